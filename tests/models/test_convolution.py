@@ -110,24 +110,35 @@ def test_no_derivative_in_forward_mode_is_promised_and_no_windows_make_none():
     assert jax.eval_shape(convolve_three, x[:0], kernel).shape == (0, 4, 2)
 
 
-def used(monkeypatch, channels=64, length=8, stride=1, train=True, winograd=True):
-    """Whether a layer of a network uses it."""
-    calls = []
-    monkeypatch.setattr(convolution, "convolve_three", lambda *x: calls.append(x) or x[0])
-    layer = layers.conv(channels, 3, stride, train, "conv", winograd=winograd)
-    jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros((1, length, channels), jnp.float32))
-    return bool(calls)
+@pytest.fixture
+def calls(monkeypatch):
+    """What Winograd's convolution is called with."""
+    found = []
+    monkeypatch.setattr(convolution, "convolve_three", lambda *x: found.append(x) or x[0])
+    return found
 
 
-def test_training_uses_it_where_it_is_quicker(monkeypatch):
-    assert used(monkeypatch) and used(monkeypatch, length=3)
-    for slower in ({"channels": 32}, {"length": 2}, {"stride": 2}, {"train": False}):
-        assert not used(monkeypatch, **slower)
-    assert not used(monkeypatch, winograd=False)
+def test_training_uses_it_where_it_is_quicker(calls):
+    for used, given in (
+        (True, {}),
+        (True, {"length": 3}),
+        (False, {"length": 2}),
+        (False, {"channels": 32}),
+        (False, {"stride": 2}),
+        (False, {"train": False}),
+        (False, {"winograd": False}),
+    ):
+        of = {"channels": 64, "length": 8, "stride": 1, "train": True, "winograd": True} | given
+        channels, length = of["channels"], of["length"]
+        layer = layers.conv(channels, 3, of["stride"], of["train"], "c", winograd=of["winograd"])
+        x = jnp.zeros((1, length, channels), jnp.float32)
+        calls.clear()
+        jax.eval_shape(layer.init, jax.random.key(0), x)
+        assert bool(calls) == used, given
 
 
 @pytest.mark.parametrize("name", ["gnio", "tlio", "ronin_resnet"])
-def test_it_is_chosen_when_the_network_is_made(monkeypatch, name):
+def test_it_is_chosen_when_the_network_is_made(monkeypatch, calls, name):
     """On a CPU, in one process: products of other devices may have fewer digits than float32. The
     network keeps the choice wherever it is traced, and may be given another."""
     made = models.create(name)
@@ -137,8 +148,6 @@ def test_it_is_chosen_when_the_network_is_made(monkeypatch, name):
         assert not models.create(name).winograd
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert not models.create(name).winograd
-    calls = []
-    monkeypatch.setattr(convolution, "convolve_three", lambda *x: calls.append(x) or x[0])
     monkeypatch.setattr(resnet, "BLOCKS_PER_GROUP", 1)
     windows = jnp.zeros((1, 64, 6), jnp.float32)
     jax.eval_shape(lambda key: made.init(key, windows, train=True), jax.random.key(0))

@@ -1,12 +1,10 @@
-"""iMoT against a plain NumPy forward pass of the whole network, and its decoupler."""
+"""iMoT against a plain NumPy forward pass of the whole network."""
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import erf
 
 from gnio_jax import models
 from gnio_jax.models import imot
-from tests.support.compiling import quick
 from tests.support.networks import SMALL, drawn, predicted, shapes
 from tests.support.numpy_layers import (
     attention,
@@ -37,21 +35,6 @@ def decoupled(channels):
             trends.append([(at(nine, t - 1) + nine[t] + at(nine, t + 1)) / 3 for t in range(n)])
         rows += [*modality, *trends, *(modality - np.array(trends))]
     return np.array(rows)
-
-
-def test_a_series_is_its_trend_and_its_season():
-    x = np.random.default_rng(0).normal(size=(2, 6, 25)).astype(np.float32)
-    decouple = quick(imot.decouple)
-    found = decouple(jnp.asarray(x))
-    np.testing.assert_allclose(
-        found, np.stack([decoupled(each.astype(np.float64)) for each in x]), atol=1e-5
-    )
-    parts = np.asarray(found).reshape(2, 2, 3, 3, 25)
-    np.testing.assert_allclose(parts[:, :, 1] + parts[:, :, 2], parts[:, :, 0], atol=1e-6)
-    ramp = np.tile(np.arange(25, dtype=np.float32), (2, 6, 1))
-    np.testing.assert_allclose(
-        decouple(ramp)[0, 6, 5:-5], 0, atol=1e-5
-    )  # a steady change is trend alone, away from the ends
 
 
 def perceptron(x, q):

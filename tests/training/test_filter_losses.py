@@ -19,12 +19,8 @@ CONFIG = FilterConfig(0.05, 4, W, history="core")
 # One program in place of one for every operation.
 relative_displacement = quick(filter_losses.relative_displacement, static_argnums=2)
 relative_yaw = quick(filter_losses.relative_yaw, static_argnums=2)
-gaussian_nll, normalised_squares, innovation_nll = map(
-    quick,
-    (filter_losses.gaussian_nll, filter_losses.normalised_squares, filter_losses.innovation_nll),
-)
-window_error = quick(filter_losses.window_error, static_argnums=3)
-window_slope = quick(jax.grad(filter_losses.window_error), static_argnums=3)
+window_error = quick(jax.value_and_grad(filter_losses.window_error, (0, 1)), static_argnums=3)
+"""With its derivatives by what the network says and by the filter's path."""
 
 
 def paths(seed=0):
@@ -69,15 +65,6 @@ def relative(count):
     return np.mean(displacement), np.mean(yaw)
 
 
-def test_relative_errors():
-    estimate, truth = paths()
-    for count in (1, 7, K):
-        displacement, yaw = relative(count)
-        found = relative_displacement(estimate, truth, count)
-        np.testing.assert_allclose(found, displacement, rtol=1e-12)
-        np.testing.assert_allclose(relative_yaw(estimate, truth, count), yaw, rtol=1e-12)
-
-
 def test_a_turned_and_shifted_estimate_has_no_relative_error():
     _, truth = paths()
     turn = Rotation.from_euler("z", 2.0)
@@ -94,23 +81,11 @@ def test_a_turned_and_shifted_estimate_has_no_relative_error():
     assert np.isfinite(quick(jax.grad(of))(jnp.zeros((K + 1, 3)))).all()
 
 
-def test_likelihoods():
-    rng = np.random.default_rng(1)
-    roots = rng.standard_normal((K, 6, 6)) + 3 * np.eye(6)
-    covariance = roots @ roots.transpose(0, 2, 1)
-    error = rng.standard_normal((K, 6))
-    pairs = list(zip(error, covariance, strict=True))
-    expected = [-multivariate_normal(cov=p).logpdf(e) - 3 * np.log(2 * np.pi) for e, p in pairs]
-    found = gaussian_nll(error, covariance)
-    np.testing.assert_allclose(found, np.mean(expected), rtol=1e-9)
-    squares = [e @ np.linalg.solve(p, e) for e, p in pairs]
-    found = normalised_squares(error, covariance)
-    np.testing.assert_allclose(found, squares, rtol=1e-9)
-
+def test_the_likelihood_of_innovations_is_the_mean_over_those_that_there_are():
     likelihood = np.array([np.nan, 2.0, np.nan, 5.0])
-    assert innovation_nll(likelihood) == -3.5
-    assert innovation_nll(np.full(4, np.nan)) == 0
-    slope = quick(jax.grad(filter_losses.innovation_nll))(likelihood)
+    both = quick(jax.value_and_grad(filter_losses.innovation_nll))
+    value, slope = both(likelihood)
+    assert value == -3.5 and both(np.full(4, np.nan))[0] == 0
     np.testing.assert_array_equal(slope, [0, -0.5, 0, -0.5])
 
 
@@ -129,27 +104,16 @@ def windows_told(estimate, truth):
 
 
 def test_window_error():
+    """The filter's frame is no part of it: no gradient turns it to make the network right."""
     estimate, truth = paths()
     told = windows_told(estimate, truth)
-    assert window_error(told, estimate, truth, W) < 1e-25
+    assert window_error(told, estimate, truth, W)[0] < 1e-25
     off = 0.1 * np.random.default_rng(2).standard_normal((K, 3))
     off[10] = np.nan
-    found = window_error(told + off, estimate, truth, W)
+    found, (slope, of_frame) = window_error(told + off, estimate, truth, W)
     np.testing.assert_allclose(found, np.nanmean(np.sum(off[W:] ** 2, 1)), rtol=1e-12)
-    slope = window_slope(told + off, estimate, truth, W)
-    assert np.isfinite(slope).all() and not slope[10].any() and not slope[:W].any()
-
-
-def test_the_filters_frame_is_no_part_of_the_windows_error():
-    """No gradient turns the frame to make the network right."""
-    estimate, truth = paths()
-    told = windows_told(estimate, truth) + 0.1
-
-    def of(rotation):
-        turned = estimate._replace(rotation=rotation)
-        return filter_losses.window_error(told, turned, truth, W)
-
-    assert not quick(jax.grad(of))(estimate.rotation).any()
+    assert np.isfinite(slope).all() and slope[W:10].any()
+    assert not slope[10].any() and not slope[:W].any() and not of_frame.rotation.any()
 
 
 def test_the_sum_has_the_weights_and_the_horizons_that_fit():

@@ -34,31 +34,27 @@ def found_losses(prediction, windows, config, epoch=0, axes=3):
 
 
 def test_losses_by_hand():
-    prediction = Prediction(
-        jnp.array([[1.0, 0, 0], [0, 0, 0]], jnp.float32),
-        jnp.array([[0, 0, 0], [np.log(2), 0, -1]], jnp.float32),
-    )
+    single = lambda rows: jnp.asarray(rows, jnp.float32)  # noqa: E731
+    log_std = single([[0, 0, 0], [np.log(2), 0, -1]])
+    prediction = Prediction(single([[1, 0, 0], [0, 0, 0]]), log_std)
     walked = target([[0.0, 0, 0], [2, 1, 0]])
     # First window: error 1 on x. Second: errors 2 and 1, standard deviations 2, 1, 1/e.
-    mse = (1 + (4 + 1)) / 2
-    nll = ((0.5) + (0.5 * 4 / 4 + 0.5 * 1 + np.log(2) - 1)) / 2
-    found = found_losses(prediction, walked, LossConfig())
-    np.testing.assert_allclose(
-        [found.mse, found.nll, found.total], [mse, nll, 100 * mse + 1e-4 * nll], rtol=1e-6
-    )
-    found = found_losses(
-        prediction, walked, LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0)
-    )
-    np.testing.assert_allclose(found.total, mse + (1 + (2 + 1)) / 2, rtol=1e-6)
-    found = found_losses(prediction, walked, LossConfig(nll_from_epoch=3.0), epoch=2)
-    np.testing.assert_allclose([found.nll, found.total], [nll, 100 * mse], rtol=1e-6)
+    mse, mae = (1 + (4 + 1)) / 2, (1 + (2 + 1)) / 2
+    nll = (0.5 + (0.5 * 4 / 4 + 0.5 * 1 + np.log(2) - 1)) / 2
+    for config, total in (
+        (LossConfig(), 100 * mse + 1e-4 * nll),
+        (LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0), mse + mae),
+        (LossConfig(nll_from_epoch=3.0), 100 * mse),
+    ):
+        found = found_losses(prediction, walked, config, epoch=2)
+        np.testing.assert_allclose(
+            [found.mse, found.nll, found.total], [mse, nll, total], rtol=1e-6
+        )
 
 
 def test_uncertainty_learns_from_its_epoch_on():
-    walked, config = (
-        target([[0.3, -0.2, 0.1]]),
-        LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=10.0),
-    )
+    walked = target([[0.3, -0.2, 0.1]])
+    config = LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=10.0)
 
     def slopes(epoch):
         value = lambda d, u: found_losses(Prediction(d, u), walked, config, epoch).total  # noqa: E731
@@ -75,41 +71,30 @@ def test_uncertainty_learns_from_its_epoch_on():
 
 
 def test_switches_are_steps():
+    """The first whole step after a fraction of an epoch; without a likelihood the uncertainty has
+    nothing to learn from, unless the loss has one of its own."""
     config = LossConfig(nll_from_epoch=0.5, log_std_from_epoch=1.25)
-    assert losses.switches(config, 8) == (4, 10)
-    assert losses.switches(config, 7) == (4, 9)  # the first whole step after the fraction
-    assert losses.switches(LossConfig(nll_from_epoch=3.0), 7) == (
-        21,
-        21,
-    )  # without a likelihood it has nothing to learn from
-    assert losses.switches(LossConfig(name="velocity_and_covariance", nll_from_epoch=3.0), 7) == (
-        21,
-        0,
-    )
-    assert losses.switches(LossConfig(log_std_from_epoch=1e9), 300) == (0, 2**31 - 1)
+    own = LossConfig(name="velocity_and_covariance", nll_from_epoch=3.0)
+    for given, steps, switches in (
+        (config, 8, (4, 10)),
+        (config, 7, (4, 9)),
+        (LossConfig(nll_from_epoch=3.0), 7, (21, 21)),
+        (own, 7, (21, 0)),
+        (LossConfig(log_std_from_epoch=1e9), 300, (0, 2**31 - 1)),
+    ):
+        assert losses.switches(given, steps) == switches
     seen = [losses.loss_stage(config, step, 8) for step in range(12)]
     assert [float(stage.nll_weight) > 0 for stage in seen] == [step >= 4 for step in range(12)]
     assert [bool(stage.log_std_learns) for stage in seen] == [step >= 10 for step in range(12)]
 
 
 def test_velocity_and_covariance_by_hand():
-    rng = np.random.default_rng(0)
-    steps, velocity, log_std = (
-        0.1 * rng.standard_normal((2, 5, 3)),
-        rng.standard_normal((2, 5, 3)),
-        rng.standard_normal((2, 5, 3)),
-    )
-    windows = Windows(
-        jnp.zeros((2, 5, 6), jnp.float32),
-        jnp.asarray(steps.sum(1), jnp.float32),
-        jnp.asarray(steps, jnp.float32),
-    )
+    steps, velocity, log_std = np.random.default_rng(0).standard_normal((3, 2, 5, 3))
+    steps *= 0.1
     single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    said = {
-        "velocity": single(velocity),
-        "velocity_log_std": single(log_std),
-        "task_log_std": single([[0.3, -0.4]] * 2),
-    }
+    windows = Windows(jnp.zeros((2, 5, 6), jnp.float32), single(steps.sum(1)), single(steps))
+    said = {"velocity": single(velocity), "velocity_log_std": single(log_std)}
+    said["task_log_std"] = single([[0.3, -0.4]] * 2)
     prediction = Prediction(single(velocity.mean(1)), single(np.zeros((2, 3))), said)
     speed = covariance = place = 0.0
     for b in range(2):
