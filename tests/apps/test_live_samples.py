@@ -5,12 +5,11 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from gnio_jax.apps.live import LONGEST_WAIT, MISSING, Sample, drawing, lines_of, paired, parse_line
 
 SPIN, PULL = (0.1, 0.2, 0.3), (0.0, 1.0, 9.8)
+KEYS = ('"time"', '"gyro"', '"accel"', "null", "true", "Infinity", "nan", "[0, 0, 0]")
 
 
 def gyro(time, values=SPIN):
@@ -128,8 +127,7 @@ def test_either_sensor_may_come_late(late, between):
     assert [row.time for row in found] == [row.time for row in turned[:-1]]
 
 
-@pytest.mark.parametrize("length", [5, 8, 10])
-@pytest.mark.parametrize("first", ["accel", "gyro"])
+@pytest.mark.parametrize("first, length", [("accel", 5), ("gyro", 10)])
 def test_rows_may_come_in_batches(first, length):
     pulled, turned = at_100_hz()
     rows = []
@@ -174,10 +172,9 @@ def test_where_the_gyro_falls_silent_time_passes():
     assert len(list(paired([*rows, *back]))) == pytest.approx(len(found) + 189, abs=3)
 
 
-@pytest.mark.parametrize("start", [0.0, 1.7e9])
-def test_an_accelerometer_of_10_hz_is_enough(start):
-    pulled = [accel(start + k / 10) for k in range(50)]
-    turned = [gyro(start + k / 100 + 0.001) for k in range(490)]
+def test_an_accelerometer_of_10_hz_is_enough_also_by_unix_time():
+    pulled = [accel(1.7e9 + k / 10) for k in range(50)]
+    turned = [gyro(1.7e9 + k / 100 + 0.001) for k in range(490)]
     assert len(whole(paired(by_stamp(pulled, turned)))) == 490
 
 
@@ -188,9 +185,7 @@ def test_an_accelerometer_of_10_hz_is_enough(start):
     "line",
     [
         "1.5,0.1,-0.2,0.3,0,1,9.81\n",
-        " 1.5; 0.1; -0.2; 0.3; 0; 1; 9.81",
         "1.5\t0.1\t-0.2\t0.3\t0\t1\t9.81\r\n",
-        "1.5 0.1 -0.2 0.3 0 1 9.81",
         '{"time": 1.5, "gyro": [0.1, -0.2, 0.3], "accel": [0, 1, 9.81], "temperature": 20}',
     ],
 )
@@ -212,66 +207,46 @@ def test_what_is_missing_is_nan():
     [
         "",
         "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z",
-        "1,2,3",
-        "1,2,3,4,5,6,7,8",
         ",0,0,0,0,0,9.81",
-        "nan,0,0,0,0,0,9.81",
         "1,300,0,0,0,0,9.81",  # deg/s
         "1,0,0,0,0,0,9810",  # mg
         '{"time": 1, "gyro": [0, 0], "accel": [0, 0, 9.81]}',
         '{"time": true, "gyro": [0, 0, 0], "accel": [0, 0, 9.81]}',
-        '{"time": 1}',
         "{" * 4000,
         "[" * 2000,
         f'{{"time": 1, "gyro": [0, 0, {"9" * 400}], "accel": [0, 0, 9.81]}}',
-        '{"time": Infinity, "gyro": [0, 0, 0], "accel": [0, 0, 9.81]}',
         '{"time": 1, "gyro": {"0": 0}, "accel": "009"}',
         "1" * 5000,
-        "\x00\xff garbage",
     ],
 )
 def test_what_is_no_sample(line):
     assert parse_line(line) is None
 
 
-@given(st.text(max_size=200))
-@settings(max_examples=100, deadline=None)
-def test_no_text_at_all_is_an_error(text):
-    found = parse_line(text)
-    assert found is None or math.isfinite(found.time)
+def test_no_text_at_all_is_an_error():
+    random, signs = np.random.default_rng(0), [*'0123456789.,;:+-eE{}[]" \t\x00\xff\u20ac', *KEYS]
+    for length in random.integers(0, 20, 3000):
+        found = parse_line("".join(random.choice(signs, length)))
+        assert found is None or math.isfinite(found.time)
 
 
 # --- the drawing
 
 
-def dots(text):
-    """Set dots of a drawing, (row, column) from the top left."""
-    bits = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1), (3, 0), (3, 1)]
-    return {
-        (4 * row + down, 2 * column + across)
-        for row, line in enumerate(text.split("\n"))
-        for column, character in enumerate(line)
-        if 0x2800 <= ord(character) <= 0x28FF
-        for bit, (down, across) in enumerate(bits)
-        if ord(character) - 0x2800 >> bit & 1
-    }
-
-
 def test_the_drawing_has_one_scale_and_y_up():
-    corner = np.array([[0.0, 0, 0]] * 3 + [[k, 0, 0] for k in range(30)])
-    corner = np.concatenate([corner, [[29.0, k, 0] for k in range(30)]])
-    lines = drawing(corner, 40, 20).split("\n")
+    """From the bottom left to the right, then up to the marker; as high as it is wide."""
+    side = np.arange(30.0)
+    path = np.array([[k, 0, 0] for k in side] + [[29.0, k, 0] for k in side])
+    lines = drawing(path, 40, 20).split("\n")
     assert [len(line) for line in lines] == [40] * 20
-    row, column = next((r, line.index("●")) for r, line in enumerate(lines) if "●" in line)
-    found = dots("\n".join(lines))
-    lowest, leftmost = max(down for down, _ in found), min(across for _, across in found)
-    # From the bottom left to the right, then up to the marker; as high as it is wide.
-    assert (lowest, leftmost) in found
-    assert 4 * row < lowest - 60 and 2 * column > leftmost + 60
-    assert abs((2 * column - leftmost) - (lowest - 4 * row)) <= 6
+    drawn = np.array([[sign not in " \u2800" for sign in line] for line in lines])
+    rows, columns = np.flatnonzero(drawn.any(1)), np.flatnonzero(drawn.any(0))
+    assert abs(2 * np.ptp(rows) - np.ptp(columns)) <= 2 and np.ptp(rows) > 15
+    assert drawn[rows[-1]].sum() == len(columns) and drawn[:, columns[-1]].sum() == len(rows)
+    assert lines[rows[0]][columns[-1]] == "●" and drawn[rows[5]].sum() == 1
 
 
 def test_a_drawing_of_nothing_is_empty_and_standing_is_a_point():
     assert drawing(np.full((3, 3), np.nan), 10, 4).strip() == ""
     still = drawing(np.random.default_rng(0).normal(0, 0.01, (50, 3)), 40, 20)
-    assert still.count("●") == 1 and len(dots(still)) <= 8
+    assert still.count("●") == 1 and sum(sign not in " \u2800\n" for sign in still) <= 4

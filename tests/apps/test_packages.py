@@ -15,7 +15,6 @@ import gnio_jax
 from gnio_jax import config as configuration
 from gnio_jax.apps import packages
 from gnio_jax.apps.packages import SHIPPED, Description
-from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import report
@@ -72,15 +71,6 @@ def package(published, tmp_path):
     return shutil.copytree(published / "walk", tmp_path / "walk")
 
 
-@pytest.fixture
-def gnio(monkeypatch, capsys):
-    def call(*arguments):
-        console.run(lambda: app.main(list(map(str, arguments))))
-        return capsys.readouterr().out
-
-    return call
-
-
 def refused(place, *words):
     with pytest.raises(InputError) as caught:
         gnio_jax.load_pretrained(place)
@@ -131,48 +121,34 @@ def test_the_files_are_what_other_programs_read(run, published):
         assert archive.read(packages.WEIGHTS) == content
 
 
-def test_the_card_has_what_the_publisher_and_the_evaluations_say(published):
+def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run, tmp_path):
+    """Also of walks with waypoints, and to what the filter was fitted: by the network itself, or by
+    another one whose filter it has taken over."""
     card = packages.card_of(published / "walk")
     for words in (
         "Trained on: simulated walks",
-        "Licence: CC0",
         "- Running | jumping.",
         "gnio train --config config.yaml --workdir runs/walk --init-from runs/earlier",
-        "Dataset `synthetic`, seed 7",
         "covariance of the filter: scale.",
         "| synthetic_test_ekf | 2 | 2 | 1.25 (0.61 to 1.89) | – |",
     ):
         assert words in card
     assert "calibrate" not in card and "fitted" not in card
-
-
-@pytest.mark.parametrize(
-    "calibrated, shown", [("walk", "walk"), ("runs/half", "half"), ("other/run", "run")]
-)
-def test_the_card_says_to_what_the_filter_was_fitted(run, tmp_path, calibrated, shown):
-    """By the network itself, or by another one whose filter it has taken over."""
     own = shutil.copytree(run, tmp_path / "walk_calibrated")
-    (own / "calibration.json").write_text(json.dumps({"run": calibrated, "split": "val"}))
-    packages.publish(own, tmp_path / "package", SAID)
-    card = packages.card_of(tmp_path / "package")
-    assert f"gnio calibrate --workdir runs/{shown}\n" in card
-    assert f"The filter is fitted to split `val` of run `{shown}`." in card
-
-
-def test_the_card_has_the_legs_of_walks_with_waypoints(run, tmp_path):
-    own = shutil.copytree(run, tmp_path / "run")
     scores = {
         name: Measures({"leg_ratio": ratio, "waypoint_rms": 2.0}, {}, False)
         for name, ratio in (("a", 0.75), ("b", 0.85))
     }
     figures = report.Report(SETTINGS, scores, {}, {"a": "F1", "b": "F2"}, {}, {})
     write_report(own / "eval" / "mall_test_ekf", figures)
-    packages.publish(own, tmp_path / "walk", SAID)
-    lines = packages.card_of(tmp_path / "walk").splitlines()
-    (line,) = (each for each in lines if each.startswith("| mall_test_ekf"))
+    for calibrated, shown in (("runs/half", "half"), ("walk", "walk"), ("other/run", "run")):
+        (own / "calibration.json").write_text(json.dumps({"run": calibrated, "split": "val"}))
+        packages.publish(own, tmp_path / "package", SAID)
+        card = packages.card_of(tmp_path / "package")
+        assert f"gnio calibrate --workdir runs/{shown}\n" in card
+        assert f"The filter is fitted to split `val` of run `{shown}`." in card
+    (line,) = (each for each in card.splitlines() if each.startswith("| mall_test_ekf"))
     assert line.endswith("| – | – | 0.80 (0.16 to 1.44) | 2.00 (2.00 to 2.00) |")
-    (line,) = (each for each in lines if each.startswith("| synthetic_test_ekf"))
-    assert line.endswith("| – | – |")
 
 
 @pytest.mark.parametrize("name", [packages.WEIGHTS, packages.MANIFEST])
@@ -184,17 +160,16 @@ def test_a_changed_byte(package, name):
     refused(package, f"'{name}'", "SHA-256")
 
 
-def test_what_else_is_damaged(package, tmp_path):
+def test_what_else_is_damaged(package, tmp_path, monkeypatch):
+    """Weights that are too large are not read: a zip of megabytes may unpack to any size."""
     good = json.loads((package / "manifest.json").read_text())
     for changes, words in (
         ({"version": 1}, ("format version 1", "publish its run again")),
         ({"format": "other"}, ("not that of a package",)),
         ({"license": None}, ("no 'license'",)),
-        ({"network": ["tlio"]}, ("no 'network'",)),
         ({"weights": {}}, ("does not describe",)),
         ({"weights": {"bytes": 2**40, "sha256": ""}}, ("SHA-256",)),
-        *(({"step": step}, ("no 'step'",)) for step in (1.5, -5, "../..", 10**20, True)),
-        ({"epoch": {}}, ("no 'epoch'",)),
+        *(({"step": step}, ("no 'step'",)) for step in (1.5, -5, "../..", True)),
         ({"config": {"seed": "one"}}, ("manifest.json", "seed")),
     ):
         with_changes(package, **good | changes)
@@ -203,25 +178,18 @@ def test_what_else_is_damaged(package, tmp_path):
         (package / "manifest.json").write_text(text)
         refused(package, "no JSON")
     (package / "manifest.json").write_text(json.dumps(good))
-    (package / packages.WEIGHTS).unlink()
-    refused(package, "'weights.safetensors' is missing")
-    broken = tmp_path / "broken.zip"
-    broken.write_bytes(b"PK no zip")
-    refused(broken, "cannot be read")
-
-
-def test_a_file_that_is_too_large_is_not_read(package, monkeypatch):
-    """As a zip of some megabytes may unpack to any size."""
-    monkeypatch.setattr(packages, "LARGEST_WEIGHTS", 100)
-    refused(package, "'weights.safetensors' is larger than 100 bytes")
-
-
-def test_weights_of_another_network(package):
     content = packages.to_bytes({"params": {"head": {"kernel": np.zeros((4, 3), np.float32)}}})
     (package / packages.WEIGHTS).write_bytes(content)
     weights = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-    with_changes(package, weights=weights)
+    with_changes(package, **good | {"weights": weights})
     refused(package, "'batch_stats/norm/mean' has shape None", "(4,)")
+    with monkeypatch.context() as patch:
+        patch.setattr(packages, "LARGEST_WEIGHTS", 100)
+        refused(package, "'weights.safetensors' is larger than 100 bytes")
+    (package / packages.WEIGHTS).unlink()
+    refused(package, "'weights.safetensors' is missing")
+    (tmp_path / "broken.zip").write_bytes(b"PK no zip")
+    refused(tmp_path / "broken.zip", "cannot be read")
 
 
 def test_names_are_found_and_listed(published, run, monkeypatch, tmp_path, gnio):
@@ -243,25 +211,22 @@ def test_names_are_found_and_listed(published, run, monkeypatch, tmp_path, gnio)
 
 
 def test_the_default_is_shipped_or_the_newest_run(published, run, monkeypatch, tmp_path):
+    """And what was measured of it is known."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(packages, "SHIPPED", published)
     assert packages.find() == published / "small.zip"
     monkeypatch.setattr(packages, "SHIPPED", tmp_path)
     with pytest.raises(InputError, match="runs: holds no run"):
         packages.find()
-    shutil.copytree(run, tmp_path / "runs" / "walk")
+    own = shutil.copytree(run, tmp_path / "runs" / "walk")
     assert packages.find().name == "walk"
-
-
-def test_what_was_measured_of_weights(published, run, tmp_path):
     assert packages.choose(published / "walk").about == f"simulated walks, whose {MEASURED}"
-    own = shutil.copytree(run, tmp_path / "walk")
     assert packages.choose(own).about == f"dataset synthetic, split train, whose {MEASURED}"
     (own / "eval" / "synthetic_test_ekf" / "metrics.json").write_text("{")
     assert packages.choose(own).about == "dataset synthetic, split train"  # and it tracks
 
 
-def test_the_command(run, tmp_path, gnio, capsys):
+def test_the_command(run, tmp_path, gnio, mistake):
     out = tmp_path / "mine.zip"
     given = ["publish", run, "--out", out, "--data", "walks \x1b[2J", "--license", "CC0"]
     told = gnio(*given, "--fails", "Running.", "Cars.")
@@ -277,29 +242,22 @@ def test_the_command(run, tmp_path, gnio, capsys):
         (["--name", "a/b"], "no name of a folder"),
         (["--license", " "], "--license: is empty"),
     ):
-        with pytest.raises(SystemExit, match="2"):
-            gnio(*given, *wrong)
-        told = capsys.readouterr().err
-        assert words in told and told.count("\n") == 1
+        assert words in mistake(*given, *wrong)
     assert (tmp_path / "other" / "thesis.txt").read_text() == "mine"
 
 
 # --- the network that comes with gnio-jax
 
 
-def test_the_shipped_network_is_the_default_and_small(monkeypatch, gnio, capsys):
+def test_the_shipped_network_is_the_default_and_small(monkeypatch, gnio, mistake):
     monkeypatch.delenv("GNIO_WEIGHTS", raising=False)
     place = SHIPPED / "pedestrian"
     assert packages.find() == place
     assert sum(file.stat().st_size for file in place.iterdir()) < 5e6
-    about = packages.read_about(place)
-    assert "Tyrex" in about.data and "CeCILL 2.1" in about.license
     card = gnio("weights", "pedestrian")
-    for words in ("gnio train", "gnio calibrate", "seed 0", "oxiod_sessions_test_ekf | 7 | 3 |"):
+    for words in ("Tyrex", "CeCILL 2.1", "gnio calibrate", "oxiod_sessions_test_ekf | 7 | 3 |"):
         assert words in card
-    with pytest.raises(SystemExit, match="2"):
-        gnio("weights", "--out", "run")
-    assert "is for one package; name it before --out" in capsys.readouterr().err
+    assert "is for one package; name it before --out" in mistake("weights", "--out", "run")
 
 
 def test_the_shipped_network_answers():

@@ -26,7 +26,7 @@ FILTER = tracking_filter(Run(CONFIG, nn.Dense(1), {}, epoch=0, step=0))._replace
 """Sure of its start, so that what it doubts is the hole."""
 HOLE = (1.5, 4.0)
 """s: the samples between are missing."""
-DRAWS = 48
+DRAWS = 24
 
 
 def recordings():

@@ -48,18 +48,15 @@ def test_what_is_found(home, capsys):
         "dataset randomised": "computed",
         "dataset synthetic": "computed",
     }
-    assert found["recordings read"] == str(home / "kept")
-    assert "pedestrian" in found["weights"]
+    assert found["recordings read"] == str(home / "kept") and "pedestrian" in found["weights"]
     assert found["newest run"].startswith("none: runs: holds no run; train one with gnio train")
 
 
 def test_it_fits_a_screen_and_says_what_is_wrong(home, capsys, monkeypatch):
     monkeypatch.setenv("GNIO_WEIGHTS", str(home / "nowhere"))
-    run_folder = home / "runs" / "mine"
-    run_folder.mkdir(parents=True)
-    (run_folder / "config.yaml").write_text("")
+    (home / "runs" / "mine").mkdir(parents=True)
+    (home / "runs" / "mine" / "config.yaml").write_text("")
     text = told(capsys)
-    assert len(text.splitlines()) <= 45 and "\x1b" not in text
-    assert "runs/mine" in text
+    assert len(text.splitlines()) <= 45 and "\x1b" not in text and "runs/mine" in text
     (line,) = [line for line in text.splitlines() if line.startswith("weights")]
     assert "$GNIO_WEIGHTS" in line and "is not a folder" in line

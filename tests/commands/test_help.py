@@ -65,18 +65,14 @@ def test_help_explains_every_option(words, command, capsys):
         assert options.comment(option) in joined(text), option.name
 
 
-def test_help_of_the_overviews_names_every_command(capsys):
+def test_help_of_the_overviews_names_every_command_and_that_of_train_the_configs(capsys):
     overview, of_data = shown(capsys), shown(capsys, "data")
     for word, *inner in WORDS:
         assert re.search(rf"^ +{word} ", overview, re.M), word
         for name in inner:
             assert re.search(rf"^ +{name} ", of_data, re.M), name
-
-
-def test_help_of_train_names_the_configs(capsys):
     text = joined(shown(capsys, "train", "-H"))
     assert all(name in text for name in config.names())
-    assert "(default: synthetic)" in text
     assert "--optim.epochs INT Passes over the training windows. (default: 200)" in text
 
 
@@ -96,20 +92,8 @@ def test_bash_completes_commands_and_options(capsys):
         assert sorted(shown.stdout.split()) == completed and shown.stderr == ""
 
 
-def test_nobody_is_asked_for_too_much():
-    counts = {
-        words: sum(
-            option.name.startswith("--")
-            for option in options.options_of(options.options_type(command))
-        )
-        for words, command in commands()
-    }
-    assert counts[("train",)] <= 60
-    assert sum(counts.values()) <= 150, counts
-
-
-@pytest.mark.parametrize("words", [("data", "list"), ("weights",), ("data", "check", "synthetic")])
+@pytest.mark.parametrize("words", [("data", "list"), ("weights",)])
 def test_results_in_a_pipe_have_no_control_characters(words, capsys):
-    run(*words, *(["--split", "val"] if len(words) == 3 else []))
+    run(*words)
     text = capsys.readouterr().out
     assert text and plain(text)

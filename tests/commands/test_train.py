@@ -44,38 +44,18 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
     "arguments, expected",
     [
         (["--dataset", "tlio"], "github.com/CathIAS/TLIO"),
-        (["--dataset", "tlio", "--data-root", "nowhere"], "nowhere"),
-        (["--dataset", "oxiod"], "deepio.cs.ox.ac.uk"),
         (["--dataset", "oxoid"], "did you mean 'oxiod'? known datasets: blackbird, csv, euroc"),
-        (["--config", ""], ".: cannot be read"),
         (["--devices", "0"], "--devices: must be at least 1"),
         (["--seeds"], "--seeds: expected at least one"),
-        (["--model.name", "gnoi"], "model 'gnoi': unknown; did you mean 'gnio'?"),
-        (
-            ["--model.name", "ctin", "--model.width", "90"],
-            "model 'ctin': width must be even and a multiple of the 8 heads, found 90",
-        ),
-        (["--data.rate", "0"], "--data.rate: must be positive"),
+        (["--model.name", "ctin", "--model.width", "90"], "model 'ctin': width must be even and a"),
         (["--data.stride-seconds", "0.3"], "field 'data.stride_seconds' must divide the window"),
-        (["--data.context-seconds", "0.25"], "field 'data.stride_seconds' must divide the context"),
-        (
-            ["--data.context-seconds", "1", "--model.name", "ctin"],
-            "field 'data.context_seconds' is not for ctin",
-        ),
-        (["--data.train-split", "trian"], "trian"),
-        (["--config", "none.yaml"], "none.yaml: no such config file"),
+        (["--data.context-seconds", "1", "--model.name", "ctin"], "is not for ctin"),
         (["--workdir", __file__], "test_train.py: is a file; name a folder with --workdir"),
         (["--resume", "--workdir", "none"], "none: holds no run to resume"),
     ],
 )
 def test_mistakes(monkeypatch, capsys, tmp_path, arguments, expected):
     assert expected in mistake(monkeypatch, capsys, tmp_path, *arguments)
-
-
-def test_a_mistake_in_a_file_names_it(monkeypatch, capsys, tmp_path):
-    (tmp_path / "my.yaml").write_text("optim: {epohcs: 3}")
-    line = mistake(monkeypatch, capsys, tmp_path, "--config", "my.yaml")
-    assert line == "my.yaml: unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"
 
 
 def test_every_config_of_the_repository_is_valid_and_names_its_command():
@@ -99,11 +79,7 @@ def test_the_papers_configs_are_the_papers(name):
     config, defaults = configuration.load(ROOT / "configs" / f"{name}.yaml"), TrainConfig()
     assert (config.model, config.loss) == (defaults.model, defaults.loss)
     optim = OptimConfig(
-        epochs=200,
-        batch_size=1024,
-        start_learning_rate=1e-6,
-        learning_rate=1e-4,
-        warmup_epochs=5.0,
+        epochs=200, batch_size=1024, start_learning_rate=1e-6, learning_rate=1e-4, warmup_epochs=5.0
     )
     assert config.optim == defaults.optim == optim and optimizer.END_LEARNING_RATE == 1e-6
     assert (config.loss.mse_weight, config.loss.nll_weight) == (1e2, 1e-4)

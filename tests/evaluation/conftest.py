@@ -14,23 +14,22 @@ def few_dots(monkeypatch):
     monkeypatch.setattr("gnio_jax.evaluation.plots.DOTS_PER_INCH", 30)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def walks():
-    # Lengths that share one compiled filter (a fifth is the most that is padded), but for the
-    # shortest.
-    lengths = {1: 18.0, 2: 11.3, 3: 16.0}
+    """As a filter sees them of one length: none is a fifth shorter than the longest."""
+    lengths = {1: 15.0, 2: 14.0, 3: 13.0}
     return [
         simulated.pedestrian(seed, seed, "handheld", seconds, RATE)
         for seed, seconds in lengths.items()
     ]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def clean():
-    return simulated.pedestrian(5, 5, "pocket", 18.0, RATE, imu_errors=False)
+    return simulated.pedestrian(5, 5, "pocket", 15.0, RATE, imu_errors=False)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def estimates():
     return [
         estimate("room 1/walk", 0),
@@ -39,13 +38,13 @@ def estimates():
     ]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def made(estimates):
     groups = {each.name: each.name[:4] for each in estimates}
     return reported(estimates, groups, {"blind": ["start: rough"]}, {"short": "0.5 s"})
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def with_divergence(estimates):
     """The walks again, the second lost after 20 s, and a third that is whole."""
     second = estimates[1]._replace(trajectory=lost(estimates[1].trajectory, 200))

@@ -30,37 +30,30 @@ def rows(folder):
         return list(csv.DictReader(file))
 
 
-def test_files_parse_back(tmp_path, estimates, made):
-    found = write(tmp_path / "e", made, estimates)
-    assert found["sequences"].keys() == {"room 1/walk", "room 1:walk", "blind"}
-    first = found["sequences"]["room 1/walk"]
+def test_what_is_written_is_read_back_whole(tmp_path, estimates, made, with_divergence):
+    """Infinite figures too; each sequence has its files."""
+    for place, of, wanted in (
+        (tmp_path / "a", *with_divergence),
+        (tmp_path / "e", estimates, made),
+    ):
+        found = write(place, wanted, of)
+        assert evaluation.load(place) == wanted
+    first, _, blind = found["sequences"].values()
     assert first["ate"] == made.scores["room 1/walk"].values["ate"]
     assert first["reasons"] == {} and first["infinite"] == [] and first["diverged"] is False
     assert first["accepted"] == pytest.approx(90, abs=0.5) and first["nis"] == 1.0
-    blind = found["sequences"]["blind"]
     assert blind["ate"] is None and blind["reasons"]["ate"] == "no trusted reference"
     assert blind["notes"] == ["start: rough"] and blind["nis"] == 1.0
     ates = [found["sequences"][f"room 1{c}walk"]["ate"] for c in "/:"]
     assert found["mean"]["ate"] == pytest.approx(np.mean(ates))
     assert found["n"]["ate"] == 2 and found["interval"]["ate"] is None
     assert len(found["interval"]["nis"]) == 2 and found["left_out"] == {"short": "0.5 s"}
-    assert found["settings"]["orientation_source"] == "filter"
     assert found["reference_rows"]["never_moves"]["mean"]["path_length_ratio"] == 0
     lines = rows(tmp_path / "e")
     assert float(lines[0]["ate"]) == first["ate"]
     assert lines[2]["ate"] == "" and lines[2]["sequence"] == "blind"
-
-
-def test_what_is_written_is_read_back_whole(tmp_path, estimates, made, with_divergence):
-    """Infinite figures too; each sequence has its files."""
-    for place, of, wanted in (
-        (tmp_path / "a", *with_divergence),
-        (tmp_path / "b", estimates, made),
-    ):
-        write(place, wanted, of)
-        assert evaluation.load(place) == wanted
     trajectories, references = (
-        sorted(path.name for path in (tmp_path / "b" / kind).iterdir())
+        sorted(path.name for path in (tmp_path / "e" / kind).iterdir())
         for kind in ("trajectories", "references")
     )
     assert trajectories == ["blind.txt", "room_1_walk.txt", "room_1_walk_.txt"]
@@ -134,52 +127,45 @@ def test_no_page_is_lost_and_none_is_of_other_figures(tmp_path, estimates, made)
     assert ates[0] != ates[1] and len(list((folder / "plots").iterdir())) == 2
 
 
-@pytest.mark.parametrize(
-    ("where", "value"),
-    [
-        (("sequences", "blind", "reasons"), ["x"]),
-        (("sequences", "blind", "reasons"), ""),
-        (("sequences", "blind", "reasons"), {"ate": 5}),
-        (("sequences", "blind", "group"), None),
-        (("sequences", "blind", "nis"), 10**400),
-        (("sequences", "blind", "nis"), math.inf),
-        (("sequences", "blind", "nis"), "1.0"),
-        (("sequences", "blind", "infinite"), ["nis"]),
-        (("sequences", "blind", "infinite"), None),
-        (("sequences", "blind", "diverged"), "no"),
-        (("sequences", "blind", "notes"), [5]),
-        (("settings", "split"), 5),
-        (("settings", "recordings"), {}),
-        (("settings", "filter"), 5),
-        (("settings",), []),
-        (("sequences",), {}),
-        (("sequences",), [[1]]),
-        (("left_out",), {"short": None}),
-    ],
-)
-def test_a_damaged_file_is_refused(tmp_path, estimates, made, where, value):
-    found = inner = write(tmp_path / "e", made, estimates)
-    for name in where[:-1]:
-        inner = inner[name]
-    inner[where[-1]] = value
-    path = tmp_path / "e" / "metrics.json"
-    path.write_text(json.dumps(found))
-    with pytest.raises(InputError, match=r"is not a metrics\.json of an evaluation"):
-        report.read(path.parent)
+DAMAGES = [
+    (("sequences", "blind", "reasons"), ["x"]),
+    (("sequences", "blind", "reasons"), {"ate": 5}),
+    (("sequences", "blind", "group"), None),
+    (("sequences", "blind", "nis"), 10**400),
+    (("sequences", "blind", "nis"), math.inf),
+    (("sequences", "blind", "nis"), "1.0"),
+    (("sequences", "blind", "infinite"), ["nis"]),
+    (("sequences", "blind", "infinite"), None),
+    (("sequences", "blind", "diverged"), "no"),
+    (("sequences", "blind", "notes"), [5]),
+    (("settings", "split"), 5),
+    (("settings", "recordings"), {}),
+    (("settings", "filter"), 5),
+    (("settings",), []),
+    (("sequences",), {}),
+    (("left_out",), {"short": None}),
+]
 
 
 def test_what_is_no_evaluation_is_named(tmp_path, estimates, made):
-    found = write(tmp_path / "e", made, estimates)
+    whole = json.dumps(write(tmp_path / "e", made, estimates))
     path = tmp_path / "e" / "metrics.json"
-    for definitions in (report.DEFINITIONS - 1, None):
-        found["settings"]["definitions"] = definitions
-        path.write_text(json.dumps(found))
-        with pytest.raises(InputError, match=re.escape("written by another version")):
+
+    def refused(content, problem):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=re.escape(problem)):
             report.read(path.parent)
-    for broken in ("[" * 100_000, "nothing", "\xff"):
-        path.write_bytes(broken.encode("latin-1"))
-        with pytest.raises(InputError, match=r"is not a metrics\.json of an evaluation"):
-            report.read(path.parent)
+
+    for where, value in [*DAMAGES, (("settings", "definitions"), report.DEFINITIONS - 1)]:
+        found = inner = json.loads(whole)
+        for name in where[:-1]:
+            inner = inner[name]
+        inner[where[-1]] = value
+        other = where[-1] == "definitions"
+        words = "written by another version" if other else "is not a metrics.json of an evaluation"
+        refused(json.dumps(found).encode(), words)
+    for broken in (b"[" * 100_000, b"nothing", b"\xff"):
+        refused(broken, "is not a metrics.json of an evaluation")
     path.unlink()
     for folder in (tmp_path, path, tmp_path / "nowhere"):
         with pytest.raises(InputError, match="is neither a run nor an evaluation"):

@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -21,14 +20,13 @@ from gnio_jax.evaluation import (
     prepare,
     report,
     score,
-    tabulate,
 )
 from gnio_jax.evaluation.estimate import in_one_frame
 from gnio_jax.evaluation.metrics import OF_FILTER, OF_WAYPOINTS
 from gnio_jax.evaluation.trajectory import positions_at
 from gnio_jax.types import Waypoints
 from tests.support.estimates import SETTINGS, estimate, reported
-from tests.support.estimators import CONFIG, NETWORK, loose, summed, tight, with_waypoints
+from tests.support.estimators import CONFIG, with_waypoints
 from tests.support.reports import BASE
 from tests.support.trajectories import lost, moved_by, perturbed, walk
 
@@ -67,19 +65,25 @@ def least(path, waypoints):
         turn = Rotation.from_euler("z", motion[0]).as_matrix()[:2, :2]
         return np.mean(np.sum((ours @ turn.T + motion[1:] - waypoints.position) ** 2, 1))
 
-    starts = ([angle, 0.0, 0.0] for angle in np.arange(-3.0, 3.0, 1.0))
+    starts = ([angle, 0.0, 0.0] for angle in (-2.0, 0.0, 2.0))
     return math.sqrt(min(minimize(cost, each, tol=1e-12).fun for each in starts))
 
 
-@pytest.mark.parametrize("rows", [ROWS, ROWS[:2], [100, 101, 102]])
-@pytest.mark.parametrize("shape", ["wandering", "collinear", "still", "one place"])
-def test_the_alignment_is_the_best_turn_and_shift(rows, shape):
+@pytest.mark.parametrize(
+    "rows, tapped_by, moved_by_itself",
+    [
+        (ROWS, 1.0, 1.0),
+        (ROWS[:2], 1.0, 1.0),
+        ([100, 101, 102], [1.0, 0.0, 0.0], 1.0),  # collinear
+        (ROWS, 0.0, 1.0),  # in one place
+        (ROWS, 1.0, 0.0),  # and one who stands still
+    ],
+)
+def test_the_alignment_is_the_best_turn_and_shift(rows, tapped_by, moved_by_itself):
     truth = walk()
-    flat = {"wandering": 1.0, "collinear": [1.0, 0.0, 0.0], "still": 1.0, "one place": 0.0}[shape]
-    waypoints = tapped(truth._replace(position=truth.position * flat), rows)
+    waypoints = tapped(truth._replace(position=truth.position * tapped_by), rows)
     path = moved_by(perturbed(truth), TURNED, [5.0, -3.0, 1.0])
-    if shape == "still":
-        path = path._replace(position=0.0 * path.position + 4.0)
+    path = path._replace(position=moved_by_itself * path.position + 4.0)
     aligned = align(path, waypoints)
     error = positions_at(aligned, waypoints.time) - waypoints.position
     found = math.sqrt(np.mean(np.sum(error**2, 1)))
@@ -109,7 +113,7 @@ def test_positions_lie_between_rows_and_not_beyond_the_ends():
 # --- metrics
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.8, 1.25, 0.0])
+@pytest.mark.parametrize("scale", [0.8, 0.0])
 def test_a_walk_that_is_short_by_a_factor(scale):
     """All is known by hand: each leg is too short by the factor, whatever the frame."""
     truth = walk()
@@ -186,16 +190,6 @@ def test_the_start_is_level_and_says_so(clean):
             prepare([with_waypoints(clean)], CONFIG, **{asked: "reference"})
 
 
-@pytest.mark.parametrize("way", [tight, loose, summed])
-def test_every_estimator_takes_them_along(walks, way):
-    """And a recording with poses beside it is as it was."""
-    both, _ = prepare([walks[0], with_waypoints(walks[2])], CONFIG, orientation="filter")
-    (first, second), (own,) = way(both, NETWORK), way(both[:1], NETWORK)
-    np.testing.assert_allclose(first.trajectory.position, own.trajectory.position, atol=1e-6)
-    assert first.waypoints is None and second.waypoints is both[1].waypoints
-    assert np.isfinite(score([second])[second.name].values["waypoint_rms"])
-
-
 # --- the folder, the tables, and what is drawn
 
 
@@ -212,17 +206,18 @@ def made(unseen_ones):
 
 
 def test_the_folder_holds_the_waypoints_and_gives_them_back(unseen_ones, made, tmp_path):
-    report.write(tmp_path / "e", made, unseen_ones, BASE, plots=False)
-    assert sorted(x.name for x in (tmp_path / "e" / "waypoints").iterdir()) == ["a_b.txt", "c.txt"]
-    back = report.read_estimates(tmp_path / "e", list(made.scores))
-    for ours, theirs in zip(back, unseen_ones, strict=True):
+    report.write(tmp_path, made, unseen_ones, BASE, plots=False)
+    assert sorted(x.name for x in (tmp_path / "waypoints").iterdir()) == ["a_b.txt", "c.txt"]
+    for ours, theirs in zip(
+        report.read_estimates(tmp_path, list(made.scores)), unseen_ones, strict=True
+    ):
         assert not ours.reference.known.any()
         for one, other in zip(ours.waypoints, theirs.waypoints, strict=True):
             np.testing.assert_allclose(one, other, atol=1e-6)
-    assert report.read(tmp_path / "e").scores == made.scores
-    (tmp_path / "e" / "waypoints" / "c.txt").write_text("1 2\n")
+    assert report.read(tmp_path).scores == made.scores
+    (tmp_path / "waypoints" / "c.txt").write_text("1 2\n")
     with pytest.raises(InputError, match="2 columns"):
-        report.read_estimates(tmp_path / "e", list(made.scores))
+        report.read_estimates(tmp_path, list(made.scores))
 
 
 def test_picture_and_page_show_where_the_estimate_is_at_the_waypoints(unseen_ones, made):
@@ -242,42 +237,7 @@ def test_picture_and_page_show_where_the_estimate_is_at_the_waypoints(unseen_one
     assert "rms at waypoints" in of_all.axes[1].get_xlabel()
     found = page.columns(seen, 150)  # of the page, each waypoint once
     rows = np.flatnonzero(np.isfinite(found["waypoint_x"]))
-    assert len(rows) == len(seen.taps.time)
     np.testing.assert_allclose(found["time"][rows], seen.taps.time, atol=0.15)
     np.testing.assert_allclose(found["waypoint_error"][rows], seen.taps.error, rtol=1e-6)
     corners = page.frame([page.Run("x", {}, [seen], {})], "a/b")
     assert corners["x"][0] <= seen.taps.position[:, 0].min()
-
-
-@pytest.mark.parametrize("mixed", [False, True])
-def test_the_table_on_the_screen_has_the_columns_that_there_are(made, mixed):
-    scores = made.scores | (score([estimate("posed", 3)]) if mixed else {})
-    shown = made._replace(scores=scores, groups={name: name for name in scores})
-    console = Console(width=80)
-    with console.capture() as captured:
-        console.print(tabulate.render(shown))
-    lines = captured.get().splitlines()
-    heads = " ".join("\n".join(lines[:6]).split())
-    assert max(map(len, lines)) <= 80 and not any("…" in line for line in lines)
-    assert "leg" in heads and "ratio" in heads and ("ATE" in heads) == mixed
-
-
-def test_rows_of_waypoint_walks_are_compared_by_their_own_errors(made):
-    def times(factor, diverged=False):
-        scores = {
-            name: own._replace(
-                values=own.values | {"waypoint_rms": factor * own.values["waypoint_rms"]},
-                diverged=diverged,
-            )
-            for name, own in made.scores.items()
-        }
-        return made._replace(scores=scores)
-
-    def difference(report):
-        ((_, cell),) = tabulate.cells([[made], [report]], ["waypoint_rms"]).values()
-        return cell.difference
-
-    better = times(0.5)
-    assert difference(better).better == 2 and difference(better).mean < 0
-    lost = {"a/b": times(math.inf, diverged=True).scores["a/b"]}
-    assert difference(better._replace(scores=better.scores | lost)).withheld

@@ -87,9 +87,12 @@ def clock(rate, seconds=SECONDS):
 
 def imu(make, topic="/imu/data", rate=100.0, seconds=SECONDS, frame="imu_link", unit=1.0, no=""):
     """sensor_msgs/Imu; `unit` scales the accelerometer, `no` says which sensor is not measured."""
-    name = "sensor_msgs/msg/Imu"
+    name, times = "sensor_msgs/msg/Imu", clock(rate, seconds)
+    measured = zip(known_walk.rate(times), known_walk.force(times) * unit, strict=True)
+    known = dict(zip(times.tolist(), measured, strict=True))
 
     def message(time):
+        turning, pull = known[time]
         unknown = np.zeros(9)
         unknown[0] = -1.0
         return make.new(
@@ -97,13 +100,13 @@ def imu(make, topic="/imu/data", rate=100.0, seconds=SECONDS, frame="imu_link", 
             make.header(time, frame),
             make.new("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
             unknown,
-            make.vector(known_walk.rate(time)),
+            make.vector(turning),
             unknown if no == "gyro" else np.zeros(9),
-            make.vector(known_walk.force(time) * unit),
+            make.vector(pull),
             unknown if no == "accel" else np.zeros(9),
         )
 
-    return rows(topic, name, clock(rate, seconds), message)
+    return rows(topic, name, times, message)
 
 
 def poses(make, kind, mount, topic="/pose", rate=50.0, child="base_link", start=0.0):

@@ -1,8 +1,6 @@
 """A headless Chromium, driven by the DevTools protocol over two pipes."""
 
-import base64
 import contextlib
-import io
 import itertools
 import json
 import os
@@ -11,9 +9,6 @@ import shutil
 import signal
 import tempfile
 import time
-
-import numpy as np
-from PIL import Image
 
 NAME = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ARGUMENTS = """--headless --no-sandbox --disable-gpu --disable-background-networking --disable-sync
@@ -65,11 +60,6 @@ class Page:
             assert time.monotonic() < until, f"the page is not ready: {self.errors}"
             time.sleep(0.05)
         self.evaluate("new Promise((done) => setTimeout(done, 300))")  # until it is painted
-
-    def picture(self):
-        """What is seen, uint8 (height, width, 3)."""
-        shot = base64.b64decode(self.call("Page.captureScreenshot")["data"])
-        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
 
     def _next(self):
         while b"\0" not in self._left:

@@ -15,7 +15,7 @@ from gnio_jax.models import Network
 from gnio_jax.types import Prediction, Waypoints
 
 RATE = 50.0
-CONFIG = DataConfig(rate=RATE)
+CONFIG = DataConfig(rate=RATE, context_seconds=0.2)
 OPTIONS = FilterSettings()
 
 

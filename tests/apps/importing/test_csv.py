@@ -10,12 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
-from gnio_jax.apps import importing
 from gnio_jax.apps.importing import read_imported, write_imported
-from gnio_jax.config import ImportOptions
 from gnio_jax.data.parsing.units import named_unit
 from gnio_jax.data.readers import csv_files
-from gnio_jax.errors import InputError
 from tests.support import known_walk
 from tests.support.csv_writers import AXES, SECONDS, compare_imu, imu, write, write_native
 from tests.support.importing import import_recording, imported, refused
@@ -49,15 +46,13 @@ def write_logger(path, unit="ns", gyro=1.0, accel=1.0, separator=",", spoil=None
 # --- units and signs
 
 
-_FACTORS = [(1.0, 1.0), (180 / np.pi, 1 / G), (1.0, 1000 / G)]
-
-
 @pytest.mark.parametrize(
     ("unit", "gyro", "accel", "separator"),
     [
-        *((unit, gyro, accel, ",") for unit in UNITS for gyro, accel in _FACTORS),
-        ("ns", 1.0, 1.0, ";"),
-        ("ns", 1.0, 1.0, "\t"),
+        ("s", 1.0, 1.0, ","),
+        ("ms", 180 / np.pi, 1 / G, ";"),
+        ("us", 1.0, 1000 / G, ","),
+        ("ns", 180 / np.pi, 1.0, "\t"),
     ],
 )
 def test_units_and_separators_are_detected_and_reported(tmp_path, unit, gyro, accel, separator):
@@ -73,18 +68,13 @@ def test_units_and_separators_are_detected_and_reported(tmp_path, unit, gyro, ac
     assert f"gyro taken as {'rad/s' if gyro == 1.0 else 'deg/s'}" in text
     assert f"accel taken as {'m/s2' if accel == 1.0 else 'g' if accel < 1 else 'mg'}" in text
     assert "uniform clock of 200 Hz" in text and "quietest second accel reads" in text
-
-
-@pytest.mark.parametrize(
-    ("name", "unit"), [("gyro_unit", "deg/s"), ("accel_unit", "g"), ("time_unit", "ns")]
-)
-def test_a_stated_unit_is_taken_and_not_reported_as_detected(tmp_path, name, unit):
-    path = write_logger(tmp_path / "phone.csv", gyro=180 / np.pi, accel=1 / G)
-    sequence, notes = import_recording(path, MAPPED, **{name: unit})
-    compare_imu(sequence)
-    start = f"phone.csv: {name.removesuffix('_unit')}"
-    detected = (f"{start} taken as", f"{start} of gyro taken as")
-    assert not any(note.startswith(detected) for note in notes) and len(notes) >= 4
+    # Units that are stated are taken, and not reported as detected.
+    names = ["rad/s" if gyro == 1.0 else "deg/s", "m/s2" if accel == 1.0 else "g"]
+    if accel < 10:
+        stated = {"time_unit": unit, "gyro_unit": names[0], "accel_unit": names[1]}
+        sequence, notes = import_recording(path, MAPPED, **stated)
+        compare_imu(sequence)
+        assert not any(" taken as " in note for note in notes) and len(notes) >= 2
 
 
 def test_a_wrong_statement_is_refused_by_what_it_makes_of_the_data(tmp_path):
@@ -92,15 +82,6 @@ def test_a_wrong_statement_is_refused_by_what_it_makes_of_the_data(tmp_path):
     refused(path, "field 'time' makes gyro run at 0.0002 Hz with", MAPPED, time_unit="ms")
     refused(path, "field 'accel'", MAPPED, accel_unit="g")
     refused(path, "rate: 0 Hz", MAPPED, rate=0.0)
-    for name, value, words in (
-        ("time_unit", "hours", "unknown value 'hours'; known: s, ms, us, ns"),
-        ("gyro_unit", "rpm", "unknown value 'rpm'"),
-        ("accel_sign", "up", "unknown value 'up'"),
-    ):
-        stated = ImportOptions()
-        object.__setattr__(stated, name, value)  # the tests' type checks refuse it at once
-        with pytest.raises(InputError, match=words):
-            importing.import_recording(path, stated)
 
 
 def test_slow_turns_tell_their_unit_by_the_turning_of_gravity(tmp_path):
@@ -149,21 +130,11 @@ def test_a_header_tells_the_unit(tmp_path):
     path.write_text(path.read_text().replace(" [deg/s]", ""))
     plain = {name: label.split()[0] for name, label in names.items()}
     refused(path, "the unit of field 'gyro' is ambiguous", plain)
-    for label, unit in {
-        "Gyroscope x (rad/s)": "rad/s",
-        "w_RS_S_x [rad s^-1]": "rad/s",
-        "X (°/s)": "deg/s",
-        "wx [dps]": "deg/s",
-        "Acceleration x (m/s^2)": "m/s2",
-        "a_RS_S_x [m s^-2]": "m/s2",
-        "Time (s)": "s",
-        "#timestamp [ns]": "ns",
-        "accel (g)": "g",
-        "Magnetic field x (µT)": None,
-        "gyro_x": None,
-        "g": None,
-    }.items():
-        assert named_unit(label) == unit
+    labels = ["w_RS_S_x [rad s^-1]", "X (°/s)", "wx [dps]", "a_RS_S_x [m s^-2]", "#timestamp [ns]"]
+    units = ["rad/s", "deg/s", "deg/s", "m/s2", "ns"]
+    assert [*map(named_unit, labels)] == units
+    assert named_unit("accel (g)") == "g"
+    assert not any(map(named_unit, ["Magnetic field x (µT)", "gyro_x", "g"]))
 
 
 def test_signs_are_turned_when_stated_or_asked_for(tmp_path):
@@ -231,7 +202,7 @@ def test_gravity_and_user_acceleration_apart_are_summed(tmp_path):
 
 @pytest.mark.parametrize("quoted", [True, False])
 def test_a_header_as_editors_and_spreadsheets_leave_it(tmp_path, quoted):
-    """A byte order mark, and quoted names, or decimal commas behind whole numbers."""
+    """A byte order mark, a comment, and quoted names, or decimal commas behind whole numbers."""
     path = write_logger(tmp_path / "phone.csv", "ms", separator=";")
     first, *rows = path.read_text().splitlines()
     if quoted:
@@ -239,16 +210,10 @@ def test_a_header_as_editors_and_spreadsheets_leave_it(tmp_path, quoted):
     else:
         rows = [row.replace(".", ",") for row in rows]
         rows[0] = ";".join(cell.split(",")[0] for cell in rows[0].split(";"))
-    path.write_bytes("\r\n".join(["\ufeff" + first, *rows]).encode())
+    path.write_bytes("\r\n".join(["\ufeff# of Monday, a, b", "", first, *rows]).encode())
     sequence, _ = import_recording(path, MAPPED)
     inner = slice(100, 110)
     np.testing.assert_allclose(sequence.accel[inner], imu(sequence.time[inner])[:, 3:], atol=1e-3)
-
-
-def test_a_comment_above_the_header_is_none(tmp_path):
-    path = write_native(tmp_path / "walk.csv")
-    path.write_text("# walk of Monday, a, b\n\n" + path.read_text())
-    assert import_recording(path)[0].valid.all()
 
 
 def test_files_without_a_header_are_read_by_the_places_of_their_columns(tmp_path):
@@ -265,8 +230,6 @@ def test_files_without_a_header_are_read_by_the_places_of_their_columns(tmp_path
     stated = {"accel_path": paths[1], "gyro_unit": "rad/s"}
     summed, _ = import_recording(paths[0], columns | {"gyro_x": "1+2"}, **stated)
     np.testing.assert_allclose(summed.gyro[:, 0], sequence.gyro[:, :2].sum(axis=1), atol=1e-9)
-    words = r"gyro\.txt: column '4' is missing; found: 0, 1, 2, 3"
-    refused(paths[0], words, columns | {"gyro_z": "4"}, accel_path=paths[1])
     words = "has 4 columns of numbers and no header; .* time=0 gyro_x=1 gyro_y=2 gyro_z=3$"
     refused(paths[0], words, accel_path=paths[1])
 
@@ -290,9 +253,7 @@ def test_rows_of_one_sensor_each_are_told_apart(tmp_path):
 # --- stamps
 
 
-def test_rows_out_of_order_are_sorted_unless_the_clock_was_set_back(tmp_path):
-    """Sorted, the samples of two times would lie among each other: noise of twice the rate. A
-    block in the wrong place only has to be moved."""
+def test_what_is_repaired_of_the_stamps_is_noted(tmp_path):
     order = np.arange(2800)
     order[[100, 140]] = order[[140, 100]]
     order = np.delete(np.insert(order, 700, order[700]), [1000, 1001])
@@ -300,42 +261,20 @@ def test_rows_out_of_order_are_sorted_unless_the_clock_was_set_back(tmp_path):
     compare_imu(sequence)
     assert "mixed.csv: gyro had 2 steps back in time; its rows were sorted" in notes
     assert "mixed.csv: 1 rows of accel repeat a stamp and were dropped" in notes
-    moved = np.r_[1000:1600, 0:1000, 1600:2800]
+    moved = np.r_[1000:1600, 0:1000, 1600:2800]  # a block in the wrong place
     compare_imu(import_recording(write_logger(tmp_path / "moved.csv", rows=moved), MAPPED)[0])
-
-    def back(columns):
-        later = np.arange(2800) >= 1500
-        return columns | {"Timestamp": columns["Timestamp"] - later * 2_003_000_000}
-
-    problem = r"back\.csv: gyro: field 'time' jumps back by 2\.00 s after 7\.495.* s, .*overlaps"
-    refused(write_logger(tmp_path / "back.csv", spoil=back), problem, MAPPED)
-
-
-def test_a_clock_too_coarse_and_gaps_are_told(tmp_path):
-    path = write_logger(
-        tmp_path / "coarse.csv", spoil=lambda c: c | {"Timestamp": c["Timestamp"] // 10**7 * 10**7}
-    )
-    refused(path, "'time' gives 1400 of 2800 rows the same stamp .*; give stamps fine", MAPPED)
     path = write_logger(tmp_path / "holes.csv", rows=np.r_[0:1000, 1079:2800])
     _, notes = import_recording(path, MAPPED)
-    assert any("gyro lacks samples 1 times, for up to 0.40 s" in note for note in notes)
-    path = write_logger(tmp_path / "lost.csv", rows=np.r_[0:1000, 1280:2800])
-    refused(path, r"lost\.csv: field 'time' has a gap of 1\.405 s", MAPPED)
+    assert "holes.csv: gyro lacks samples 1 times, for up to 0.40 s; bridged linearly" in notes
 
 
-@pytest.mark.parametrize("rate", [10.5, 40.0, 48.0, 60.0])
-def test_slow_recordings_with_jitter_have_no_holes(tmp_path, rate):
-    """Each sensor on its own stamps, which jitter by a fifth of an interval."""
-    draw = np.random.default_rng(3)
-    stamps = np.arange(round(14.0 * rate)) / rate
-    gyro, accel = (stamps + draw.uniform(-0.2, 0.2, len(stamps)) / rate for _ in range(2))
-    write(tmp_path / "gyro.csv", ["time", *AXES[:3]], [gyro, *imu(gyro)[:, :3].T])
-    write(tmp_path / "accel.csv", ["time", *AXES[3:]], [accel, *imu(accel)[:, 3:].T])
-    given = {"accel_path": tmp_path / "accel.csv", "gyro_unit": "rad/s"}
-    sequence, notes = import_recording(tmp_path / "gyro.csv", **given)
-    assert sequence.imu_valid is None
-    assert not any("lacks samples" in note for note in notes)
-    assert any("which is slow" in note for note in notes) == (rate < 50.0)
+def test_a_slow_clock_that_jitters_has_no_holes(tmp_path):
+    """At 10.5 Hz two samples lie more than 0.1 s apart half of the time."""
+    time = np.arange(150) / 10.5 + np.random.default_rng(3).uniform(-0.02, 0.02, 150)
+    path = write(tmp_path / "slow.csv", ["time", *AXES], [time, *imu(time).T])
+    sequence, notes = import_recording(path, gyro_unit="rad/s")
+    assert sequence.imu_valid is None and not any("lacks samples" in note for note in notes)
+    assert any("which is slow" in note for note in notes)
 
 
 @pytest.mark.parametrize(("gyro_rate", "accel_rate"), [(208.0, 100.0), (100.0, 197.0)])
@@ -369,13 +308,11 @@ def test_one_file_per_sensor_is_joined_on_one_clock(tmp_path, gyro_rate, accel_r
     assert sequence.attributes["start_time"] == pytest.approx(UNIX * 1e-9 + start, abs=2e-6)
     assert any("both are interpolated to one clock, and 1.0" in note for note in notes), notes
 
-    accelerometer("us")  # one clock, but another unit
-    same, _ = import_recording(gyro, columns, **given)
-    np.testing.assert_allclose(same.accel[inner], known[inner, 3:], atol=1e-3)
-
-    # One of them stops for half a second: what is there of the other is no whole sample either.
+    # In another unit, and it stops for a while: what is there of the other is no whole sample.
     accelerometer("us", rows=(accel_time < 4.0) | (accel_time > 4.5))
     holed, _ = import_recording(gyro, columns, **given)
+    early = slice(20, 350)
+    np.testing.assert_allclose(holed.accel[early], known[early, 3:], atol=1e-3)
     missing = holed.time[~holed.imu_valid] + start
     assert len(missing) == pytest.approx(50, abs=3)
     assert missing[[0, -1]] == pytest.approx([4.0, 4.5], abs=0.02)

@@ -51,7 +51,6 @@ def test_what_is_no_recording(tmp_path):
     with h5py.File(tmp_path / "walk.h5", "w"):
         pass
     (tmp_path / "noise.csv").write_bytes(bytes(range(128, 256)) * 9)
-    (tmp_path / "words.txt").write_text("The quick brown fox\njumps over the lazy dog\n")
     (tmp_path / "empty.csv").write_text("")
     (tmp_path / "empty").mkdir()
     (tmp_path / "bag").mkdir()
@@ -66,7 +65,6 @@ def test_what_is_no_recording(tmp_path):
         "c.db3": "c.db3: cannot be read as a ROS 2 bag",
         "walk.h5": "walk.h5: is HDF5 already; check it with gnio data check",
         "noise.csv": "noise.csv: is no text",
-        "words.txt": "words.txt: ",
         "empty.csv": "empty.csv: holds no row",
         "empty": "empty: has the layout of no known recording .found: no CSV file.; known: CSV",
         "bag": "bag: cannot be read as a ROS 2 bag",

@@ -52,10 +52,8 @@ RAW = "AccelerometerUncalibrated.csv: accel taken as"
     ("platform", "standardised", "dropped", "words"),
     [
         ("android", False, (), "(Android); time in ns, Gyroscope.csv in rad/s, TotalAcceleration."),
-        ("android", False, ("Metadata.csv",), "Sensor Logger (Android)"),
         ("android", False, ("TotalAcceleration.csv",), SUM),
         ("ios", False, (), f"(iOS); time in ns, Gyroscope.csv in rad/s, {SUM}"),
-        ("ios", True, (), "Sensor Logger (iOS)"),
         ("ios", False, ("Accelerometer.csv",), f"{RAW} g"),
         ("ios", True, ("Accelerometer.csv",), f"{RAW} m/s2"),
     ],
@@ -119,10 +117,6 @@ def test_gravity_of_other_stamps_is_interpolated(tmp_path):
             "walk.zip: has no accelerometer .found: Gyroscope.csv.; record the gyroscope",
         ),
         (
-            {"Magnetometer.csv": sensor_logger()["Magnetometer.csv"]},
-            "walk.zip: has no gyro .found: Magnetometer.csv.",
-        ),
-        (
             without(sensor_logger("ios"), "Gravity.csv", "AccelerometerUncalibrated.csv"),
             "walk.zip: holds acceleration without gravity .Accelerometer.csv.; record .* Gravity",
         ),
@@ -140,10 +134,8 @@ def test_gravity_of_other_stamps_is_interpolated(tmp_path):
         ),
         (sensor_logger(seconds=0.5), "walk.zip: both sensors were recorded for 0.49 s, less than"),
         ({"notes.txt": "hello"}, "layout of no known recording .found: no CSV file.; known"),
-        ({"notes.csv": "\0\1\2 nothing"}, "the layout of no known recording .found: notes.csv"),
         ({"a.csv": "\xff" * 9}, "the layout of no known recording .found: a.csv"),
         (sensor_logger() | {"../../etc/Gyroscope.csv": "x"}, r"2 recordings: ., \.\./\.\./etc"),
-        (sensor_logger() | {"/Gyroscope.csv": "x"}, "holds 2 recordings: ., /; give one"),
         ({f"{number}.csv": "" for number in range(201)}, "walk.zip: holds 201 CSV files"),
     ],
 )
@@ -186,9 +178,7 @@ def test_a_zip_cut_short_or_with_a_member_that_lies_about_its_size_is_one_line(t
 # --- phyphox
 
 
-@pytest.mark.parametrize(
-    ("separator", "decimal"), [(",", "."), ("\t", "."), (";", "."), ("\t", ","), (";", ",")]
-)
+@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), ("\t", ","), (";", ",")])
 def test_phyphox_as_text(tmp_path, separator, decimal):
     sequence, notes = import_recording(zipped(tmp_path / "w.zip", phyphox(separator, decimal)))
     compare(sequence)
@@ -251,6 +241,7 @@ def test_phyphox_of_an_earlier_release_in_another_language_in_degrees(tmp_path):
     del sets["Beschleunigung"]
     words = "walk.zip: holds acceleration without gravity .Linear Accelerometer.csv.; record"
     refused(zipped(path, phyphox(sets=sets)), words)
+    # Gravity is found by its stamps, in any order.
     for rows in (slice(None), np.random.default_rng(0).permutation(len(later))):
         sets["Gravity"] = (later[rows], down[rows], axes("Gravity", "m/s^2"))
         compare(import_recording(zipped(path, phyphox(sets=sets)))[0])

@@ -44,15 +44,16 @@ def test_every_kind_of_bag(tmp_path, kind):
     "kind", ["Pose", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped"]
 )
 def test_every_kind_of_reference(tmp_path, kind):
-    make = Maker()
-    entries = imu(make) + poses(make, kind, ONE, child="imu_link")
+    """Slow poses follow splines: a lidar's 10 Hz."""
+    make, slow = Maker(), kind == "PoseStamped"
+    entries = imu(make) + poses(make, kind, ONE, rate=10.0 if slow else 50.0, child="imu_link")
     sequence, notes = import_recording(write(tmp_path, "mcap", entries))
     if kind == "Pose":  # without a header: stamped by the bag
         assert sequence.valid[100:-100].all()
         late = known_walk.position(sequence.time[100:-100] - LOGGED * 1e-9)
         np.testing.assert_allclose(sequence.position[100:-100], late, atol=2e-3)
     else:
-        compare_reference(sequence, INNER, 2e-3)
+        compare_reference(sequence, INNER, 2e-2 if slow else 2e-3)
     text = " | ".join(notes)
     mixed = "/pose has no stamps in its headers, so those of the bag are taken"
     assert (mixed in text) == (kind == "Pose")
@@ -90,15 +91,6 @@ def test_transforms_need_a_frame_where_several_move(tmp_path):
     words = "topic /tf moves the frames imu_link, wheel; name one: --reference-topic /tf:FRAME"
     refused(path, words, reference_topic="/tf")
     compare_reference(import_recording(path, reference_topic="/tf:imu_link")[0], INNER, 2e-3)
-
-
-def test_slow_poses_follow_splines(tmp_path):
-    """A lidar's 10 Hz."""
-    make = Maker()
-    entries = imu(make) + poses(make, "Odometry", ONE, rate=10.0, child="imu_link")
-    sequence, _ = import_recording(write(tmp_path, "mcap", entries))
-    compare_reference(sequence, INNER, 2e-2)
-    assert sequence.valid.mean() > 0.9
 
 
 def test_empty_headers_leave_the_bags_stamps(tmp_path):
@@ -172,12 +164,12 @@ def test_a_reference_that_is_none_is_left_out_unless_it_was_named(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["rosbag1", "db3", "mcap"])
-@pytest.mark.parametrize("kept", [0.1, 0.9, 0.99])
-def test_a_bag_cut_short_is_one_line(tmp_path, kind, kept):
+def test_a_bag_cut_short_is_one_line(tmp_path, kind):
     path = write(tmp_path, kind, imu(Maker(kind), seconds=2.0))
     whole = path.read_bytes()
-    path.write_bytes(whole[: int(kept * len(whole))])
-    refused(path, f"{path.name}: (cannot be read as a ROS . bag, it may be|is) cut short")
+    for kept in (0.1, 0.9, 0.99):
+        path.write_bytes(whole[: int(kept * len(whole))])
+        refused(path, f"{path.name}: (cannot be read as a ROS . bag, it may be|is) cut short")
 
 
 def test_a_bag_whose_index_counts_wrongly_is_one_line(tmp_path):
@@ -194,8 +186,7 @@ class Bug(Exception):
     """Of ours."""
 
 
-@pytest.mark.parametrize("error", [Bug, MemoryError])
-@pytest.mark.parametrize("kind", ["rosbag1", "mcap"])
+@pytest.mark.parametrize("error, kind", [(Bug, "rosbag1"), (MemoryError, "mcap")])
 def test_only_what_a_library_cannot_read_is_called_damage(tmp_path, monkeypatch, error, kind):
     def fails(_):
         raise error

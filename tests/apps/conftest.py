@@ -1,0 +1,39 @@
+"""`gnio` as a person types it."""
+
+import io
+import sys
+
+import pytest
+
+from gnio_jax.commands import app, console
+
+
+@pytest.fixture
+def gnio(monkeypatch, capsys):
+    """What `gnio` prints, with these lines on its standard input."""
+    monkeypatch.setattr("gnio_jax.evaluation.plots.DOTS_PER_INCH", 30)
+
+    def call(*words, lines=()):
+        content = "\n".join(lines).encode("utf-8", "surrogateescape")
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
+        monkeypatch.setattr(sys, "argv", ["gnio", *map(str, words)])
+        console.run(app.main)
+        told = capsys.readouterr()
+        assert "\x1b" not in told.out + told.err  # no terminal: no control characters
+        return told.out
+
+    return call
+
+
+@pytest.fixture
+def mistake(gnio, capsys):
+    """The one line with which `gnio` ends, and a status of 2."""
+
+    def call(*words, lines=()):
+        with pytest.raises(SystemExit, match="2"):
+            gnio(*words, lines=lines)
+        told = capsys.readouterr()
+        assert told.err.count("\n") == 1, told.err
+        return told.err
+
+    return call
