@@ -102,17 +102,6 @@ def test_poses_that_are_not_of_this_phone_are_refused(tmp_path, options, words):
         read_whole(write(tmp_path, frame(seconds=20.0, **options)))
 
 
-def test_a_piece_shorter_than_a_window_is_lost_and_the_other_keeps_the_name(tmp_path):
-    table = frame(seconds=12.0, lag=0.1).iloc[:13]
-    table = pd.concat([table, frame(lag=0.1, start=16.02)])
-    message = r"14\.feather: .*\(1, up to 15\.9 s\); kept: 35\.9 of 51\.9 s, 1 of 2 pieces"
-    with pytest.warns(UserWarning, match=message):
-        sequence = read_whole(write(tmp_path, table, "building3/known", 14))
-    assert len(compare(sequence)) > 3550
-    assert sequence.attributes["start_time"] - EPOCH == pytest.approx(16.02, abs=0.02)
-    assert sequence.name == "building3_known_14"
-
-
 def test_a_hole_of_two_seconds_costs_two_seconds(tmp_path):
     """Nothing of the hole is left for a filter to integrate."""
     table = frame(seconds=38.0, lag=0.15)

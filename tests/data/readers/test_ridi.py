@@ -51,23 +51,6 @@ def test_table_comes_back(tmp_path, shuffled):
     assert a["truth"] == "Tango VIO of the phone itself" and "not stated" in a["licence"]
 
 
-def test_of_a_recording_with_a_gap_both_pieces_are_kept(tmp_path):
-    time = np.arange(int(walk.SECONDS * 202.3)) / 202.3
-    path = write_table(tmp_path, "huayi_bag2", time=time[(time < 9.0) | (time > 13.4)])
-    with pytest.warns(UserWarning) as caught:
-        pieces = ridi.read(path.parent.parent)
-    (warning,) = caught
-    assert str(path) in str(warning.message)
-    assert "(1, up to 4.4 s); kept: 31.6 of 36.0 s, 2 of 2 pieces" in str(warning.message)
-    assert [piece.name for piece in pieces] == ["huayi_bag2_piece1", "huayi_bag2_piece2"]
-    for sequence, begin, seconds in zip(pieces, (0.0, 13.4), (9.0, 22.6), strict=True):
-        time = compare(sequence)
-        assert time[0] == pytest.approx(begin, abs=0.02)
-        assert len(time) == pytest.approx(seconds * 200, abs=3)
-        assert sequence.valid.all() and sequence.time[0] == 0.0
-        assert sequence.attributes["group"] == "huayi"
-
-
 def test_the_cache_is_keyed_by_the_files_that_are_read(tmp_path):
     folder = write_text(tmp_path, "hang_leg1", "android_sensor_pose.txt", seconds=5.0)
     sensors = {path.name for path in folder.iterdir()}
