@@ -73,6 +73,16 @@ def test_single_jumps_and_flips_of_a_tracker_are_bridged():
     compare(found, 6e-3, 0.5, 0.05)
 
 
+def test_a_flip_of_a_second_is_not_valid_and_turns_nothing_around_it():
+    poses = tracked(np.arange(0.0, 30.0, 1.0 / 60.0), noisy=True)
+    poses.attitude[600:660] = poses.attitude[600:660] * Rotation.from_euler("x", 120, degrees=True)
+    found = reference_at(CLOCK, walk.rate(CLOCK), poses)
+    assert not found.valid[(CLOCK > 10.05) & (CLOCK < 10.95)].any()
+    assert found.valid[(CLOCK < 9.8) | (CLOCK > 11.2)][20:-20].all()
+    error = rotations(found.orientation[20:-20]) * walk.attitude(CLOCK[20:-20]).inv()
+    assert np.degrees(error.magnitude()).max() < 0.5
+
+
 def test_a_tracker_that_saw_nothing_of_the_imu_gives_no_reference():
     """It was lost before the first sample and came back after the last."""
     stamps = np.concatenate([np.arange(-10.0, -5.0, 1 / 60.0), np.arange(35.0, 40.0, 1 / 60.0)])

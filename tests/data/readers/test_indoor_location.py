@@ -42,7 +42,7 @@ def test_a_walk_comes_back_with_its_waypoints(tmp_path):
 def test_lines_without_a_newline_between_them_are_divided(tmp_path):
     text = lines()
     tap = next(i for i, line in enumerate(text[50:], 50) if "WAYPOINT" in line)
-    for row in (tap, tap - 40, 20):
+    for row in (tap - 1, tap - 40, 20):
         text[row : row + 2] = [text[row] + text[row + 1]]
     (sequence,) = indoor_location.read(write(tmp_path, text))
     check_walk(sequence)
