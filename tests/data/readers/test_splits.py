@@ -40,8 +40,7 @@ COPIES = {
         text ronin/lists/list_test_unseen.txt a006_2
         split train a001_1 a000_1
         split val a009_2
-        split test a011_2
-        split seen a011_2
+        split test,seen a011_2
         split unseen a006_2
         warns train list_train.txt: 1 of 3 listed sequences are absent: a007_3""",
     "ridi": r"""
@@ -53,15 +52,13 @@ COPIES = {
         text deep/list_crosssubject.txt # others|shali_bag1|ruixuan_bag1
         split train dan_bag1 dan_leg2 hang_bag1 hao_bag1 hao_body1 yajie_leg1
         split val ma_bag1
-        split test hang_leg7
-        split seen hang_leg7
+        split test,seen hang_leg7
         split unseen shali_bag1
         split all dan_bag1 dan_bag9 dan_leg2 hang_bag1 hang_leg7 hao_bag1 hao_body1 ma_bag1 \
 shali_bag1 yajie_leg1
         warns train 1 of 8 listed sequences are absent: zhicheng_bag1,bag
         warns val absent: zhicheng_bag1
-        warns test absent: hang_leg_new3
-        warns seen absent: hang_leg_new3
+        warns test,seen absent: hang_leg_new3
         warns unseen absent: ruixuan_bag1""",
     "idol": rf"""
         files deep/building1/train/{{}}.feather 0 1 2 3 4 5 6 7 8 9
@@ -74,18 +71,14 @@ shali_bag1 yajie_leg1
         split train building1_train_0 building1_train_1 building1_train_2 building1_train_3 \
 building1_train_4 building1_train_5 building1_train_8 building1_train_9
         split val building1_train_6 building1_train_7
-        split known building1_known_0 building2_known_9 building2_known_10
-        split seen building1_known_0 building2_known_9 building2_known_10
-        split test building1_known_0 building2_known_9 building2_known_10
-        split unknown building3_unknown_0
-        split unseen building3_unknown_0""",
+        split known,seen,test building1_known_0 building2_known_9 building2_known_10
+        split unknown,unseen building3_unknown_0""",
     "euroc": r"""
         files {}/mav0/imu0/data.csv machine_hall/MH_01_easy machine_hall/MH_05_difficult
         files {}/mav0/imu0/data.csv V1_02_medium V2_03_difficult my_flight
         split train MH_01_easy
         split val V1_02_medium
-        split test MH_05_difficult my_flight
-        split seen MH_05_difficult my_flight
+        split test,seen MH_05_difficult my_flight
         split unseen V2_03_difficult""",
     "tumvi": r"""
         files dataset-{}_16/mav0/imu0/data.csv room1_512 room1_1024 room2_1024 room3_512
@@ -130,8 +123,7 @@ Thibaud_Nexus5_Dist_AR Thibaud_iPhone5_NoDist_AR""",
         text deep/deeper/running/Train.txt data1/imu1.csv
         text deep/deeper/running/Test.txt data1/imu7.csv
         split train handheld_data1_2
-        split test handheld_data5_1 running_data1_7
-        split seen handheld_data5_1 running_data1_7
+        split test,seen handheld_data5_1 running_data1_7
         warns train 2 entries of the lists Train.txt are not in this copy""",
 }
 """What lies below a root: files by a path and what stands in it for `{}` (folders, where it ends
@@ -141,10 +133,11 @@ the names of each split, and what is said of entries of its list that the copy l
 
 def entries(name, kind):
     """(name, rest) of the lines of this kind."""
-    lines = (
-        line.split(maxsplit=2) for line in COPIES[name].replace("\\\n", "").strip().splitlines()
-    )
-    return [(each[1], each[2]) for each in lines if each[0] == kind]
+    lines = COPIES[name].replace("\\\n", "").strip().splitlines()
+    words = (line.split(maxsplit=2) for line in lines)
+    return [
+        (each, rest) for found, names, rest in words if found == kind for each in names.split(",")
+    ]
 
 
 @pytest.fixture
