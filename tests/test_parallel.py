@@ -252,9 +252,7 @@ def test_each_device_has_the_state_and_its_part_of_the_batch(small, on_two):
     assert [shard.data.shape[0] for shard in windows.imu.addressable_shards] == [8, 8]
 
 
-def test_a_cpu_is_one_device_unless_asked_for_more():
-    with parallel.sharing():
-        assert parallel.count() == 1
+def test_a_number_of_devices_that_there_is_not_is_refused():
     for limit, expected in ((3, "--devices: is 3, but process 0 has 2"), (0, "--devices: must be")):
         with pytest.raises(InputError, match=expected), parallel.sharing(limit):
             pass
@@ -341,10 +339,11 @@ def test_one_process_meets_nobody(monkeypatch):
 
 def test_with_one_device_nothing_is_placed_nor_constrained():
     rows = jnp.arange(6)
-    with parallel.sharing(1):
-        assert parallel.count() == 1 and parallel.described() == "cpu"
-        assert parallel.split(rows) is rows and parallel.replicated(rows) is rows
-        assert parallel.everywhere(np.arange(6)).sharding == rows.sharding
+    for limit in (1, None):  # a CPU is one device unless asked for more
+        with parallel.sharing(limit):
+            assert parallel.count() == 1 and parallel.described() == "cpu"
+            assert parallel.split(rows) is rows and parallel.replicated(rows) is rows
+            assert parallel.everywhere(np.arange(6)).sharding == rows.sharding
     with parallel.sharing(2):
         assert parallel.count() == 2 and parallel.described() == "2 × cpu"
         assert parallel.everywhere(np.arange(6)).sharding.spec == PartitionSpec()
