@@ -37,3 +37,9 @@ def mistake(gnio, capsys):
         return told.err
 
     return call
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Tracks without picture and page, which take a second."""
+    monkeypatch.setattr("gnio_jax.apps.track._draw", lambda *_: None)

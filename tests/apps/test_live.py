@@ -284,7 +284,9 @@ def test_a_stream_without_a_start_is_told_why(mistake, run, recorded, samples, p
     assert f"standard input: {problem}" in mistake("live", "--weights", run, lines=lines)
 
 
-def test_a_recording_played_gives_the_track_of_it(gnio, follow, run, monkeypatch, tmp_path):
+def test_a_recording_played_gives_the_track_of_it(
+    gnio, undrawn, follow, run, monkeypatch, tmp_path
+):
     """A second and a half of rest with a biased gyro, and a walk that lacks half a second: as long
     as those of the tests of tracks. Only while the rest is not yet seen there is no pose."""
     _, gyro, accel = walked(seconds=5.5)

@@ -122,7 +122,7 @@ def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
     assert "gyro bias: mean of 5 s of rest" in told
 
 
-def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, runs, tmp_path, monkeypatch):
+def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_path, monkeypatch):
     time = np.delete(np.arange(120), np.s_[60:70]) / 20
     slow = csv(tmp_path / "slow.csv", time)
     monkeypatch.setattr("gnio_jax.apps.packages.SHIPPED", tmp_path)
@@ -174,7 +174,7 @@ def without_poses(name, time):
     return Sequence(name, time, *signals, level, nothing, nothing, valid)
 
 
-def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
+def test_our_own_file_with_holes(gnio, undrawn, mistake, runs, tmp_path):
     """It comes to the tracker as it is: nobody has looked for holes yet."""
     given = ("track", tmp_path / "walk.h5", "--weights", runs / "walker")
     for lost, name in ((70, "../../walk"), (320, "walk")):

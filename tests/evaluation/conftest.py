@@ -14,6 +14,12 @@ def few_dots(monkeypatch):
     monkeypatch.setattr("gnio_jax.evaluation.plots.DOTS_PER_INCH", 30)
 
 
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Where there would be pictures, their folder alone is made."""
+    monkeypatch.setattr("gnio_jax.evaluation.plots.save_all", lambda folder, *_: folder.mkdir())
+
+
 @pytest.fixture(scope="session")
 def walks():
     """As a filter sees them of one length: none is a fifth shorter than the longest."""

@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
 from mcap.writer import Writer as McapWriter
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 
 from tests.support import known_walk
 
@@ -49,10 +51,9 @@ class Maker:
 
     def pose(self, time, mount):
         """Of the body on which the IMU sits at `mount` (rotation, lever)."""
-        attitude = known_walk.attitude(time) * mount[0].inv()
-        place = known_walk.position(time) - attitude.apply(mount[1])
-        position = self.vector(place, "Point")
-        return self.new("geometry_msgs/msg/Pose", position, self.quaternion(attitude))
+        quaternion, place = _body(time, tuple(mount[0].as_quat()), tuple(mount[1]))
+        turn = self.new("geometry_msgs/msg/Quaternion", *quaternion)
+        return self.new("geometry_msgs/msg/Pose", self.vector(place, "Point"), turn)
 
     def transform(self, time, mount, frame, child):
         pose = self.pose(time, mount)
@@ -72,6 +73,12 @@ class Maker:
         )
         one = self.joined(self.header(0.0, parent), child, moved)
         return self.new("tf2_msgs/msg/TFMessage", [one])
+
+
+@functools.cache
+def _body(time, turn, lever):
+    attitude = known_walk.attitude(time) * Rotation.from_quat(turn).inv()
+    return attitude.as_quat().tolist(), known_walk.position(time) - attitude.apply(lever)
 
 
 def rows(topic, name, times, message):
