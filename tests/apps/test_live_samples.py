@@ -24,14 +24,14 @@ def by_stamp(*rows):
     return sorted(itertools.chain(*rows), key=lambda row: row.time)
 
 
-def at_100_hz(seconds=5.0):
+def at_100_hz(seconds=3.0):
     """Rows of both sensors, the gyro 3 ms behind the accelerometer."""
     times = np.arange(0.0, seconds, 0.01)
     return [accel(t) for t in times], [gyro(t + 0.003) for t in times]
 
 
 def whole(found):
-    return [row for row in found if row is not None and np.isfinite([row.gyro, row.accel]).all()]
+    return [row for row in found if row and all(map(math.isfinite, (*row.gyro, *row.accel)))]
 
 
 def taken_by_a_tracker(rows):
@@ -111,7 +111,7 @@ def test_without_the_accelerometer_the_gyro_waits_no_longer_than_it_must():
     assert [sample.time for sample in given] == [row.time for row in rows[1:]]
 
 
-@pytest.mark.parametrize("late", [0.0, 0.006, 0.011, 0.05, 0.09, -0.006, -0.02, -0.05, -0.09])
+@pytest.mark.parametrize("late", [0.0, 0.011, 0.09, -0.006, -0.09])
 @pytest.mark.parametrize("between", [None, 0.02])
 def test_either_sensor_may_come_late(late, between):
     """In the order of arrival, the gyro `late` s after the accelerometer: where rows of it are
@@ -120,7 +120,7 @@ def test_either_sensor_may_come_late(late, between):
     turned = [*turned[:200], *turned[203:]]
     rows = [(row.time, row) for row in pulled] + [(row.time + late, row) for row in turned]
     if between:
-        times = np.arange(1.001, 5.0, between)  # once the gyro has rows of its own
+        times = np.arange(1.001, 3.0, between)  # once the gyro has rows of its own
         rows += [(time, Sample(time, MISSING, MISSING)) for time in times]
     arrived = [row for _, row in sorted(rows, key=lambda pair: pair[0])]
     found = whole(taken_by_a_tracker(arrived))
