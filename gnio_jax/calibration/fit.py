@@ -181,6 +181,11 @@ def fit_innovations(
         warnings.append(
             f"{limit}, before it had found the best settings; give fewer groups to --fit"
         )
+    elif not found.success:
+        warnings.append(
+            f"the fit stopped after {found.nit} steps, because no step along the gradient made the "
+            "innovations more likely; the settings are the best ones that it found"
+        )
     warnings += unphysical(fitted, names)
     return Fit(fitted, before, evidences[-1], int(found.nit), tuple(warnings))
 
