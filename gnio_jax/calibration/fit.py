@@ -72,6 +72,8 @@ DIGITS = 4
 """As many are written down."""
 CHECKPOINT_EVERY = 50
 """Clone intervals between the states that the backward pass keeps."""
+LEAST_GAIN = 1e-4
+"""Of the negative log-likelihood of an innovation, below which a search is not begun anew."""
 FAILED = 1e6
 """The objective where the filter fails: the search turns back from there."""
 NO_GATE = 1e9
@@ -168,26 +170,34 @@ def fit_innovations(
             return FAILED, np.zeros_like(vector)
         return float(value), np.asarray(gradient, float)
 
-    limits = {"maxiter": most_steps, "ftol": 1e-7}
-    found = minimize(evaluate, start, jac=True, method="L-BFGS-B", options=limits)
+    at, reached, steps, converged = start, math.inf, 0, False
+    # A step into where the filter fails may leave a search with steps of next to nothing. One that
+    # begins anew there, without what the old one remembers, goes on if there is anything to gain.
+    while True:
+        limits = {"maxiter": most_steps - steps, "ftol": 1e-7}
+        found = minimize(evaluate, at, jac=True, method="L-BFGS-B", options=limits)
+        gained, at, reached = reached - found.fun, found.x, found.fun
+        steps, converged = steps + int(found.nit), converged or found.success
+        if gained < LEAST_GAIN or steps >= most_steps:
+            break
     if evidences[0] == FAILED:
         raise InputError("the filter", "fails on these recordings with the settings of the run")
-    fitted = with_written_parameters(settings, dict(zip(names, found.x, strict=True)), DIGITS)
+    fitted = with_written_parameters(settings, dict(zip(names, at, strict=True)), DIGITS)
     before = evidences[0]
     evaluate(np.array(list(free_parameters(fitted, names).values())))
     warnings = []
-    if found.nit >= most_steps:
+    if steps >= most_steps:
         limit = f"the fit stopped after {most_steps} steps"
         warnings.append(
             f"{limit}, before it had found the best settings; give fewer groups to --fit"
         )
-    elif not found.success:
+    elif not converged:
         warnings.append(
-            f"the fit stopped after {found.nit} steps, because no step along the gradient made the "
+            f"the fit stopped after {steps} steps, because no step along the gradient made the "
             "innovations more likely; the settings are the best ones that it found"
         )
     warnings += unphysical(fitted, names)
-    return Fit(fitted, before, evidences[-1], int(found.nit), tuple(warnings))
+    return Fit(fitted, before, evidences[-1], steps, tuple(warnings))
 
 
 def unphysical(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
