@@ -15,6 +15,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
+from scipy.optimize import OptimizeResult
 
 from gnio_jax import calibration, data, filtering, models
 from gnio_jax.calibration import evidence
@@ -322,6 +323,33 @@ def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told
     settings = changed(TRUE, noise={"std_factor": (0.7, 1.0, 1.0)}, start={"velocity": 0.2})
     fit(others, settings, most_steps=1)
     assert programs > 0 and fitting._value_and_gradient._cache_size() == programs
+
+
+def test_a_search_along_a_wrong_gradient_is_told_of(monkeypatch):
+    def value_and_gradient(free, *_, **fixed):
+        return (free @ free, free @ free), -2 * free
+
+    monkeypatch.setattr(fitting, "_value_and_gradient", value_and_gradient)
+    found = fit(walks_and_truth()[0], TRUE)
+    assert found.steps == 0 and any("no step along the gradient" in told for told in found.warnings)
+
+
+def test_a_search_begins_anew_until_that_gains_nothing(monkeypatch):
+    """Where one ended too early, e.g. after a step into where the filter fails."""
+    begun = []
+
+    def minimize(function, at, options, **_):
+        function(at)
+        begun.append((float(at[0]), options["maxiter"]))
+        return OptimizeResult(x=at + 0.1, fun=-min(len(begun), 3.0), nit=5, success=True)
+
+    monkeypatch.setattr(fitting, "minimize", minimize)
+    found = fit(walks_and_truth()[0], TRUE, most_steps=40)
+    start = next(iter(free_parameters(TRUE, PATHS).values()))
+    assert begun == [(pytest.approx(start + 0.1 * k), 40 - 5 * k) for k in range(4)]
+    assert found.steps == 20 and found.warnings == ()
+    reached = next(iter(free_parameters(found.settings, PATHS).values()))
+    assert reached == pytest.approx(start + 0.4, abs=1e-3)
 
 
 def test_values_outside_what_is_physical_are_named():
