@@ -78,7 +78,7 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: places.get(item.path, len(LONGEST)))
 
 
-MOST_MEMORY, MOST_MAPS = 2.0e9, 30_000
+MOST_MEMORY, MOST_MAPS = 1.4e9, 30_000
 """Bytes of a worker, and its memory maps: Linux grants a process 65,530, and XLA crashes without a
 word where they end."""
 

@@ -253,7 +253,7 @@ def test_the_shipped_network_is_the_default_and_small(monkeypatch, gnio, mistake
     monkeypatch.delenv("GNIO_WEIGHTS", raising=False)
     place = SHIPPED / "pedestrian"
     assert packages.find() == place
-    assert sum(file.stat().st_size for file in place.iterdir()) < 5e6
+    assert sum(file.stat().st_size for file in place.iterdir()) < 5.1e6
     card = gnio("weights", "pedestrian")
     for words in ("Tyrex", "CeCILL 2.1", "gnio calibrate", "oxiod_sessions_test_ekf | 7 | 3 |"):
         assert words in card
@@ -263,7 +263,7 @@ def test_the_shipped_network_is_the_default_and_small(monkeypatch, gnio, mistake
 def test_the_shipped_network_answers():
     """The arrays are those that were published; a phone that lies still goes next to nowhere."""
     digest = hashlib.sha256((SHIPPED / "pedestrian" / packages.WEIGHTS).read_bytes()).hexdigest()
-    assert digest == "d9f4f1847924e05d38ce4ca90f33256e9ad02714974501712214e7c04fc28e6f"
+    assert digest == "edb3e3583478b20891625915f2ff17aa50722f9db80a90f3a1e9ccc8ad35d6ab"
     run = gnio_jax.load_pretrained("pedestrian")
     assert run.config.datasets == ("tyrex", "indoor_location") and run.config.model.name == "gnio"
     still = np.zeros((1, run.config.data.seen, 6), np.float32)
@@ -278,5 +278,5 @@ def test_training_starts_from_a_package_by_its_name():
     run = checkpoint.initial_run(config, gnio_jax.load_pretrained)
     assert run is not None and run.step > 0
     other = dataclasses.replace(config, model=dataclasses.replace(config.model, width=8))
-    with pytest.raises(InputError, match=r"pedestrian: its model.width is 16.* describe the same"):
+    with pytest.raises(InputError, match=r"pedestrian: its model.width is 32.* describe the same"):
         checkpoint.initial_run(other, gnio_jax.load_pretrained)
