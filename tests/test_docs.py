@@ -73,6 +73,7 @@ def code_of(page):
     return "\n".join(block.code for block in RUN if block.page == page)
 
 
+@pytest.mark.slow
 def test_the_example_of_the_readme(one_walk, capsys, monkeypatch):
     """With weights that NumPy has drawn: those of each shape would be a program."""
     monkeypatch.setattr(models, "initialise", lambda model, _: drawn(models.variable_shapes(model)))

@@ -614,8 +614,8 @@ def line(found: Followed) -> str:
     """The newest pose in words. The way is horizontal, through points 1 s apart, as that of `gnio
     track` is."""
     assert found.pose is not None
-    (x, y, z), path = found.pose.position, found.trajectory
-    time = path.time
+    x, y, z = np.round(found.pose.position, 2) + 0.0  # no -0.00
+    path, time = found.trajectory, found.trajectory.time
     sigma = float(np.sqrt(np.maximum(np.trace(found.pose.covariance[6:8, 6:8]), 0.0)))
     walked = 0.0
     if len(time) > 1:

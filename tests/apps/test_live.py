@@ -478,8 +478,9 @@ def test_what_is_sent_while_it_compiles_is_not_lost(follow, port, monkeypatch, t
 
 
 def test_the_way_is_that_of_a_track():
-    """Horizontal, through points 1 s apart, and up to the newest pose."""
+    """Horizontal, through points 1 s apart, and up to the newest pose, of which no zero is
+    negative."""
     found = live.Followed()
     for k in range(26):  # to and fro within each second, and up
-        live._add(found, pose_at(k / 10, [k / 10, 0.3 * (k % 10 == 4), k / 10]))
-    assert "walked 2.5 m" in live.line(found)
+        live._add(found, pose_at(k / 10, [k / 10, 0.3 * (k % 10 == 4) - 1e-3, k / 10]))
+    assert "walked 2.5 m" in live.line(found) and "y    +0.00" in live.line(found)
