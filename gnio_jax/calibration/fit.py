@@ -177,16 +177,18 @@ def fit_innovations(
         limits = {"maxiter": most_steps - steps, "ftol": 1e-7}
         found = minimize(evaluate, at, jac=True, method="L-BFGS-B", options=limits)
         gained, at, reached = reached - found.fun, found.x, found.fun
-        steps, converged = steps + int(found.nit), converged or found.success
+        steps += int(found.nit)
+        converged = found.success or (converged and gained < LEAST_GAIN)
+        if evidences[0] == FAILED:
+            problem = "fails on these recordings with the settings of the run"
+            raise InputError("the filter", problem)
         if gained < LEAST_GAIN or steps >= most_steps:
             break
-    if evidences[0] == FAILED:
-        raise InputError("the filter", "fails on these recordings with the settings of the run")
     fitted = with_written_parameters(settings, dict(zip(names, at, strict=True)), DIGITS)
     before = evidences[0]
     evaluate(np.array(list(free_parameters(fitted, names).values())))
     warnings = []
-    if steps >= most_steps:
+    if steps >= most_steps and gained >= LEAST_GAIN:
         limit = f"the fit stopped after {most_steps} steps"
         warnings.append(
             f"{limit}, before it had found the best settings; give fewer groups to --fit"

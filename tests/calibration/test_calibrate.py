@@ -395,6 +395,18 @@ def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
         for force in (still, falling)
     ]
     np.testing.assert_allclose(*evidences, rtol=1e-9)
+    # As the walks alone, whose every row counts.
+    alone = given._replace(
+        gyro=given.gyro[:, : N * known],
+        accel=given.accel[:, : N * known],
+        given=Displacements(given.given.value[:, :known], given.given.std[:, :known]),
+    )
+    free = free_parameters(TRUE, PATHS)
+    fixed = {"names": tuple(free), "config": innovation_config(DATA, TRUE)}
+    vector = np.array(list(free.values()))
+    objective = functools.partial(fitting.innovation_objective, **fixed)
+    _, evidence = jax.jit(objective)(vector, alone, vector, TRUE)
+    np.testing.assert_allclose(evidence, evidences[0], rtol=1e-9)
     knock = np.arange(STRIDES * N)[:, None] == 900
     broken = given._replace(accel=np.where(knock, 1e6, given.accel))
     with pytest.raises(InputError, match="the filter: fails on these recordings"):

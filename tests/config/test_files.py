@@ -245,6 +245,22 @@ def test_words_of_a_command_line_are_values(hint, words, value):
     assert found == value and type(found) is type(value)
 
 
+@pytest.mark.parametrize(
+    ("hint", "words", "problem"),
+    [
+        (int, ["3.5"], "--x: must be a whole number, found 3.5"),
+        (str | tuple[int, ...], ["1", "x"], "--x: must be a whole number, found 'x'"),
+        (int, ["0x10"], "--x: must be a whole number, found '0x10'"),
+        (float, [".inf"], "--x: must be a number, found '.inf'"),
+        (tuple[int, ...], ["1", "a"], "--x: must be a whole number, found 'a'"),
+    ],
+)
+def test_words_that_are_no_values_are_named(hint, words, problem):
+    with pytest.raises(InputError) as refused:
+        configuration.value_from_words(hint, words, "--x")
+    assert str(refused.value) == problem
+
+
 def test_settings_of_a_program_may_be_numbers_of_numpy():
     """They are what a calibration gives; their bounds hold for them too."""
     config = TrainConfig(filter=changed(noise={"gyro_density": np.float32(1e-3)}))

@@ -1,5 +1,6 @@
 """Is the filter as certain as it may be? Monte Carlo with noises as it assumes them, correlated
-errors among them, and with a network in the loop that answers in its own frame."""
+errors among them, and with a network in the loop that answers in its own frame; and the Jacobian of
+that frame by autodiff."""
 
 import functools
 
@@ -11,9 +12,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from gnio_jax import filtering, geometry
+from gnio_jax.filtering.displacement import Displacement, linearise_displacement
+from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.state import CLONE
+from gnio_jax.filtering.update import Step
 from gnio_jax.types import Prediction
-from tests.support.compiling import lightly_optimised, optimised
+from gnio_jax.windows import cut_window
+from tests.support.compiling import lightly_optimised, optimised, quick
 from tests.support.walks import errors, simulate, with_correlated_errors
 from tests.support.whole_covariance import covariance
 
@@ -207,3 +212,61 @@ def test_attitude_is_consistent_whatever_the_pitch(pitch):
     low, high = bounds(3 * TIGHT_RUNS, 0.99)
     assert low < nees_of(error, spread, [0, 1, 2])[20:].mean() < high
     assert np.degrees(np.sqrt((error[:, 20:, :2] ** 2).sum(-1).mean())) < 0.25
+
+
+OWN = filtering.FilterConfig(0.02, 4, 3)
+
+
+@quick
+def told_by_a_network(R, gyro, accel, bias, weights, seen):
+    """What the network predicts, turned into the world, the derivative of its innovation by θ, and
+    that of the filter."""
+
+    def network(window):
+        up = jnp.mean(window[:, :3], axis=0)
+        up = up / jnp.linalg.norm(up)
+        axis = jnp.stack([up[1], -up[0], jnp.zeros_like(up[0])])  # up × z
+        turn = geometry.hat(axis)
+        return (jnp.eye(3) + turn + turn @ turn / (1 + up[2])) @ window[:, :3].T @ weights
+
+    def cut(theta):
+        return geometry.exp(-theta) @ R
+
+    def said(theta):
+        return network(cut_window(cut(theta), gyro, accel, jnp.zeros(3), bias, OWN.cut, OWN.dt))
+
+    def innovation(theta):
+        return said(theta) - geometry.yaw_rotation(cut(theta)).T @ seen
+
+    nothing, single = jnp.zeros(3), filtering.FilterConfig(0.01, 1, 1)
+    state = filtering.initial_state(single, jnp.eye(3), nothing, nothing)
+    clones = jnp.stack([R, jnp.eye(3)]), jnp.stack([-seen, nothing])
+    state = state._replace(clone_rotation=clones[0], clone_offset=clones[1])
+    step = Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), 1, 0, single, NOISE)
+    measured = Displacement(nothing, jnp.eye(3), jnp.bool_(True), "own")
+    linear, defined = linearise_displacement(measured, state, step)
+    found = linear.jacobian["oldest_rotation"], defined
+    return geometry.yaw_rotation(R) @ said(nothing), jax.jacfwd(innovation)(nothing), found
+
+
+@pytest.mark.parametrize("angles", [(0.3, 0.9, -2.0), (0.4, np.pi / 2, 1.0)])
+def test_own_frame_jacobian_is_that_of_an_equivariant_network(angles):
+    """Autodiff through the window as it is cut and a network that turns with it, at any attitude,
+    on the nose too. It levels its window by the mean specific force: small tilts change nothing."""
+    config = OWN
+    rng = np.random.default_rng(4)
+    R, n = Rotation.from_euler("xyz", angles).as_matrix(), config.window
+    gyro, bias = rng.normal(size=(n, 3)), 0.1 * rng.normal(size=3)
+    attitudes = [R]
+    for w in gyro[:-1]:
+        attitudes.append(attitudes[-1] @ Rotation.from_rotvec(w * config.dt).as_matrix())
+    force = rng.normal(size=(n, 3))
+    force = force - force.mean(0) + [0, 0, 9.81]  # on average the device does not accelerate
+    accel = np.einsum("kji,kj->ki", attitudes, force) + bias
+    weights = 0.2 * rng.normal(size=n)
+    seen = weights @ force  # in the world
+    told, slope, (jacobian, defined) = told_by_a_network(R, gyro, accel, bias, weights, seen)
+    np.testing.assert_allclose(told, seen, atol=1e-9)
+    assert bool(defined)
+    np.testing.assert_allclose(jacobian, slope, atol=1e-7)
+    assert np.abs(jacobian[:, 2]).max() > 0.5

@@ -56,7 +56,7 @@ def predict_numpy(window):
     return pooled, np.diag(FACTOR**2 * np.exp(2 * np.maximum(-2.0 + 0.1 * pooled, -4.0)))
 
 
-CUTS = {"per_sample": (0, True, False), "tlio": (1, False, True)}
+CUTS = {"per_sample": (0, True, False), "single": (0, True, False), "tlio": (1, False, True)}
 """By how many samples windows begin early, whether they are without biases, and whether a sample is
 turned by its own rate or by that of the one before."""
 
@@ -76,7 +76,7 @@ def by_hand(config, cut, gyro, accel):
         for turn in turns[:context][::-1]:
             R = R @ turn.T
         for j, (w, a) in enumerate(zip(*seen, strict=True)):
-            if j:
+            if j and config.window_rotation != "single":
                 R = R @ turns[j if own else j - 1]
             rows.append(np.concatenate([unyaw @ R @ a, unyaw @ R @ w]))
         return predict_numpy(np.array(rows))
@@ -86,7 +86,8 @@ def by_hand(config, cut, gyro, accel):
 
 
 @pytest.mark.parametrize(
-    "window_rotation, context, first", [("per_sample", 6, FIRST), ("tlio", 0, CLONES)]
+    "window_rotation, context, first",
+    [("per_sample", 6, FIRST), ("single", 0, CLONES), ("tlio", 0, CLONES)],
 )
 def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, first):
     gyro, accel = recording(0)
@@ -118,8 +119,12 @@ def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     """With `history.given`, which takes the factors of the axes off again. The network's log
     standard deviation is raised to a floor."""
     gyro, accel = recording(1)
-    final, history = program(CONFIG)(start(CONFIG), gyro, accel, BASE, SLOPE)
-    fixed = CONFIG, NOISE, None, CONFIG.displacement_frame
+    valid = np.ones(len(gyro), bool)
+    valid[5 * N : 5 * N + 2] = False
+    network = functools.partial(predict, base=BASE, slope=SLOPE)
+    arguments = start(CONFIG), gyro, accel, CONFIG, NOISE, valid
+    final, history = jax.jit(lambda: filtering.run_odometry(network, *arguments))()
+    fixed = CONFIG, NOISE, valid, CONFIG.displacement_frame
     given = start(CONFIG), gyro, accel, *history.given(NOISE)
     again_final, again = filtering.run_filter(*given, *fixed)
     assert again.diagnostics == {}

@@ -122,6 +122,8 @@ def test_forward_against_numpy():
     model, variables = models.create("gnio", **options), drawn(shapes("gnio", **options))
     windows = np.random.default_rng(1).standard_normal((2, 100, 6)).astype(np.float32)
     displacement, log_std, gate, attention = numpy_forward(variables, windows)
+    # The bank is projected once, when the network is made ready.
+    assert models.inference_variables(model, variables).constants.keys() == {"memory"}
     for found in predicted(model, variables, windows):
         np.testing.assert_allclose(found.displacement, displacement, rtol=2e-4, atol=2e-5)
         np.testing.assert_allclose(found.log_std, log_std, rtol=2e-4, atol=2e-5)

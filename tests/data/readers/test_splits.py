@@ -10,6 +10,7 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data.readers import csv_files, euroc, kitti, oxiod, ronin
+from gnio_jax.data.splits import held_out
 from gnio_jax.errors import InputError
 
 PEOPLE = [{"subjectID": who, "calibration": "start"} for who in (*range(5), 14)]
@@ -190,7 +191,12 @@ WRONG = [
     ("oxiod", {}, "unseen", "no recording of split 'unseen'"),
     ("oxiod", {"deep/deeper/handheld/Train.txt": "data1/vi3.csv"}, "train", "'data1/vi3.csv'"),
     ("oxiod", {"deep/deeper/handheld/Train.txt": "\n"}, "train", "Train.txt: the list is empty"),
-    ("oxiod", {f"deep/deeper/{s}/Test.txt": None for s in ("handheld", "running")}, "test", "list"),
+    (
+        "oxiod",
+        {f"deep/deeper/{s}/Test.txt": None for s in ("handheld", "running")},
+        "test",
+        "no scene has its list",
+    ),
     *((name, None, data.get(name).splits[-1], "expected layout: ") for name in COPIES),
 ]
 
@@ -306,3 +312,13 @@ def test_sessions_are_shared_out_whole_whatever_a_copy_holds(tmp_path):
     assert {"multi users/user2", "multi devices/nexus 5", "trolley/data1"} < test
     assert found["val"] == {"handheld/data4", "trolley/data1"}
     assert found["train"] == {"handheld/data1", "trolley/data2"}
+
+
+def test_who_is_held_out_depends_on_the_names_alone():
+    """Whole people; of one person whole recordings; of three recordings none."""
+    pairs = {f"p{n // 2}_{n}": f"p{n // 2}" for n in range(20)}
+    held = held_out(pairs)
+    assert held == held_out(dict(reversed(pairs.items())))
+    assert len(held) == 2 and len({pairs[name] for name in held}) == 1
+    assert len(held_out({f"dan_{n}": "dan" for n in range(20)})) == 2
+    assert held_out({"dan_1": "dan", "dan_2": "dan", "hang_1": "hang"}) == set()
