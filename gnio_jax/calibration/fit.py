@@ -171,8 +171,9 @@ def fit_innovations(
         return float(value), np.asarray(gradient, float)
 
     at, reached, steps, converged = start, math.inf, 0, False
-    # A step into where the filter fails may leave a search with steps of next to nothing. One that
-    # begins anew there, without what the old one remembers, goes on if there is anything to gain.
+    # A trial step to where the gradient explodes (4e126 was met, of a value of 0.4) leaves the line
+    # search with a step of next to nothing, which passes for convergence. A search that begins anew
+    # from there goes on, if there is anything to gain.
     while True:
         limits = {"maxiter": most_steps - steps, "ftol": 1e-7}
         found = minimize(evaluate, at, jac=True, method="L-BFGS-B", options=limits)

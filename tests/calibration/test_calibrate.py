@@ -335,7 +335,7 @@ def test_a_search_along_a_wrong_gradient_is_told_of(monkeypatch):
 
 
 def test_a_search_begins_anew_until_that_gains_nothing(monkeypatch):
-    """Where one ended too early, e.g. after a step into where the filter fails."""
+    """Where one ended too early, e.g. after a trial step to where the gradient explodes."""
     begun = []
 
     def minimize(function, at, options, **_):
@@ -350,6 +350,30 @@ def test_a_search_begins_anew_until_that_gains_nothing(monkeypatch):
     assert found.steps == 20 and found.warnings == ()
     reached = next(iter(free_parameters(found.settings, PATHS).values()))
     assert reached == pytest.approx(start + 0.4, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("searches", "problem"),
+    [
+        ([(-1.0, 39, True), (-1.00001, 1, True)], None),  # the last one gains nothing
+        ([(-1.0, 20, True), (-2.0, 20, True)], "the fit stopped after 40 steps, before it"),
+        ([(-1.0, 5, True), (-1.0, 0, False)], None),  # no step from where another has converged
+        ([(-1.0, 5, True), (-2.0, 5, False), (-2.0, 0, False)], "10 steps, because no step along"),
+    ],
+)
+def test_searches_that_ended_too_early_are_told_of(monkeypatch, searches, problem):
+    """Of each: the value that it reaches, its steps, and whether it has converged."""
+    ends = iter(searches)
+
+    def minimize(function, at, **_):
+        function(at)
+        value, steps, success = next(ends)
+        return OptimizeResult(x=at, fun=value, nit=steps, success=success)
+
+    monkeypatch.setattr(fitting, "minimize", minimize)
+    warnings = fit(walks_and_truth()[0], TRUE, most_steps=40).warnings
+    assert next(ends, None) is None
+    assert [problem in warning for warning in warnings] == ([True] if problem else [])
 
 
 def test_values_outside_what_is_physical_are_named():
