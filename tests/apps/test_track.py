@@ -19,7 +19,6 @@ from gnio_jax.types import Sequence, Waypoints
 from tests.support import bag_files, known_walk, logger_files, tiny_run
 
 CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
-SECONDS = 6.0
 
 
 @pytest.fixture(scope="module")

@@ -329,7 +329,7 @@ def test_what_follows_an_import_beside_its_own_csv_can_be_followed(place, capsys
 
 # --- mistakes
 
-OUT, HEADS = ["--out", "x.h5"], ["--data-root", "heads"]
+HEADS = ["--data-root", "heads"]
 
 
 @pytest.mark.parametrize(
