@@ -22,7 +22,7 @@ from gnio_jax.config import ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
 from gnio_jax.training import loop, run_folder
-from gnio_jax.training.task import Recordings, set_up
+from gnio_jax.training.recordings import Recordings, set_up
 from gnio_jax.training.window_task import WindowTask
 from tests.support import tiny_run
 from tests.support.drawn_state import drawn_state

@@ -318,7 +318,9 @@ def publish(workdir: Path, out: Path, said: Description, which: Which = "best") 
     run = checkpoint.load_run(workdir, which)
     figures, made_by = _figures(workdir), f"gnio-jax {version('gnio-jax')}"
     content = to_bytes(run.variables)
-    own = dataclasses.replace(run.config, workdir=None, data_root=None, init_from=None)
+    windows = dataclasses.replace(run.config.data, poses_by=None)
+    folders: dict[str, Any] = {"workdir": None, "data_root": None, "init_from": None}
+    own = dataclasses.replace(run.config, data=windows, **folders)
     about = About(
         said.name,
         run.config.model.name,
@@ -395,6 +397,8 @@ def _card(
     """The model card, Markdown."""
     config, windows, name = run.config, run.config.data, said.name
     begun = f" --init-from runs/{Path(config.init_from).name}" if config.init_from else ""
+    if windows.poses_by:
+        begun += f" --set data.poses_by=runs/{Path(windows.poses_by).name}"
     steps, fitted = [f"gnio train --config config.yaml --workdir runs/{name}{begun}"], ""
     if (workdir / "calibration.json").is_file():
         found = json.loads((workdir / "calibration.json").read_text(encoding="utf-8"))

@@ -110,6 +110,9 @@ class DataConfig:
     weights: tuple[Positive, ...] = ()
     """For several datasets: how often an epoch visits the windows of each. 0.5 visits half of them,
     drawn again in every epoch; 2 visits all of them twice. The default is 1 for each (ours)."""
+    poses_by: Annotated[str | None, FILE_ONLY] = None
+    """Calibrated run, or package of weights (see gnio weights), whose displacements and the
+    smoother make poses of walks with waypoints; by default they are interpolated (ours)."""
 
     @property
     def window(self) -> int:

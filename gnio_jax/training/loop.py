@@ -23,8 +23,9 @@ from gnio_jax.reporting import Lines, Reporter, Silence
 from gnio_jax.training import checkpoint, optimizer, run_folder
 from gnio_jax.training.checkpoint import Position, Run, load_run
 from gnio_jax.training.filter_task import FilterTask
+from gnio_jax.training.recordings import Recordings, set_up
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.task import Progress, Recordings, Row, Task, set_up
+from gnio_jax.training.task import Progress, Row, Task
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
@@ -68,7 +69,7 @@ def train_all(
     reporter: Reporter | None = None,
     workers: int = 1,
     devices: int | None = None,
-    load_initial: Callable[[str], Run] = load_run,
+    load: Callable[[str], Run] = load_run,
 ) -> list[Outcome]:
     """`train` experiments that differ in nothing but their seeds and folders (`config.with_seeds`),
     one after the other. Recordings are read once and steps are compiled once.
@@ -77,11 +78,11 @@ def train_all(
     missing ones start. A signal ends the run that it interrupts, and those after it do not begin:
     they have no outcome. `workers` processes read recordings that are slow to read. A batch of
     windows is shared out among `devices` devices of each process (`parallel.sharing`); how many
-    there are changes the results by rounding alone, also in a run that is resumed. `load_initial`
-    reads what `config.init_from` names, by default the folder of a run; `gnio_jax.load_pretrained`
-    also takes packages of weights. Raises `InputError` where that is not of the same network, for
-    settings that do not fit together, for a folder that holds another run, and where the devices
-    cannot share a batch evenly.
+    there are changes the results by rounding alone, also in a run that is resumed. `load` reads
+    what `config.init_from` and `config.data.poses_by` name, by default the folder of a run;
+    `gnio_jax.load_pretrained` also takes packages of weights. Raises `InputError` where the initial
+    run is not of the same network, for settings that do not fit together, for a folder that holds
+    another run, and where the devices cannot share a batch evenly.
     """
     reporter = (reporter or Lines()) if parallel.is_first() else Silence()
     begun = [(configuration.default_workdir(each) / "config.yaml").exists() for each in configs]
@@ -102,9 +103,9 @@ def train_all(
     sharing = parallel.sharing(1 if through_filter else devices)
     with jax.enable_x64(through_filter), sharing, _signals() as received:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
-        start = None if resumed else checkpoint.initial_run(configs[0], load_initial)
+        start = None if resumed else checkpoint.initial_run(configs[0], load)
         chosen = FilterTask if through_filter else WindowTask
-        task, recordings = set_up(chosen, configs[0], reporter, workers)
+        task, recordings = set_up(chosen, configs[0], reporter, workers, load)
         for config, resume in zip(configs, resumes, strict=True):
             outcomes.append(_train(task, recordings, config, start, resume, received, reporter))
             (signum,) = parallel.largest(max(received))

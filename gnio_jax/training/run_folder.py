@@ -25,7 +25,8 @@ from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
-from gnio_jax.training.task import Recordings, Row
+from gnio_jax.training.recordings import Recordings
+from gnio_jax.training.task import Row
 
 MAY_CHANGE = ("workdir", "data_root", "init_from")
 """Settings that a resumed run may change: where things lie, not what is computed."""

@@ -6,7 +6,6 @@ jitted step: gradient, guard, update, all on the device.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 from abc import ABC, abstractmethod
@@ -22,10 +21,8 @@ import optax
 from flax import linen as nn
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-from gnio_jax import data, models, parallel
+from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
-from gnio_jax.errors import InputError
-from gnio_jax.reporting import Reporter
 from gnio_jax.training import optimizer
 from gnio_jax.training.losses import loss_stage
 from gnio_jax.training.optimizer import Trainable
@@ -64,17 +61,6 @@ class Progress(NamedTuple):
     of a task that skips steps, their number `skipped`, and no figures of them."""
     failed_step: Int[jax.Array, ""]
     """First step whose loss or gradient was not finite, and was not skipped; −1: none."""
-
-
-class Recordings(NamedTuple):
-    """What a task is trained on and validated with."""
-
-    source: Any
-    """Windows or segments of the training split, on the devices."""
-    held_out: dict[str, Any]
-    """Those of the validation split of each dataset by its name, likewise."""
-    splits: dict[str, list[str]]
-    """Names of the recordings of each split; of several datasets, with theirs before them."""
 
 
 @dataclass(frozen=True)
@@ -301,61 +287,6 @@ def gradient_norms(gradient: Trainable) -> dict[str, Float[jax.Array, ""]]:
     return {part: jnp.sqrt(sum(found)) for part, found in squares.items()}
 
 
-# Set-up
-# ------------------------------------------------------------------------------------------------
-
-
-def set_up(
-    task: type[Task], config: TrainConfig, reporter: Reporter, workers: int = 1
-) -> tuple[Task, Recordings]:
-    """Load the recordings and find the windows or segments in them.
-
-    Raises `InputError` for options that the network does not have, missing data, recordings that
-    are too short, a batch that is larger than the split, and one that the devices cannot share
-    evenly. `workers` processes read recordings that are slow to read.
-    """
-    model = models.from_config(config.model)  # a mistake in its options does not wait for the data
-    size, devices = config.optim.batch_size, parallel.count()
-    if size % devices:
-        problem = f"is {size}, which {devices} devices cannot share evenly"
-        remedy = f"make it a multiple of {devices}, or use fewer --devices"
-        raise InputError("optim.batch_size", problem, remedy)
-    train, val = config.data.train_split, config.data.val_split
-    names = config.datasets
-    reporter.line(f"reading {', '.join(names)}: {train} and {val}")
-    sources, held_out, splits = [], {}, {}
-    for split, training in ((train, True), (val, False)):
-        splits[split] = []
-        for name in names:
-            label = f"{name}/" if len(names) > 1 else ""
-            samples: dict[str, int] = {}
-            sequences = read_split(config, name, split, reporter, workers, samples)
-            source = task.source_of(sequences, config, training)
-            if training:
-                sources.append(source)
-            else:
-                held_out[name] = parallel.everywhere(source)
-            splits[split] += [label + each for each in samples]
-            hours = sum(samples.values()) / config.data.rate / 3600
-            contents = f"{hours:.2f} h, {task.count(source):,} {task.unit}"
-            reporter.line(f"  {label}{split}: {len(samples)} sequences, {contents}")
-    both = sorted(set(splits[train]) & set(splits[val]))
-    if both:
-        reporter.line(
-            f"warning: {', '.join(both[:3])}{' ...' if both[3:] else ''} in {train} and in {val}: "
-            "the best checkpoint is chosen by recordings that it was trained on; separate the two "
-            "splits"
-        )
-    parts = tuple(map(task.count, sources))
-    epoch = sum(map(visits, parts, config.data.weights or [1.0] * len(parts)))
-    if epoch < size:
-        problem = f"is {size}, but there are only {epoch} {task.unit}"
-        raise InputError("optim.batch_size", problem, "lower it")
-    recordings = Recordings(parallel.everywhere(task.joined(sources)), held_out, splits)
-    anywhere = dataclasses.replace(config, workdir=None, data_root=None, init_from=None, seed=0)
-    return task(model, anywhere, epoch // size, parts), recordings
-
-
 def visits(count: int, weight: float) -> int:
     """How many windows or segments an epoch visits of a dataset that has `count`."""
     return round(weight * count)
@@ -369,30 +300,6 @@ def overlaid(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
         else other.get(name, leaf)
         for name, leaf in tree.items()
     }
-
-
-def read_split(
-    config: TrainConfig,
-    dataset: str,
-    split: str,
-    reporter: Reporter,
-    workers: int,
-    samples: dict[str, int],
-) -> Iterator[Sequence]:
-    """The recordings of a split of a dataset at the network's rate, one after another, with poses
-    where they come with waypoints. The number of samples of each is noted in `samples` by its
-    name."""
-    progress = functools.partial(reporter.progress, f"reading {split}")
-    for sequence in data.load_each(dataset, config.data_root, split, workers, progress):
-        resampled = data.resample(sequence, config.data.rate)
-        if resampled.waypoints is not None:
-            try:
-                resampled = data.with_poses(resampled)
-            except InputError as error:
-                reporter.line(f"warning: {error}")
-                continue
-        samples[resampled.name] = len(resampled.time)
-        yield resampled
 
 
 def size_of(parameters: Any) -> int:

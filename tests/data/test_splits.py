@@ -12,7 +12,7 @@ from gnio_jax.data import loading
 from gnio_jax.data.splits import find_list, listed
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines
-from gnio_jax.training.task import read_split
+from gnio_jax.training.recordings import read_split
 from gnio_jax.types import Sequence
 
 

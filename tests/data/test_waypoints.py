@@ -14,7 +14,7 @@ from gnio_jax.data.waypoints import levelled, with_poses
 from gnio_jax.data.windows import window_source
 from gnio_jax.numerics import rotations
 from gnio_jax.reporting import Lines
-from gnio_jax.training.task import read_split
+from gnio_jax.training.recordings import read_split
 from gnio_jax.types import Waypoints
 from tests.support.surveyor import RATE, survey
 

@@ -32,6 +32,7 @@ from gnio_jax.filtering.settings import with_free_parameters
 from gnio_jax.reporting import Silence
 from gnio_jax.training import checkpoint, loop, optimizer, task
 from gnio_jax.training.filter_task import FilterTask
+from gnio_jax.training.recordings import set_up
 from gnio_jax.training.task import TrainState
 from gnio_jax.training.window_task import WindowTask
 from tests.support import tiny_run
@@ -166,7 +167,7 @@ def test_what_an_earlier_version_has_trained_is_told(finished, tmp_path):
 def training(recording):
     """Task and segments of a run that is never written."""
     with jax.enable_x64(True):
-        found, recordings = task.set_up(FilterTask, tiny(recording, "unused"), Silence())
+        found, recordings = set_up(FilterTask, tiny(recording, "unused"), Silence())
     return found, recordings.source
 
 
@@ -421,7 +422,7 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
             assert checkpoint.initial_run(other, checkpoint.load_run) is not None
     with jax.enable_x64(False):
         start = checkpoint.initial_run(config, checkpoint.load_run)
-        training, _ = task.set_up(WindowTask, config, Silence())
+        training, _ = set_up(WindowTask, config, Silence())
         state = training.initial_state(KEY, start.variables)
     theirs = checkpoint.load_run(recording / "initial").variables
     assert same(state.variables["params"], theirs["params"])

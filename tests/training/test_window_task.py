@@ -16,7 +16,8 @@ from gnio_jax.models.heads import CalibratedUncertainty
 from gnio_jax.reporting import Silence
 from gnio_jax.training import task, window_task
 from gnio_jax.training.losses import Losses, loss_stage
-from gnio_jax.training.task import TrainState, set_up
+from gnio_jax.training.recordings import set_up
+from gnio_jax.training.task import TrainState
 from gnio_jax.training.window_task import Validation, WindowTask, calibrated
 from tests.support.compiling import lightly_optimised
 from tests.support.drawn_state import drawn_state, fresh_state

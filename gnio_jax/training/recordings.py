@@ -1,0 +1,221 @@
+"""What a network learns from: the recordings of two splits at its rate, with poses, as windows or
+segments.
+
+A walk with waypoints has no poses. They are interpolated between the waypoints
+(`data.with_poses`), or made by the smoother from the displacements of an earlier run
+(`filtering.waypoint_poses`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gnio_jax import config as configuration
+from gnio_jax import data, filtering, models, parallel
+from gnio_jax.config import TrainConfig
+from gnio_jax.data.hdf5 import Reading, cache_folder, read_reading, write_reading
+from gnio_jax.data.loading import FEW, in_processes
+from gnio_jax.errors import InputError
+from gnio_jax.filtering.network import Predict
+from gnio_jax.models import Network
+from gnio_jax.reporting import Reporter
+from gnio_jax.training.checkpoint import Run, load_run
+from gnio_jax.training.task import Task, visits
+from gnio_jax.types import Array, Prediction, Sequence
+
+Load = Callable[[str], Run]
+"""Reads the run, or the package of weights, of this name."""
+
+
+class Recordings(NamedTuple):
+    """What a task is trained on and validated with."""
+
+    source: Any
+    """Windows or segments of the training split, on the devices."""
+    held_out: dict[str, Any]
+    """Those of the validation split of each dataset by its name, likewise."""
+    splits: dict[str, list[str]]
+    """Names of the recordings of each split; of several datasets, with theirs before them."""
+
+
+def set_up(
+    task: type[Task],
+    config: TrainConfig,
+    reporter: Reporter,
+    workers: int = 1,
+    load: Load = load_run,
+) -> tuple[Task, Recordings]:
+    """Load the recordings and find the windows or segments in them.
+
+    Raises `InputError` for options that the network does not have, missing data, recordings that
+    are too short, a batch that is larger than the split, and one that the devices cannot share
+    evenly. `workers` processes read recordings that are slow to read, and make smoothed poses with
+    the run that `load` reads.
+    """
+    model = models.from_config(config.model)  # a mistake in its options does not wait for the data
+    size, devices = config.optim.batch_size, parallel.count()
+    if size % devices:
+        problem = f"is {size}, which {devices} devices cannot share evenly"
+        remedy = f"make it a multiple of {devices}, or use fewer --devices"
+        raise InputError("optim.batch_size", problem, remedy)
+    train, val = config.data.train_split, config.data.val_split
+    names = config.datasets
+    reporter.line(f"reading {', '.join(names)}: {train} and {val}")
+    sources, held_out, splits = [], {}, {}
+    for split, training in ((train, True), (val, False)):
+        splits[split] = []
+        for name in names:
+            label = f"{name}/" if len(names) > 1 else ""
+            samples: dict[str, int] = {}
+            sequences = read_split(config, name, split, reporter, workers, samples, load)
+            source = task.source_of(sequences, config, training)
+            if training:
+                sources.append(source)
+            else:
+                held_out[name] = parallel.everywhere(source)
+            splits[split] += [label + each for each in samples]
+            hours = sum(samples.values()) / config.data.rate / 3600
+            contents = f"{hours:.2f} h, {task.count(source):,} {task.unit}"
+            reporter.line(f"  {label}{split}: {len(samples)} sequences, {contents}")
+    both = sorted(set(splits[train]) & set(splits[val]))
+    if both:
+        reporter.line(
+            f"warning: {', '.join(both[:3])}{' ...' if both[3:] else ''} in {train} and in {val}: "
+            "the best checkpoint is chosen by recordings that it was trained on; separate the two "
+            "splits"
+        )
+    parts = tuple(map(task.count, sources))
+    epoch = sum(map(visits, parts, config.data.weights or [1.0] * len(parts)))
+    if epoch < size:
+        problem = f"is {size}, but there are only {epoch} {task.unit}"
+        raise InputError("optim.batch_size", problem, "lower it")
+    recordings = Recordings(parallel.everywhere(task.joined(sources)), held_out, splits)
+    of_data = dataclasses.replace(config.data, poses_by=None)
+    nowhere: dict[str, Any] = {"workdir": None, "data_root": None, "init_from": None}
+    anywhere = dataclasses.replace(config, data=of_data, seed=0, **nowhere)
+    return task(model, anywhere, epoch // size, parts), recordings
+
+
+def read_split(
+    config: TrainConfig,
+    dataset: str,
+    split: str,
+    reporter: Reporter,
+    workers: int,
+    samples: dict[str, int],
+    load: Load = load_run,
+) -> Iterator[Sequence]:
+    """The recordings of a split of a dataset at the network's rate, one after another, with poses
+    where they come with waypoints. The number of samples of each is noted in `samples` by its
+    name. A walk that can have no poses is left out with a warning."""
+    progress = functools.partial(reporter.progress, f"reading {split}")
+    read = data.load_each(dataset, config.data_root, split, workers, progress)
+    if config.data.poses_by is not None:
+        read = _with_smoothed_poses(read, config.data.poses_by, load, split, reporter, workers)
+    for sequence in read:
+        resampled = data.resample(sequence, config.data.rate)
+        if resampled.waypoints is not None:
+            try:
+                resampled = data.with_poses(resampled)
+            except InputError as error:
+                reporter.line(f"warning: {error}")
+                continue
+        samples[resampled.name] = len(resampled.time)
+        yield resampled
+
+
+def _with_smoothed_poses(
+    read: Iterable[Sequence], run: str, load: Load, split: str, reporter: Reporter, workers: int
+) -> Iterator[Sequence]:
+    """The recordings, with smoothed poses where they have waypoints. These take seconds a walk, so
+    `workers` processes make them, and they are kept in the cache of recordings."""
+    used, sequences = load(run), list(read)
+    walks = [each for each in sequences if each.waypoints is not None]
+    entries = {walk.name: _cache_entry(walk, used) for walk in walks}
+    found = {walk.name: read_reading(entries[walk.name]) for walk in walks}
+    missing = [(walk, run, load) for walk in walks if found[walk.name] is None]
+    progress = functools.partial(reporter.progress, f"poses of {split}")
+    made = in_processes(smoothed_poses, missing, workers if len(missing) > FEW else 1, progress)
+    for (walk, *_), reading in zip(missing, made, strict=True):
+        write_reading(entries[walk.name], reading)
+        found[walk.name] = reading
+    for sequence in sequences:
+        reading = found.get(sequence.name, Reading([sequence]))
+        assert reading is not None
+        for refusal in reading.refusals:
+            reporter.line(f"warning: {refusal}")
+        yield from reading.sequences
+
+
+def smoothed_poses(walk: Sequence, run: str, load: Load) -> Reading:
+    """A walk with waypoints as one with smoothed poses at the rate of the network that makes them,
+    or why it has none.
+
+    Valid are the legs on which interpolation is: where nobody carried the phone ahead, the taps may
+    be another's.
+    """
+    with jax.enable_x64(True):
+        rate, predict, setup = _labeller(run, load)
+        try:
+            resampled = data.resample(walk, rate)
+            legs = data.with_poses(resampled)
+            poses = filtering.waypoint_poses(resampled, predict, setup).sequence
+        except InputError as error:
+            return Reading([], refusals=(str(error),))
+    valid = legs.valid & poses.valid
+    known = valid[:, None]
+    return Reading(
+        [
+            poses._replace(
+                valid=valid,
+                orientation=np.where(known, poses.orientation, np.nan),
+                position=np.where(known, poses.position, np.nan),
+                velocity=np.where(known, poses.velocity, np.nan),
+            )
+        ]
+    )
+
+
+@functools.cache
+def _labeller(run: str, load: Load) -> tuple[float, Predict, filtering.FilterSetup]:
+    """A run's rate (Hz), network and filter: made once, since programs are compiled for the network
+    that they are given."""
+    used = load(run)
+    network, windows = Network.of(used.model, used.variables), used.config.data
+
+    def predict(windows: Array) -> Prediction:
+        return network.apply(network.variables, windows.astype(jnp.float32))
+
+    return windows.rate, predict, filtering.filter_setup(windows, used.config.filter)
+
+
+def _cache_entry(walk: Sequence, run: Run) -> Path:
+    """The file that keeps the smoothed poses of a walk: of its samples and waypoints, the run's
+    weights and settings, and the sources that make poses of them."""
+    digest = hashlib.sha256(_sources())
+    digest.update(repr(sorted(configuration.flat(run.config).items())).encode())
+    arrays = [walk.time, walk.gyro, walk.accel, walk.imu_valid, *(walk.waypoints or ())]
+    for leaf in jax.tree.leaves((run.variables, arrays)):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return cache_folder() / f"{digest.hexdigest()[:32]}.h5"
+
+
+@functools.cache
+def _sources() -> bytes:
+    """A digest of the source files that decide what poses a walk gets."""
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    rooms = (
+        path for room in ("data", "filtering", "models") for path in (package / room).rglob("*.py")
+    )
+    for path in sorted([*package.glob("*.py"), *rooms, Path(__file__)]):
+        digest.update(path.read_bytes())
+    return digest.digest()
