@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import zipfile
 import zlib
@@ -367,7 +368,8 @@ def _figures(workdir: Path) -> dict[str, Report]:
 def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
     """The error by which networks are listed, in words, of the first evaluation that has it: with
     the filter before without, on the run's own datasets before others, on a test split before
-    others. Empty where none has it."""
+    others; and by way of carrying, over all evaluations with the filter. Empty where none has it.
+    """
 
     def rank(name: str) -> tuple[bool, bool, bool, int, str]:
         how = figures[name].settings
@@ -376,8 +378,24 @@ def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
 
     for name in sorted(figures, key=rank):
         if (error := _cell(figures[name], SHOWN[0])) != tabulate.number(None, 0):
-            return f"{tabulate.column(SHOWN[0]).heading} is {error} m on {name}"
+            found = f"{tabulate.column(SHOWN[0]).heading} is {error} m on {name}"
+            carried = _by_placement(figures)
+            return f"{found} ({', '.join(carried)})" if carried else found
     return ""
+
+
+def _by_placement(figures: dict[str, Report]) -> list[str]:
+    """The mean of that error for each way of carrying, the smallest first, in words."""
+    errors: dict[str, dict[str, float]] = {}  # by way of carrying and recording
+    for found in figures.values():
+        if found.settings["estimator"] != "ekf":
+            continue
+        for name, placement in found.placements.items():
+            error = found.scores[name].values.get(SHOWN[0])
+            if error is not None and math.isfinite(error):
+                errors.setdefault(placement, {})[name] = error
+    means = {placement: sum(own.values()) / len(own) for placement, own in errors.items()}
+    return [f"{each} {means[each]:.1f}" for each in sorted(means, key=means.__getitem__)]
 
 
 def _cell(figures: Report, metric: str) -> str:

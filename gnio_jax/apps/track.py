@@ -32,7 +32,7 @@ from gnio_jax.filtering.zero_velocity import quiet_samples
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.training.checkpoint import Run
-from gnio_jax.types import Sequence
+from gnio_jax.types import GRAVITY, Sequence
 
 ZERO_VELOCITY_STD = 0.02
 """m/s that the filter measures while the IMU is quiet (ours): what lies on a table stays there."""
@@ -42,6 +42,13 @@ by 0.5 to 0.8 rad and change their velocity by 0.5 to 0.7 m/s, root mean square 
 OxIOD and on simulated walks; over two and three by less for each second (ours)."""
 LYING = 0.95
 """Share of rest from which a recording is said to lie still (ours)."""
+RUNNING, RUNNING_SHARE = 5.0, 0.1
+"""m/s² root mean square of |accel| − g over a second, beyond which somebody runs, and the share of
+such seconds that is worth a warning. On Tyrex and OxIOD people who walk have it in at most 1 % of
+their seconds, however they carry the phone, and those who run in 92 % or more (ours)."""
+CLIMB = 3.0
+"""m between the highest and the lowest place of a path, from which on it tells of stairs or of a
+drift (ours)."""
 REFUSED = 0.15
 """Share of refused displacements that is worth a warning (ours). On people that a network has not
 met it refuses 0 to 5 %; walks of a kind that it has not met went wrong by 20 sigma with 29 %."""
@@ -71,6 +78,10 @@ class Summary(NamedTuple):
     """Horizontal at the end, root mean square by the filter's covariance, m."""
     rest: float
     """Share of the time in which the IMU is quieter than a hand."""
+    running: float
+    """Share of the seconds in which it is shaken as in a run."""
+    climb: float
+    """Between the highest and the lowest place, m."""
     accepted: float | None
     """Share of the displacements that the filter used; None if there was none."""
     errors: dict[str, float | None]
@@ -188,6 +199,8 @@ def summarise(
         from_start=float(np.linalg.norm(position[-1] - position[0])),
         expected_error=error,
         rest=_share_at_rest(ready, ekf),
+        running=_share_running(ready),
+        climb=float(np.ptp(found.trajectory.position[: last + 1, 2])),
         accepted=float(used.mean()) if len(used) else None,
         errors={},
         warnings=(),
@@ -207,6 +220,11 @@ def summarise(
             f"gaps: samples are missing{where}, and what happened there is guessed: from there on "
             "heading and place are less certain than the filter says"
         )
+    if ready.start.raw_gyro:
+        warnings.append(
+            "gyro: raw, and without a rest that shows its bias: the heading may be lost within a "
+            "minute; hold the phone still for some seconds first"
+        )
     if ready.start.std.velocity > ROUGH_START:
         warnings.append("start: it moves in its first second, so its velocity and tilt are rough")
     diverged = (note for note in found.notes if note not in ready.notes)
@@ -224,6 +242,10 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
         f"rest: it lies still {summary.rest:.0%} of the time, and the filter holds it there": (
             summary.rest >= LYING
         ),
+        f"running: in {summary.running:.0%} of the seconds it is shaken as in a run, where "
+        "networks of walks make the path too short": summary.running > RUNNING_SHARE,
+        f"height: it changes by {summary.climb:.1f} m: that is drift unless somebody took stairs, "
+        "on which few networks have learnt": summary.climb > CLIMB,
         f"gate: the filter refused {1.0 - accepted:.0%} of the network's displacements: the motion "
         "is unlike what the network was trained on": accepted < 1.0 - REFUSED,
         f"speed: {speed:.1f} m/s in the mean is faster than people walk: the track is wrong": (
@@ -244,6 +266,14 @@ def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
     if ready.imu_valid is not None:
         quiet = quiet & ready.imu_valid
     return float(quiet.reshape(-1, ekf.config.samples_per_clone).all(axis=1).mean())
+
+
+def _share_running(ready: Recording) -> float:
+    """Share of the seconds in which the IMU is shaken as in a run."""
+    second = round(len(ready.accel) / (ready.time[-1] - ready.time[0]))
+    off = np.linalg.norm(ready.accel, axis=1) - GRAVITY
+    seconds = off[: len(off) // second * second].reshape(-1, second)
+    return float((np.sqrt((seconds**2).mean(axis=1)) > RUNNING).mean())
 
 
 def _write_figures(

@@ -128,6 +128,7 @@ def evaluate(
         {each.name: each.group for each in recordings},
         {each.name: list(each.notes) for each in estimates if each.notes},
         left_out,
+        {each.name: each.placement for each in recordings if each.placement},
     )
     folder = workdir / "eval" / folder_name(config, run.config)
     write(folder, report, estimates, run.config, command, config.plots, stage("drawing"))

@@ -66,6 +66,8 @@ class Recording(NamedTuple):
     name: str
     group: str
     """Person or session: recordings of one are not independent of each other."""
+    placement: str
+    """How the IMU was carried, as its dataset says; empty where that is not known."""
     time: Float[np.ndarray, "k1"]
     """Stamps of the start and of the end of each stride, K + 1, s."""
     gyro: Float[np.ndarray, "t 3"]
@@ -148,6 +150,7 @@ def prepare(
             Recording(
                 name=sequence.name,
                 group=str(data.group(sequence)),
+                placement=_placement(sequence),
                 time=whole.time[ends],
                 gyro=whole.gyro[:-1],
                 accel=whole.accel[:-1],
@@ -166,6 +169,11 @@ def prepare(
             )
         )
     return recordings, left_out
+
+
+def _placement(sequence: Sequence) -> str:
+    found = str(sequence.attributes.get("placement", ""))
+    return "" if found == "unknown" else found
 
 
 def measured_rows(sequence: Sequence) -> Int[np.ndarray, "m"]:

@@ -42,7 +42,7 @@ a file's figures cannot stand beside newer ones: another definition of a metric,
 diverged or of a mean, or something in the file that tables need."""
 PAGE = "report.html"
 REMEDY = "evaluate the run anew with gnio evaluate"
-BESIDE = ("infinite", "reasons", "diverged", "group", "notes")
+BESIDE = ("infinite", "reasons", "diverged", "group", "placement", "notes")
 """What metrics.json has of a sequence besides its metrics."""
 
 
@@ -61,6 +61,8 @@ class Report(NamedTuple):
     """Sequence → what a reader should know of its start and of its filter."""
     left_out: dict[str, str]
     """Sequence → why it has no figures."""
+    placements: dict[str, str] = {}
+    """Sequence → how the IMU was carried, where that is known."""
 
     @property
     def diverged(self) -> list[str]:
@@ -149,10 +151,12 @@ def file_names(names: list[str]) -> list[str]:
 
 
 def _of_estimates(report: Report) -> dict[str, dict[str, Any]]:
-    return {
-        name: {**own, "group": report.groups[name], "notes": report.notes.get(name, [])}
-        for name, own in _sequences(report.scores).items()
-    }
+    found = _sequences(report.scores)
+    for name, own in found.items():
+        own |= {"group": report.groups[name], "notes": report.notes.get(name, [])}
+        if name in report.placements:
+            own["placement"] = report.placements[name]
+    return found
 
 
 def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
@@ -211,6 +215,7 @@ def read(folder: Path) -> Report:
             {name: str(own["group"]) for name, own in sequences.items()},
             {name: [*map(str, own["notes"])] for name, own in sequences.items() if own["notes"]},
             {name: str(reason) for name, reason in found["left_out"].items()},
+            {n: str(own["placement"]) for n, own in sequences.items() if "placement" in own},
         )
         # What is not as it is written is no report: a text in the place of a number, say.
         again = {row: _sequences(own) for row, own in report.reference_rows.items()}

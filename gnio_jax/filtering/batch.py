@@ -78,9 +78,9 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
     all others, and of the result, have the sequences as their leading axis. A number of sequences
     that does not divide evenly is filled up with the last one, whose additional results are
     dropped. With one device it is `jax.vmap`, and with one sequence the function itself. JAX
-    refuses arguments that are bound to a device by `jax.device_put(x, device)` (ValueError). In several processes
-    (`jax.distributed`) each of them gives all sequences, and `parallel.on_host` gives each of them
-    all results.
+    refuses arguments that are bound to a device by `jax.device_put(x, device)` (ValueError). In
+    several processes (`jax.distributed`) each of them gives all sequences, and `parallel.on_host`
+    gives each of them all results.
 
     On a machine without a GPU JAX sees one device however many cores there are, and the filter's
     operations are too small for XLA to split each among cores: call `cores_as_devices` first.

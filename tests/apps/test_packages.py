@@ -30,7 +30,7 @@ CONFIG = TrainConfig(
     data_root="/home/somebody/recordings",
     init_from="runs/earlier",
     seed=7,
-    data=DataConfig(rate=50.0),
+    data=DataConfig(rate=50.0, poses_by="/home/somebody/runs/first"),
     model=ModelConfig(name="tiny"),
     filter=changed(noise={"std_factor": (1.7, 1.0, 1.0)}, considered={"scale": 0.02}),
 )
@@ -40,7 +40,7 @@ SCORES = {
     name: Measures({"ate_2d": error, "yaw_rmse": None}, {"yaw_rmse": "no reference"}, False)
     for name, error in (("a", 1.2), ("b", 1.3))
 }
-MEASURED = "ATE 2-D is 1.25 (0.61 to 1.89) m on synthetic_test_ekf"
+MEASURED = "ATE 2-D is 1.25 (0.61 to 1.89) m on synthetic_test_ekf (in a pocket 1.2, in a hand 1.3)"
 """12.706 (Student's t, one degree of freedom) times 0.05 m around the mean."""
 SAID = Description("walk", "simulated walks", "CC0", ("Running | jumping.",))
 
@@ -52,7 +52,8 @@ def run(tmp_path_factory):
         folder = tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIG)
         evaluation = folder / "eval" / "synthetic_test_ekf"
         evaluation.mkdir(parents=True)
-        figures = report.Report(SETTINGS, SCORES, {}, {"a": "ann", "b": "bob"}, {}, {})
+        groups, carried = {"a": "ann", "b": "bob"}, {"a": "in a pocket", "b": "in a hand"}
+        figures = report.Report(SETTINGS, SCORES, {}, groups, {}, {}, carried)
         (evaluation / "metrics.json").write_text(json.dumps(report.as_json(figures)))
         yield folder
 
@@ -91,7 +92,8 @@ def with_changes(package, **changes):
 def test_a_package_is_the_run(run, published, name, tmp_path, gnio):
     """And the run that is made of it is the same network."""
     own, loaded = checkpoint.load_run(run), gnio_jax.load_pretrained(published / name)
-    assert loaded.config == dataclasses.replace(CONFIG, data_root=None, init_from=None)
+    known = {"data_root": None, "init_from": None, "data": DataConfig(rate=50.0)}
+    assert loaded.config == dataclasses.replace(CONFIG, **known)
     out = tmp_path / "runs" / "made"
     assert f"gnio evaluate --workdir {out}" in gnio("weights", published / name, "--out", out)
     made = checkpoint.load_run(out)
@@ -128,7 +130,8 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run,
     for words in (
         "Trained on: simulated walks",
         "- Running | jumping.",
-        "gnio train --config config.yaml --workdir runs/walk --init-from runs/earlier",
+        "gnio train --config config.yaml --workdir runs/walk --init-from runs/earlier "
+        "--set data.poses_by=runs/first",
         "covariance of the filter: scale.",
         "| synthetic_test_ekf | 2 | 2 | 1.25 (0.61 to 1.89) | – |",
     ):

@@ -213,6 +213,19 @@ def test_a_recording_with_waypoints_is_compared_with_them(gnio, runs, tmp_path):
     assert "at waypoints" in page and "one turn and one shift" in page
 
 
+def test_a_raw_gyro_and_a_run_are_warned_of(gnio, undrawn, runs, tmp_path):
+    """The recording shakes as a runner's for two of its six seconds, and does not begin at rest."""
+    time = np.delete(np.arange(620), np.s_[560:580]) / 100
+    walk = without_poses("run", time)
+    shaken = walk.accel * (1 + 0.9 * np.sin(18.0 * time) * (time > 4.0))[:, None]
+    raw = walk._replace(accel=shaken, attributes={"imu_compensated": "no"})
+    write_hdf5(tmp_path / "run.h5", raw)
+    told = gnio("track", tmp_path / "run.h5", "--weights", runs / "walker", "--out", tmp_path / "t")
+    assert "warning: gyro: raw, and without a rest that shows its bias" in told
+    assert "warning: running: in 33% of the seconds it is shaken as in a run" in told
+    assert summary_of(tmp_path / "t")["running"] == pytest.approx(2 / 6)
+
+
 def test_what_cannot_be_written_is_found_before_the_work(mistake, runs, tmp_path, monkeypatch):
     """Also stamps that ROS cannot hold."""
     monkeypatch.setattr("gnio_jax.apps.track.prepare", lambda *_, **__: pytest.fail("too late"))
@@ -225,7 +238,9 @@ def test_what_cannot_be_written_is_found_before_the_work(mistake, runs, tmp_path
         assert words in mistake("track", odd, *weights, "--format", "mcap", "--time-unit", "s")
 
 
-SUMMARY = Summary("walk", "net", "walks", 0.0, 100.0, 80.0, 1.0, 2.0, 0.0, 1.0, {}, (), (), "")
+SUMMARY = Summary(
+    "walk", "net", "walks", 0.0, 100.0, 80.0, 1.0, 2.0, 0.0, 0.0, 0.5, 1.0, {}, (), (), ""
+)
 
 
 @pytest.mark.parametrize(
@@ -234,6 +249,9 @@ SUMMARY = Summary("walk", "net", "walks", 0.0, 100.0, 80.0, 1.0, 2.0, 0.0, 1.0, 
         ({}, None),
         ({"accepted": 0.71}, "gate: the filter refused 29% of"),
         ({"rest": 0.97}, "rest: it lies still 97% of the time"),
+        ({"running": 0.05}, None),
+        ({"running": 0.94}, "running: in 94% of the seconds it is shaken as in a run"),
+        ({"climb": 4.26}, "height: it changes by 4.3 m: that is drift unless"),
         ({"path_length": 400.0}, "speed: 4.0 m/s in the mean"),
         ({"errors": {"nees_coverage_2d": 88.0}}, None),
         ({"errors": {"nees_coverage_2d": 7.0}}, "errors: larger than the filter says: its 95 %"),

@@ -45,7 +45,7 @@ def test_smoothed_poses_come_from_the_run_and_then_from_the_cache(earlier, monke
             raise InputError(walk.name, "the filter fails on it")
         poses = data.with_poses(walk)
         ends = walk.time < walk.time[-1] - 3.0
-        poses = poses._replace(position=poses.position + [0.0, 0.0, 1.0], valid=ends)
+        poses = poses._replace(position=poses.position + np.array([0.0, 0.0, 1.0]), valid=ends)
         return filtering.WaypointPoses(poses, None, None)
 
     monkeypatch.setattr(filtering, "waypoint_poses", waypoint_poses)
