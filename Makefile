@@ -2,6 +2,8 @@
 # make test   install everything the tests need, and run them on every core
 # make test-all   the tests that are marked slow, too: continuous integration runs these
 # make lint   ruff and pyright
+# make pedestrian   the network that comes with gnio-jax anew, from Tyrex and Indoor Location below
+#             $GNIO_DATA: an hour on two cores
 # make docs   the documentation as a site, in site/index.html; its notebooks run
 # make links  ask every external link of the pages if it answers; needs a network
 #
@@ -13,7 +15,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-DEMO ?= runs/demo
+RUNS ?= runs
+DEMO ?= $(RUNS)/demo
 JOBS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 EXTRAS ?= test
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
@@ -38,13 +41,22 @@ SHARED_OUT := --dist loadfile --no-loadscope-reorder
 # No rules but these.
 MAKEFLAGS += --no-builtin-rules
 
-.PHONY: demo test test-all lint docs links clean
+.PHONY: demo pedestrian test test-all lint docs links clean
 
 demo: $(VENV)/.package
 	rm -rf $(DEMO)
 	$(BIN)/gnio train --config quickstart --workdir $(DEMO)
 	$(BIN)/gnio evaluate --workdir $(DEMO) --estimator imu_only
 	$(BIN)/gnio evaluate --workdir $(DEMO)
+
+# A network of a quarter of the width learns from poses between the waypoints, and makes truer ones
+# for the network of half the width.
+pedestrian: $(VENV)/.package
+	$(BIN)/gnio train --config pedestrian --model.width 16 --workdir $(RUNS)/pedestrian_first
+	$(BIN)/gnio calibrate --workdir $(RUNS)/pedestrian_first
+	$(BIN)/gnio train --config pedestrian --workdir $(RUNS)/pedestrian \
+		--set data.poses_by=$(RUNS)/pedestrian_first_calibrated
+	$(BIN)/gnio calibrate --workdir $(RUNS)/pedestrian --average-headings
 
 test: $(VENV)/.with-$(EXTRAS)
 	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) $(SHARED_OUT) -m 'not slow' $(PYTEST_ARGS)

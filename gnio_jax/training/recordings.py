@@ -22,7 +22,7 @@ import numpy as np
 from gnio_jax import config as configuration
 from gnio_jax import data, filtering, models, parallel
 from gnio_jax.config import TrainConfig
-from gnio_jax.data.hdf5 import Reading, cache_folder, read_reading, write_reading
+from gnio_jax.data.hdf5 import Reading, cache_entry, read_reading, write_reading
 from gnio_jax.data.loading import FEW, in_processes
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.network import Predict
@@ -201,21 +201,11 @@ def _labeller(run: str, load: Load) -> tuple[float, Predict, filtering.FilterSet
 def _cache_entry(walk: Sequence, run: Run) -> Path:
     """The file that keeps the smoothed poses of a walk: of its samples and waypoints, the run's
     weights and settings, and the sources that make poses of them."""
-    digest = hashlib.sha256(_sources())
-    digest.update(repr(sorted(configuration.flat(run.config).items())).encode())
-    arrays = [walk.time, walk.gyro, walk.accel, walk.imu_valid, *(walk.waypoints or ())]
+    digest = hashlib.sha256(repr(sorted(configuration.flat(run.config).items())).encode())
+    arrays = [walk.time, walk.gyro, walk.accel, walk.imu_valid, walk.waypoints]
     for leaf in jax.tree.leaves((run.variables, arrays)):
         digest.update(np.ascontiguousarray(leaf).tobytes())
-    return cache_folder() / f"{digest.hexdigest()[:32]}.h5"
-
-
-@functools.cache
-def _sources() -> bytes:
-    """A digest of the source files that decide what poses a walk gets."""
-    package, digest = Path(__file__).parents[1], hashlib.sha256()
-    rooms = (
-        path for room in ("data", "filtering", "models") for path in (package / room).rglob("*.py")
-    )
-    for path in sorted([*package.glob("*.py"), *rooms, Path(__file__)]):
-        digest.update(path.read_bytes())
-    return digest.digest()
+    package = Path(__file__).parents[1]
+    rooms = [path for room in ("filtering", "models") for path in (package / room).rglob("*.py")]
+    sources = sorted([*package.glob("*.py"), *rooms, Path(__file__)])
+    return cache_entry(digest.hexdigest(), sources)
