@@ -4,6 +4,7 @@ import ast
 import importlib
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import tomllib
@@ -243,10 +244,11 @@ def test_what_else_the_shell_is_told_is_there():
         ("lint", ".[test,dev]"),
         ("docs", ".[docs]"),
         ("demo", "."),
+        ("pedestrian", "."),
     ],
 )
 def test_make_installs_what_it_needs(words, installed, tmp_path):
-    """Into an environment of its own, before anything else runs there."""
+    """Into an environment of its own, before anything else runs there. The commands are known."""
     command = ["make", "--dry-run", f"VENV={tmp_path / 'none'}", *words.split()]
     alone = {"PATH": os.environ["PATH"]}  # without what the make of these tests was told
     said = subprocess.run(
@@ -257,6 +259,9 @@ def test_make_installs_what_it_needs(words, installed, tmp_path):
     assert steps[: len(installs)] == installs
     assert re.search(r"pip install .*-e '?([^' ]+)'?$", installs[-1])[1] == installed
     assert len(steps) > 1
+    for line in said.stdout.replace("\\\n", " ").splitlines():
+        if "/none/bin/gnio" in line:
+            understood(shlex.split(line)[1:])
 
 
 def test_the_reference_has_every_room():
