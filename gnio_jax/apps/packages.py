@@ -368,8 +368,7 @@ def _figures(workdir: Path) -> dict[str, Report]:
 def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
     """The error by which networks are listed, in words, of the first evaluation that has it: with
     the filter before without, on the run's own datasets before others, on a test split before
-    others; and by way of carrying, over all evaluations with the filter. Empty where none has it.
-    """
+    others; with that of each way of carrying. Empty where none has it."""
 
     def rank(name: str) -> tuple[bool, bool, bool, int, str]:
         how = figures[name].settings
@@ -379,22 +378,19 @@ def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
     for name in sorted(figures, key=rank):
         if (error := _cell(figures[name], SHOWN[0])) != tabulate.number(None, 0):
             found = f"{tabulate.column(SHOWN[0]).heading} is {error} m on {name}"
-            carried = _by_placement(figures)
-            return f"{found} ({', '.join(carried)})" if carried else found
+            carried = _by_placement(figures[name])
+            return f"{found} ({'; '.join(carried)})" if carried else found
     return ""
 
 
-def _by_placement(figures: dict[str, Report]) -> list[str]:
+def _by_placement(figures: Report) -> list[str]:
     """The mean of that error for each way of carrying, the smallest first, in words."""
-    errors: dict[str, dict[str, float]] = {}  # by way of carrying and recording
-    for found in figures.values():
-        if found.settings["estimator"] != "ekf":
-            continue
-        for name, placement in found.placements.items():
-            error = found.scores[name].values.get(SHOWN[0])
-            if error is not None and math.isfinite(error):
-                errors.setdefault(placement, {})[name] = error
-    means = {placement: sum(own.values()) / len(own) for placement, own in errors.items()}
+    errors: dict[str, list[float]] = {}
+    for name, placement in figures.placements.items():
+        error = figures.scores[name].values.get(SHOWN[0])
+        if error is not None and math.isfinite(error):
+            errors.setdefault(placement, []).append(error)
+    means = {placement: sum(own) / len(own) for placement, own in errors.items()}
     return [f"{each} {means[each]:.1f}" for each in sorted(means, key=means.__getitem__)]
 
 

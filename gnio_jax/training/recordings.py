@@ -21,7 +21,7 @@ import numpy as np
 
 from gnio_jax import config as configuration
 from gnio_jax import data, filtering, models, parallel
-from gnio_jax.config import TrainConfig
+from gnio_jax.config import NoiseModel, TrainConfig
 from gnio_jax.data.hdf5 import Reading, cache_entry, read_reading, write_reading
 from gnio_jax.data.loading import FEW, in_processes
 from gnio_jax.errors import InputError
@@ -138,7 +138,13 @@ def _with_smoothed_poses(
 ) -> Iterator[Sequence]:
     """The recordings, with smoothed poses where they have waypoints. These take seconds a walk, so
     `workers` processes make them, and they are kept in the cache of recordings."""
-    used, sequences = load(run), list(read)
+    used = load(run)
+    if used.config.filter.noise == NoiseModel():
+        reporter.line(
+            f"warning: {run}: its filter is not calibrated, and smooths worse than interpolation; "
+            "calibrate it with gnio calibrate"
+        )
+    sequences = list(read)
     walks = [each for each in sequences if each.waypoints is not None]
     entries = {walk.name: _cache_entry(walk, used) for walk in walks}
     found = {walk.name: read_reading(entries[walk.name]) for walk in walks}

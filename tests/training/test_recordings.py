@@ -14,6 +14,7 @@ from gnio_jax.training import recordings
 from gnio_jax.training.checkpoint import load_run
 from gnio_jax.types import Waypoints
 from tests.support import tiny_run
+from tests.support.filter_settings import changed
 from tests.support.surveyor import survey
 
 
@@ -54,7 +55,9 @@ def test_smoothed_poses_come_from_the_run_and_then_from_the_cache(earlier, monke
     found = read(monkeypatch, [first, fails, posed, last], earlier)
     assert [each.name for each in found] == ["survey 0", "survey 3", "survey 2"]
     assert asked == [(f"survey {number}", 1 / 25) for number in range(3)]
-    assert "warning: survey 1: the filter fails on it" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "warning: survey 1: the filter fails on it" in told
+    assert f"warning: {earlier}: its filter is not calibrated" in told
     for walk, poses in zip((first, last), (found[0], found[2]), strict=True):
         flat = data.with_poses(walk)
         inside = flat.valid & (walk.time < walk.time[-1] - 3.0)
@@ -74,9 +77,13 @@ def test_smoothed_poses_come_from_the_run_and_then_from_the_cache(earlier, monke
     moved = Waypoints(first.waypoints.time, first.waypoints.position + 1.0)
     read(monkeypatch, [first._replace(waypoints=moved)], earlier)
     assert len(asked) == 4
-    other = tiny_run.save(earlier.with_name("other"), load_run(earlier).config, size=0.3)
+    config = dataclasses.replace(
+        load_run(earlier).config, filter=changed(noise={"measurement_scale": 1.0})
+    )
+    other = tiny_run.save(earlier.with_name("other"), config, size=0.3)
+    capsys.readouterr()
     read(monkeypatch, [first], other)
-    assert len(asked) == 5
+    assert len(asked) == 5 and "is not calibrated" not in capsys.readouterr().err
 
 
 def test_a_run_that_is_not_there_is_told_before_anything_is_read(tmp_path, monkeypatch):
