@@ -77,26 +77,29 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
     The first `shared` arguments (parameters, noise) are the same for every sequence; the leaves of
     all others, and of the result, have the sequences as their leading axis. A number of sequences
     that does not divide evenly is filled up with the last one, whose additional results are
-    dropped. With one device it is `jax.vmap`, and with one sequence the function itself. JAX
-    refuses arguments that are bound to a device by `jax.device_put(x, device)` (ValueError). In
-    several processes (`jax.distributed`) each of them gives all sequences, and `parallel.on_host`
-    gives each of them all results.
+    dropped. With one device it is `jax.vmap`, and for a device that has one sequence the function
+    itself. JAX refuses arguments that are bound to a device by `jax.device_put(x, device)`
+    (ValueError). In several processes (`jax.distributed`) each of them gives all sequences, and
+    `parallel.on_host` gives each of them all results.
 
     On a machine without a GPU JAX sees one device however many cores there are, and the filter's
     operations are too small for XLA to split each among cores: call `cores_as_devices` first.
     """
+
+    def batched(*arguments: object) -> T:
+        own = arguments[shared:]
+        if jax.tree.leaves(own)[0].shape[0] > 1:
+            return jax.vmap(function, in_axes=(None,) * shared + (0,) * len(own))(*arguments)
+        # A walk of its own is traced in half of vmap's time, and the network runs only where there
+        # is a window: vmap would take both branches.
+        only = jax.tree.map(lambda leaf: leaf[0], own)
+        return jax.tree.map(lambda leaf: leaf[None], function(*arguments[:shared], *only))
 
     def mapped(*arguments: object) -> T:
         own = arguments[shared:]
         count = jax.tree.leaves(own)[0].shape[0]
         # Every process takes part, also where there are fewer sequences than devices.
         devices = jax.devices() if jax.process_count() > 1 else jax.devices()[:count]
-        if len(devices) == count == 1:
-            # A walk of its own is traced in half of vmap's time, and the network runs only where
-            # there is a window: vmap would take both branches.
-            only = jax.tree.map(lambda leaf: leaf[0], own)
-            return jax.tree.map(lambda leaf: leaf[None], function(*arguments[:shared], *only))
-        batched = jax.vmap(function, in_axes=(None,) * shared + (0,) * len(own))
         if len(devices) == 1:
             return batched(*arguments)
         times = -count % len(devices)

@@ -102,16 +102,23 @@ def loss(x, around):
     return jnp.sum(around.rows * of_rows), history
 
 
-GRADIENT = quick(jax.value_and_grad(loss, has_aux=True))
-"""The one program: under a vmap it would be traced and compiled twice as long."""
+BATCH = 8
+GRADIENT = quick(jax.vmap(jax.value_and_grad(loss, has_aux=True)))
+"""The one program. Under the vmap, as in training, both branches of every condition are taken, and
+neither may spoil the gradient of the other."""
 
 
 def at(points, around=EARLY):
     """Values, histories and gradients at all of these points, what is around them the same or of
     each."""
     around = around if isinstance(around, list) else [around] * len(points)
-    found = [GRADIENT(*given) for given in zip(points, around, strict=True)]
-    (value, history), gradient = jax.tree.map(lambda *parts: np.stack(parts), *found)
+    found = []
+    for first in range(0, len(points), BATCH):
+        some = list(zip(points, around, strict=True))[first : first + BATCH]
+        some += [some[-1]] * (BATCH - len(some))
+        found.append(GRADIENT(*jax.tree.map(lambda *leaves: np.stack(leaves), *some)))
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *found)
+    (value, history), gradient = joined
     return value, history, gradient
 
 

@@ -77,7 +77,7 @@ def tiny(recording, workdir, **changes):
         init_from=str(recording / "initial"),
         data=DataConfig(rate=50.0, window_seconds=WINDOW),
         model=ModelConfig(name="tiny", uncertainty="calibrated"),
-        optim=OptimConfig(epochs=2, batch_size=4, learning_rate=1e-3, warmup_epochs=0.5),
+        optim=OptimConfig(epochs=2, batch_size=2, learning_rate=1e-3, warmup_epochs=0.5),
         filter=OPTIONS,
         through_filter=THROUGH,
     )
@@ -95,7 +95,7 @@ def finished(recording, tmp_path_factory):
 def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished):
     found = rows(finished)
     # 12 s have five segments of 2 s, since the sample at the end of each is needed; two walks.
-    assert [(row["epoch"], row["step"]) for row in found] == [(0, 2), (1, 4)]
+    assert [(row["epoch"], row["step"]) for row in found] == [(0, 5), (1, 10)]
     for row in found:
         parts = ("displacement", "yaw", "innovation", "state", "mse")
         assert row["loss"] == pytest.approx(sum(row[part] for part in parts), rel=1e-6)
