@@ -2,8 +2,8 @@
 the noises that simulated walks were made with, consider covariances against the errors that
 positions were drawn with, the gradient against differences.
 
-Fits and calibrations here are of walks, windows and settings of one shape: each of their programs
-is compiled once.
+Fits and calibrations here are of walks, windows and settings of one shape, and of one walk for each
+device: each of their programs is compiled once, and without a vmap.
 """
 
 import dataclasses
@@ -56,7 +56,7 @@ from tests.support.filter_settings import changed
 from tests.support.walks import simulate, with_correlated_errors
 
 DATA = DataConfig(rate=50.0, window_seconds=0.4, stride_seconds=0.1)
-WALKS, STRIDES, N, CLONES, SIGMA = 4, 200, 5, 4, 0.05
+WALKS, STRIDES, N, CLONES, SIGMA = 2, 400, 5, 4, 0.05
 TRAINED = TrainConfig(
     data=DATA,
     model=ModelConfig(name="tiny", width=4),
@@ -494,7 +494,7 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     walks, truth = walks_and_truth()
     truth = truth.copy()
     options = changed(TRUE, noise={"measurement_scale": 9.0})  # σ is three times what is said
-    truth[0, 50:] = np.nan
+    truth[0, 300:] = np.nan
     found = filtered_positions(walks, truth, DATA, options)
     assert len(found.error) == np.isfinite(truth).all(2).sum()
     assert nees(found) == pytest.approx(1, abs=0.5)
@@ -505,7 +505,7 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     accel[1, 100:] += 1e4
     marked = walks._replace(start=walks.start._replace(raw_gyro=raw), accel=accel)
     some = filtered_positions(marked, truth, DATA, options)
-    assert 0 <= len(some.error) - (WALKS - 2) * STRIDES < 50 and np.abs(some.error).max() < 50
+    assert 0 < len(some.error) < 50 and np.abs(some.error).max() < 50
     marked = walks._replace(start=walks.start._replace(raw_gyro=raw | True))
     assert len(filtered_positions(marked, truth, DATA, options).error) == len(found.error)
 
