@@ -52,6 +52,8 @@ demo: $(VENV)/.package
 # A network of a quarter of the width learns from poses between the waypoints, and makes truer ones
 # for the network of half the width.
 pedestrian: $(VENV)/.package
+	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_calibrated
+	rm -rf $(RUNS)/pedestrian_first $(RUNS)/pedestrian_first_calibrated
 	$(BIN)/gnio train --config pedestrian --model.width 16 --workdir $(RUNS)/pedestrian_first
 	$(BIN)/gnio calibrate --workdir $(RUNS)/pedestrian_first
 	$(BIN)/gnio train --config pedestrian --workdir $(RUNS)/pedestrian \

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import tomllib
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -235,6 +236,33 @@ def test_what_else_the_shell_is_told_is_there():
             assert path.is_dir() or path.with_suffix(".py").is_file(), f"{page}: {module}"
 
 
+def commands_of(shell):
+    """The words of each call of gnio."""
+    lines = [shlex.split(line) for line in shell.replace("\\\n", " ").splitlines()]
+    return [words for words in lines if words and Path(words[0]).name == "gnio"]
+
+
+@pytest.mark.skipif(not shutil.which("make"), reason="no make here")
+def test_the_recipe_of_the_shipped_network_is_what_make_runs():
+    text = configuration.find("pedestrian").read_text(encoding="utf-8")
+    told = commands_of("\n".join(re.findall(r"^#   +(.*)$", text, re.M)))
+    command = ["make", "--dry-run", "pedestrian", "RUNS=runs"]
+    said = subprocess.run(command, cwd=pages.ROOT, capture_output=True, text=True, check=True)
+    made = commands_of(said.stdout)
+    assert [sorted(words[1:]) for words in made] == [sorted(words[1:]) for words in told]
+    # Each step reads what an earlier one has left.
+    left = set()
+    for _, command, *words in made:
+        asked = understood([command, *words])
+        if command == "train":
+            poses = [each.partition("=")[2] for each in asked.set]
+            assert set(poses) <= left
+            left.add(asked.workdir)
+        else:
+            assert asked.workdir in left
+            left.add(f"{asked.workdir}_calibrated")
+
+
 @pytest.mark.skipif(not shutil.which("make"), reason="no make here")
 @pytest.mark.parametrize(
     ("words", "installed"),
@@ -259,9 +287,8 @@ def test_make_installs_what_it_needs(words, installed, tmp_path):
     assert steps[: len(installs)] == installs
     assert re.search(r"pip install .*-e '?([^' ]+)'?$", installs[-1])[1] == installed
     assert len(steps) > 1
-    for line in said.stdout.replace("\\\n", " ").splitlines():
-        if "/none/bin/gnio" in line:
-            understood(shlex.split(line)[1:])
+    for _, *asked in commands_of(said.stdout):
+        understood(asked)
 
 
 def test_the_reference_has_every_room():

@@ -12,6 +12,7 @@ import dataclasses
 import json
 import math
 import os
+import shlex
 import zipfile
 import zlib
 from importlib.metadata import version
@@ -387,8 +388,9 @@ def _by_placement(figures: Report) -> list[str]:
     """The mean of that error for each way of carrying, the smallest first, in words."""
     errors: dict[str, list[float]] = {}
     for name, placement in figures.placements.items():
-        error = figures.scores[name].values.get(SHOWN[0])
-        if error is not None and math.isfinite(error):
+        own = figures.scores[name]
+        error = own.values.get(SHOWN[0])
+        if error is not None and math.isfinite(error) and not own.diverged:
             errors.setdefault(placement, []).append(error)
     means = {placement: sum(own) / len(own) for placement, own in errors.items()}
     return [f"{each} {means[each]:.1f}" for each in sorted(means, key=means.__getitem__)]
@@ -405,14 +407,20 @@ def _cell(figures: Report, metric: str) -> str:
     return f"{text} ({low} to {high})"
 
 
+def _named_run(which: str) -> str:
+    """A package by its name, and a run without the folders of this machine."""
+    known = which in packages() and not Path(which).exists()
+    return shlex.quote(which if known else f"runs/{Path(which).name}")
+
+
 def _card(
     said: Description, run: Run, made_by: str, figures: dict[str, Report], workdir: Path
 ) -> str:
     """The model card, Markdown."""
     config, windows, name = run.config, run.config.data, said.name
-    begun = f" --init-from runs/{Path(config.init_from).name}" if config.init_from else ""
+    begun = f" --init-from {_named_run(config.init_from)}" if config.init_from else ""
     if windows.poses_by:
-        begun += f" --set data.poses_by=runs/{Path(windows.poses_by).name}"
+        begun += f" --set data.poses_by={_named_run(windows.poses_by)}"
     steps, fitted = [f"gnio train --config config.yaml --workdir runs/{name}{begun}"], ""
     if (workdir / "calibration.json").is_file():
         found = json.loads((workdir / "calibration.json").read_text(encoding="utf-8"))

@@ -93,7 +93,8 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
         # A walk of its own is traced in half of vmap's time, and the network runs only where there
         # is a window: vmap would take both branches.
         only = jax.tree.map(lambda leaf: leaf[0], own)
-        return jax.tree.map(lambda leaf: leaf[None], function(*arguments[:shared], *only))
+        found = function(*arguments[:shared], *only)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], found)
 
     def mapped(*arguments: object) -> T:
         own = arguments[shared:]

@@ -33,7 +33,8 @@ from gnio_jax.training.task import Task, visits
 from gnio_jax.types import Array, Prediction, Sequence
 
 Load = Callable[[str], Run]
-"""Reads the run, or the package of weights, of this name."""
+"""Reads the run, or the package of weights, of this name; a function of a module, since other
+processes call it too."""
 
 
 class Recordings(NamedTuple):
@@ -44,7 +45,17 @@ class Recordings(NamedTuple):
     held_out: dict[str, Any]
     """Those of the validation split of each dataset by its name, likewise."""
     splits: dict[str, list[str]]
-    """Names of the recordings of each split; of several datasets, with theirs before them."""
+    """Names of the recordings of each split; of several datasets, with theirs before them. Where a
+    run has made poses, its digest stands there too, as `data.poses_by`."""
+
+
+class PosesBy(NamedTuple):
+    """The network that makes poses of walks with waypoints."""
+
+    run: str
+    load: Load
+    digest: str
+    """Of its weights and settings."""
 
 
 def set_up(
@@ -68,7 +79,7 @@ def set_up(
         remedy = f"make it a multiple of {devices}, or use fewer --devices"
         raise InputError("optim.batch_size", problem, remedy)
     train, val = config.data.train_split, config.data.val_split
-    names = config.datasets
+    names, poses = config.datasets, _poses_by(config, reporter, load)
     reporter.line(f"reading {', '.join(names)}: {train} and {val}")
     sources, held_out, splits = [], {}, {}
     for split, training in ((train, True), (val, False)):
@@ -76,7 +87,7 @@ def set_up(
         for name in names:
             label = f"{name}/" if len(names) > 1 else ""
             samples: dict[str, int] = {}
-            sequences = read_split(config, name, split, reporter, workers, samples, load)
+            sequences = read_split(config, name, split, reporter, workers, samples, poses)
             source = task.source_of(sequences, config, training)
             if training:
                 sources.append(source)
@@ -93,6 +104,8 @@ def set_up(
             "the best checkpoint is chosen by recordings that it was trained on; separate the two "
             "splits"
         )
+    if poses is not None:
+        splits["data.poses_by"] = [poses.digest]
     parts = tuple(map(task.count, sources))
     epoch = sum(map(visits, parts, config.data.weights or [1.0] * len(parts)))
     if epoch < size:
@@ -105,6 +118,25 @@ def set_up(
     return task(model, anywhere, epoch // size, parts), recordings
 
 
+def _poses_by(config: TrainConfig, reporter: Reporter, load: Load) -> PosesBy | None:
+    """What `data.poses_by` names. Raises `InputError` where that is slower than the network that is
+    trained: its poses come with the IMU at its own rate."""
+    name = config.data.poses_by
+    if name is None:
+        return None
+    run = load(name)
+    if run.config.data.rate < config.data.rate:
+        problem = f"names a network of {run.config.data.rate:g} Hz, slower than data.rate"
+        remedy = f"name one of {config.data.rate:g} Hz or more"
+        raise InputError("data.poses_by", problem, remedy)
+    if run.config.filter.noise == NoiseModel():
+        reporter.line(
+            f"warning: {name}: its filter is not calibrated, and smooths worse than interpolation; "
+            "calibrate it with gnio calibrate"
+        )
+    return PosesBy(name, load, _digest_of_run(run))
+
+
 def read_split(
     config: TrainConfig,
     dataset: str,
@@ -112,15 +144,16 @@ def read_split(
     reporter: Reporter,
     workers: int,
     samples: dict[str, int],
-    load: Load = load_run,
+    poses: PosesBy | None = None,
 ) -> Iterator[Sequence]:
     """The recordings of a split of a dataset at the network's rate, one after another, with poses
-    where they come with waypoints. The number of samples of each is noted in `samples` by its
-    name. A walk that can have no poses is left out with a warning."""
+    where they come with waypoints: those that `poses` makes, else interpolated ones. The number of
+    samples of each is noted in `samples` by its name. A walk that can have no poses is left out
+    with a warning."""
     progress = functools.partial(reporter.progress, f"reading {split}")
-    read = data.load_each(dataset, config.data_root, split, workers, progress)
-    if config.data.poses_by is not None:
-        read = _with_smoothed_poses(read, config.data.poses_by, load, split, reporter, workers)
+    read: Iterable[Sequence] = data.load_each(dataset, config.data_root, split, workers, progress)
+    if poses is not None:
+        read = _with_smoothed_poses(read, poses, split, reporter, workers)
     for sequence in read:
         resampled = data.resample(sequence, config.data.rate)
         if resampled.waypoints is not None:
@@ -134,35 +167,41 @@ def read_split(
 
 
 def _with_smoothed_poses(
-    read: Iterable[Sequence], run: str, load: Load, split: str, reporter: Reporter, workers: int
+    read: Iterable[Sequence], by: PosesBy, split: str, reporter: Reporter, workers: int
 ) -> Iterator[Sequence]:
     """The recordings, with smoothed poses where they have waypoints. These take seconds a walk, so
     `workers` processes make them, and they are kept in the cache of recordings."""
-    used = load(run)
-    if used.config.filter.noise == NoiseModel():
-        reporter.line(
-            f"warning: {run}: its filter is not calibrated, and smooths worse than interpolation; "
-            "calibrate it with gnio calibrate"
-        )
-    sequences = list(read)
-    walks = [each for each in sequences if each.waypoints is not None]
-    entries = {walk.name: _cache_entry(walk, used) for walk in walks}
-    found = {walk.name: read_reading(entries[walk.name]) for walk in walks}
-    missing = [(walk, run, load) for walk in walks if found[walk.name] is None]
+    held: list[Sequence] = []  # from the first walk with waypoints on
+    for sequence in read:
+        if sequence.waypoints is None and not held:
+            yield sequence
+        else:
+            held.append(sequence)
+    walks = {each.name: each for each in held if each.waypoints is not None}
+    entries = {name: _cache_entry(walk, by) for name, walk in walks.items()}
+    found = {name: read_reading(entry) for name, entry in entries.items()}
+    missing = [(walk, by) for name, walk in walks.items() if found[name] is None]
+    several = workers > 1 and len(missing) > FEW
+    make, workers = (_poses_on_cpu, workers) if several else (smoothed_poses, 1)
     progress = functools.partial(reporter.progress, f"poses of {split}")
-    made = in_processes(smoothed_poses, missing, workers if len(missing) > FEW else 1, progress)
-    for (walk, *_), reading in zip(missing, made, strict=True):
+    made = in_processes(make, missing, workers, progress)
+    for (walk, _), reading in zip(missing, made, strict=True):
         write_reading(entries[walk.name], reading)
         found[walk.name] = reading
-    for sequence in sequences:
-        reading = found.get(sequence.name, Reading([sequence]))
-        assert reading is not None
+    for sequence in held:
+        reading = found.get(sequence.name) or Reading([sequence])
         for refusal in reading.refusals:
             reporter.line(f"warning: {refusal}")
         yield from reading.sequences
 
 
-def smoothed_poses(walk: Sequence, run: str, load: Load) -> Reading:
+def _poses_on_cpu(walk: Sequence, by: PosesBy) -> Reading:
+    """`smoothed_poses` in a process of its own: the GPU is the first process's."""
+    jax.config.update("jax_platforms", "cpu")
+    return smoothed_poses(walk, by)
+
+
+def smoothed_poses(walk: Sequence, by: PosesBy) -> Reading:
     """A walk with waypoints as one with smoothed poses at the rate of the network that makes them,
     or why it has none.
 
@@ -170,7 +209,7 @@ def smoothed_poses(walk: Sequence, run: str, load: Load) -> Reading:
     be another's.
     """
     with jax.enable_x64(True):
-        rate, predict, setup = _labeller(run, load)
+        rate, predict, setup = _labeller(by)
         try:
             resampled = data.resample(walk, rate)
             legs = data.with_poses(resampled)
@@ -192,26 +231,40 @@ def smoothed_poses(walk: Sequence, run: str, load: Load) -> Reading:
 
 
 @functools.cache
-def _labeller(run: str, load: Load) -> tuple[float, Predict, filtering.FilterSetup]:
-    """A run's rate (Hz), network and filter: made once, since programs are compiled for the network
-    that they are given."""
-    used = load(run)
-    network, windows = Network.of(used.model, used.variables), used.config.data
+def _labeller(by: PosesBy) -> tuple[float, Predict, filtering.FilterSetup]:
+    """A network's rate (Hz), the network and its filter: made once, since programs are compiled for
+    the network that they are given. Raises `InputError` where the run is no longer the same."""
+    run = by.load(by.run)
+    if _digest_of_run(run) != by.digest:
+        raise InputError(by.run, "has changed while it made poses", "begin the training anew")
+    network, windows = Network.of(run.model, run.variables), run.config.data
 
     def predict(windows: Array) -> Prediction:
         return network.apply(network.variables, windows.astype(jnp.float32))
 
-    return windows.rate, predict, filtering.filter_setup(windows, used.config.filter)
+    return windows.rate, predict, filtering.filter_setup(windows, run.config.filter)
 
 
-def _cache_entry(walk: Sequence, run: Run) -> Path:
-    """The file that keeps the smoothed poses of a walk: of its samples and waypoints, the run's
-    weights and settings, and the sources that make poses of them."""
-    digest = hashlib.sha256(repr(sorted(configuration.flat(run.config).items())).encode())
+def _digest_of_run(run: Run) -> str:
+    """Of its settings, but for its folders, and its weights."""
+    nowhere: dict[str, Any] = {"workdir": None, "data_root": None, "init_from": None}
+    settings = configuration.flat(dataclasses.replace(run.config, **nowhere))
+    return _digest(sorted(settings.items()), run.variables)
+
+
+def _cache_entry(walk: Sequence, by: PosesBy) -> Path:
+    """The file that keeps the smoothed poses of a walk: of the walk, the run, and the sources that
+    make poses of them."""
     arrays = [walk.time, walk.gyro, walk.accel, walk.imu_valid, walk.waypoints]
-    for leaf in jax.tree.leaves((run.variables, arrays)):
-        digest.update(np.ascontiguousarray(leaf).tobytes())
+    name = _digest([walk.name, sorted(walk.attributes.items()), by.digest], arrays)
     package = Path(__file__).parents[1]
     rooms = [path for room in ("filtering", "models") for path in (package / room).rglob("*.py")]
-    sources = sorted([*package.glob("*.py"), *rooms, Path(__file__)])
-    return cache_entry(digest.hexdigest(), sources)
+    return cache_entry(name, sorted([*package.glob("*.py"), *rooms, Path(__file__)]))
+
+
+def _digest(values: list[Any], arrays: Any) -> str:
+    digest = hashlib.sha256(repr(values).encode())
+    for leaf in jax.tree.leaves(arrays):
+        digest.update(f"{leaf.dtype}{leaf.shape}".encode())
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()

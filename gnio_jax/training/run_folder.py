@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fcntl
 import hashlib
 import json
@@ -28,7 +27,7 @@ from gnio_jax.files import write_text
 from gnio_jax.training.recordings import Recordings
 from gnio_jax.training.task import Row
 
-MAY_CHANGE = ("workdir", "data_root", "init_from")
+MAY_CHANGE = ("workdir", "data_root", "init_from", "data.poses_by")
 """Settings that a resumed run may change: where things lie, not what is computed."""
 
 # Made when the module is imported, so type checkers do not know them.
@@ -138,7 +137,7 @@ def compare_processes(config: TrainConfig, recordings: Recordings, variables: An
         leaves = [np.atleast_1d(leaf) for leaf in jax.tree.leaves(parallel.on_host(tree))]
         return [(leaf.shape, leaf[:: len(leaf) // 999 + 1].tobytes()) for leaf in leaves]
 
-    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in MAY_CHANGE}
+    settings = {k: v for k, v in configuration.flat(config).items() if k not in MAY_CHANGE}
     for what, value, remedy in (
         ("settings", settings, "start all with the same options, also --config"),
         (

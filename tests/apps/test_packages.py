@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 import shutil
 import struct
 import zipfile
@@ -161,6 +162,23 @@ def test_a_changed_byte(package, name):
     content[at] ^= 1
     (package / name).write_bytes(content)
     refused(package, f"'{name}'", "SHA-256")
+
+
+def test_the_error_of_each_way_of_carrying_is_a_mean_of_what_did_not_diverge():
+    known = {"a": (1.0, False), "b": (3.0, False), "c": (1.5, False), "d": (99.0, True)}
+    known["e"] = (math.inf, False)
+    scores = {
+        name: Measures({"ate_2d": error}, {}, diverged) for name, (error, diverged) in known.items()
+    }
+    carried = {"a": "hand", "b": "hand", "c": "pocket", "d": "pocket", "e": "pocket"}
+    found = report.Report(SETTINGS, scores, {}, dict.fromkeys(known, "ann"), {}, {}, carried)
+    assert packages._by_placement(found) == ["pocket 1.5", "hand 2.0"]
+
+
+def test_the_recipe_names_a_package_and_no_folder_of_this_machine(published, monkeypatch):
+    monkeypatch.setenv("GNIO_WEIGHTS", str(published))
+    assert packages._named_run("walk") == "walk"
+    assert packages._named_run("/home/some body/first run") == "'runs/first run'"
 
 
 def test_what_else_is_damaged(package, tmp_path, monkeypatch):

@@ -77,6 +77,7 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     assert own["filter"]["start"]["velocity"] == 0.7
     assert own["recordings"]["synthetic_1_handheld"] == pytest.approx(15.0, abs=0.05)
     assert [one["group"] for one in found["sequences"].values()] == ["person 1", "person 2"]
+    assert [one["placement"] for one in found["sequences"].values()] == ["handheld"] * 2
     assert found["mean"]["ate"] > 0
     assert found["reference_rows"]["perfect_displacements"]["mean"]["ate"] < 0.1
     assert len(np.loadtxt(folder / "trajectories" / "synthetic_1_handheld.txt")) == 150

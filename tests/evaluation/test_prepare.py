@@ -91,13 +91,13 @@ def test_short_sequences_are_left_out_by_name(walks):
 @pytest.mark.parametrize("compensated", ["no", "Android's gyro bias"])
 def test_a_raw_gyro_starts_with_a_wider_bias(walks, swaying, compensated):
     """Not where the phone takes a bias off, nor where a rest has shown it."""
-    attributes = {"imu_compensated": compensated}
+    attributes = {"imu_compensated": compensated, "placement": "unknown"}
     walk = walks[0]._replace(attributes=attributes)
     (recording,) = ready([walk], raw_gyro_bias=0.05)
     own = evaluation.prepare([walk], CONFIG)[0][0].start.std.gyro_bias
     expected = 0.05 if compensated == "no" else own
     assert recording.start.std.gyro_bias == expected and own < 0.01
-    assert recording.start.raw_gyro == (compensated == "no")
+    assert recording.start.raw_gyro == (compensated == "no") and recording.placement == ""
     rest = resting(swaying, BIAS)._replace(attributes=attributes)
     (recording,) = ready([rest], gyro_bias="rest", raw_gyro_bias=0.05)
     assert recording.start.std.gyro_bias == own

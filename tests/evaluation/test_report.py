@@ -32,6 +32,7 @@ def rows(folder):
 
 def test_what_is_written_is_read_back_whole(tmp_path, estimates, made, with_divergence):
     """Infinite figures too; each sequence has its files."""
+    made = made._replace(placements={"room 1/walk": "in a hand"})
     for place, of, wanted in (
         (tmp_path / "a", *with_divergence),
         (tmp_path / "e", estimates, made),
@@ -39,6 +40,7 @@ def test_what_is_written_is_read_back_whole(tmp_path, estimates, made, with_dive
         found = write(place, wanted, of)
         assert evaluation.load(place) == wanted
     first, _, blind = found["sequences"].values()
+    assert first["placement"] == "in a hand" and "placement" not in blind
     assert first["ate"] == made.scores["room 1/walk"].values["ate"]
     assert first["reasons"] == {} and first["infinite"] == [] and first["diverged"] is False
     assert first["accepted"] == pytest.approx(90, abs=0.5) and first["nis"] == 1.0

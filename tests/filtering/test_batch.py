@@ -29,6 +29,16 @@ def test_same_as_one_after_the_other_with_its_derivative(x):
     np.testing.assert_allclose(of_each, 0.25 * np.array(x), rtol=1e-14)
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_on_one_device_also_of_what_is_no_array(monkeypatch, count):
+    device = jax.devices()[0]
+    monkeypatch.setattr(jax, "devices", lambda *_: [device])
+    x = jnp.arange(1.0, 1.0 + count)
+    found = filtering.over_sequences(lambda w, x: {"x": w * x, "w": 1.0}, shared=1)(2.0, x)
+    np.testing.assert_array_equal(found["x"], 2.0 * np.asarray(x))
+    np.testing.assert_array_equal(found["w"], np.ones(count))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "flags, devices",

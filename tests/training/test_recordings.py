@@ -1,94 +1,218 @@
 """Walks with waypoints as training reads them: smoothed poses by an earlier run, from the cache."""
 
 import dataclasses
+import shutil
+from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 
 from gnio_jax import data, filtering
 from gnio_jax.config import DataConfig
 from gnio_jax.data import loading
 from gnio_jax.errors import InputError
-from gnio_jax.reporting import Lines
-from gnio_jax.training import recordings
+from gnio_jax.models import Network
+from gnio_jax.reporting import Lines, Silence
+from gnio_jax.training import loop, recordings
 from gnio_jax.training.checkpoint import load_run
+from gnio_jax.training.window_task import WindowTask
 from gnio_jax.types import Waypoints
 from tests.support import tiny_run
 from tests.support.filter_settings import changed
 from tests.support.surveyor import survey
 
+SETTINGS = changed(noise={"measurement_scale": 0.5, "correlation": None})
+WINDOW = np.random.default_rng(0).standard_normal((1, 100, 6))
+
 
 @pytest.fixture
 def earlier(tmp_path, monkeypatch):
-    """A run at 25 Hz whose network makes poses."""
+    """A run at 100 Hz, calibrated, whose network makes poses."""
     monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
-    windows = DataConfig(rate=25.0, stride_seconds=0.2, train_stride_seconds=0.2)
-    return tiny_run.save(tmp_path / "earlier", tiny_run.config(None, "", data=windows))
+    settings = dataclasses.replace(SETTINGS, raw_gyro_bias=0.03)
+    config = tiny_run.config(None, "", data=DataConfig(rate=100.0), filter=settings)
+    return tiny_run.save(tmp_path / "earlier", config)
+
+
+def experiment(run, workdir="", **changes):
+    windows = DataConfig(rate=50.0, poses_by=str(run))
+    return tiny_run.config(None, workdir, data=windows, dataset="synthetic", **changes)
 
 
 def read(monkeypatch, walks, run, workers=1):
-    """Names and recordings at 50 Hz of a split with these walks."""
+    """The recordings at 50 Hz of a split with these walks."""
     monkeypatch.setattr(loading, "read_split", lambda *_: iter(walks))
-    config = tiny_run.config(None, "", data=DataConfig(rate=50.0, poses_by=str(run)))
-    samples = {}
-    found = list(recordings.read_split(config, "synthetic", "train", Lines(), workers, samples))
+    config, samples = experiment(run), {}
+    poses = recordings._poses_by(config, Lines(), load_run)
+    given = config, "synthetic", "train", Lines(), workers, samples, poses
+    found = list(recordings.read_split(*given))
     assert samples == {each.name: len(each.time) for each in found}
     return found
 
 
-def test_smoothed_poses_come_from_the_run_and_then_from_the_cache(earlier, monkeypatch, capsys):
-    """A smoother that is known moves each interpolated position a metre up."""
-    asked = []
+@pytest.fixture
+def smoothed(earlier, monkeypatch):
+    """A smoother that is known: it moves each interpolated position a metre up, and knows nothing
+    of the last three seconds. The walks that it was asked for."""
+    asked, run = [], load_run(earlier)
+    network = Network.of(run.model, run.variables)
+    wanted = filtering.filter_setup(run.config.data, run.config.filter)
 
     def waypoint_poses(walk, predict, setup):
-        asked.append((walk.name, setup.config.dt))
+        asked.append(walk.name)
+        assert jnp.ones(()).dtype == np.float64
+        if len(asked) == 1:
+            expected = network.apply(network.variables, jnp.float32(WINDOW))
+            found = predict(jnp.asarray(WINDOW))
+            np.testing.assert_array_equal(found.displacement, expected.displacement)
+            assert setup == wanted and setup.raw_gyro_bias == 0.03
         if walk.name == "survey 1":
             raise InputError(walk.name, "the filter fails on it")
         poses = data.with_poses(walk)
-        ends = walk.time < walk.time[-1] - 3.0
-        poses = poses._replace(position=poses.position + np.array([0.0, 0.0, 1.0]), valid=ends)
+        poses = poses._replace(
+            position=poses.position + np.array([0.0, 0.0, 1.0]),
+            orientation=np.tile([1.0, 0.0, 0.0, 0.0], (len(walk.time), 1)),
+            velocity=np.zeros((len(walk.time), 3)),
+            valid=walk.time < walk.time[-1] - 3.0,
+        )
         return filtering.WaypointPoses(poses, None, None)
 
     monkeypatch.setattr(filtering, "waypoint_poses", waypoint_poses)
-    first, fails, last = (survey(seed).tapped(np.zeros(9)) for seed in range(3))
-    posed = survey(3).truth
-    found = read(monkeypatch, [first, fails, posed, last], earlier)
+    return asked
+
+
+def tapped(seed):
+    """A walk whose first leg nobody tapped."""
+    walk = survey(seed).tapped(np.zeros(9))
+    assert walk.waypoints is not None
+    return walk._replace(waypoints=Waypoints(*(part[1:] for part in walk.waypoints)))
+
+
+def test_smoothed_poses_come_from_the_run_and_then_from_the_cache(
+    earlier, smoothed, monkeypatch, capsys
+):
+    walks = tapped(0), tapped(1), survey(3).truth, tapped(2)
+    first, _, posed, last = walks
+    with jax.enable_x64(False):
+        found = read(monkeypatch, walks, earlier)
     assert [each.name for each in found] == ["survey 0", "survey 3", "survey 2"]
-    assert asked == [(f"survey {number}", 1 / 25) for number in range(3)]
+    assert smoothed == ["survey 0", "survey 1", "survey 2"]
     told = capsys.readouterr().err
-    assert "warning: survey 1: the filter fails on it" in told
-    assert f"warning: {earlier}: its filter is not calibrated" in told
+    assert "warning: survey 1: the filter fails on it" in told and "not calibrated" not in told
     for walk, poses in zip((first, last), (found[0], found[2]), strict=True):
-        flat = data.with_poses(walk)
-        inside = flat.valid & (walk.time < walk.time[-1] - 3.0)
+        # On the legs of the interpolation, as far as the smoother knows.
+        inside = data.with_poses(walk).valid & (walk.time < walk.time[-1] - 3.0)
         inside = np.interp(poses.time, walk.time, inside) > 0.5
-        assert (poses.valid != inside).mean() < 0.02 and 0 < poses.valid.mean() < 1
+        assert (poses.valid != inside).mean() < 0.02 and 0.1 < poses.valid.mean() < 0.9
         np.testing.assert_allclose(poses.position[poses.valid][:, 2], 1.0)
-        assert np.isnan(poses.position[~poses.valid]).all()
+        for part in (poses.position, poses.orientation, poses.velocity):
+            assert np.isnan(part[~poses.valid]).all() and np.isfinite(part[poses.valid]).all()
+        known = np.interp(poses.time, walk.time, walk.accel[:, 2])
+        np.testing.assert_allclose(poses.accel[5:-5, 2], known[5:-5], atol=0.05)
     np.testing.assert_array_equal(found[1].position, posed.position)
 
-    # Again: nothing is smoothed, and nothing differs. Other waypoints and other weights are new.
-    again = read(monkeypatch, [first, fails, posed, last], earlier)
-    assert len(asked) == 3
+    again = read(monkeypatch, walks, earlier)
+    assert len(smoothed) == 3
     assert "warning: survey 1: the filter fails on it" in capsys.readouterr().err
     for one, other in zip(found, again, strict=True):
         np.testing.assert_array_equal(one.position, other.position)
         np.testing.assert_array_equal(one.valid, other.valid)
-    moved = Waypoints(first.waypoints.time, first.waypoints.position + 1.0)
-    read(monkeypatch, [first._replace(waypoints=moved)], earlier)
-    assert len(asked) == 4
-    config = dataclasses.replace(
-        load_run(earlier).config, filter=changed(noise={"measurement_scale": 1.0})
+
+
+def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypatch):
+    sources = []
+    monkeypatch.setattr(
+        recordings, "cache_entry", lambda name, files: sources.append(files) or Path(name)
     )
-    other = tiny_run.save(earlier.with_name("other"), config, size=0.3)
-    capsys.readouterr()
-    read(monkeypatch, [first], other)
-    assert len(asked) == 5 and "is not calibrated" not in capsys.readouterr().err
+    walk, run = tapped(0), load_run(earlier)
+    digest = recordings._digest_of_run(run)
+    by = recordings.PosesBy(str(earlier), load_run, digest)
+    assert walk.waypoints is not None
+    time, place = walk.waypoints
+    others = [
+        walk._replace(name="other"),
+        walk._replace(attributes=walk.attributes | {"imu_compensated": "no"}),
+        walk._replace(gyro=walk.gyro + 1e-9),
+        walk._replace(accel=walk.accel + 1e-9),
+        walk._replace(imu_valid=np.arange(len(walk.time)) > 5),
+        walk._replace(waypoints=Waypoints(time, place + 1e-9)),
+    ]
+    entries = {recordings._cache_entry(each, by) for each in [walk, *others]}
+    entries.add(recordings._cache_entry(walk, by._replace(digest="other")))
+    assert len(entries) == len(others) + 2
+    names = {"/".join(path.parts[-2:]) for path in sources[0]}
+    assert {"filtering/waypoints.py", "models/gnio.py", "gnio_jax/geometry.py"} <= names
+
+    settings = dataclasses.replace(run.config.filter, raw_gyro_bias=0.04)
+    other = run._replace(config=dataclasses.replace(run.config, filter=settings))
+    changed_weights = jax.tree.map(lambda leaf: leaf + 1e-6, run.variables)
+    moved = run._replace(config=dataclasses.replace(run.config, workdir="elsewhere"))
+    assert recordings._digest_of_run(moved) == digest
+    for each in (other, run._replace(variables=changed_weights)):
+        assert recordings._digest_of_run(each) != digest
 
 
-def test_a_run_that_is_not_there_is_told_before_anything_is_read(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="gone: holds no run"):
-        read(monkeypatch, iter([]), tmp_path / "gone")
+def test_a_run_that_changes_at_its_place_makes_its_own_poses(earlier, smoothed, monkeypatch):
+    config = load_run(earlier).config
+    read(monkeypatch, [tapped(0)], earlier)
+    old = recordings.PosesBy(str(earlier), load_run, recordings._digest_of_run(load_run(earlier)))
+    tiny_run.save(earlier, dataclasses.replace(config, filter=changed(SETTINGS)), size=0.3)
+    read(monkeypatch, [tapped(0)], earlier)
+    assert smoothed == ["survey 0"] * 2
+    recordings._labeller.cache_clear()
+    with pytest.raises(InputError, match="has changed while it made poses"):
+        recordings.smoothed_poses(tapped(0), old)
+
+
+def unread():
+    pytest.fail("was read")
+    yield
+
+
+@pytest.mark.parametrize(
+    ("config", "problem"),
+    [
+        (None, "gone: holds no run"),
+        (DataConfig(rate=25.0, stride_seconds=0.2, train_stride_seconds=0.2), "slower than data"),
+    ],
+)
+def test_a_run_that_cannot_make_poses_is_told_before_anything_is_read(
+    tmp_path, monkeypatch, config, problem
+):
+    if config is not None:
+        tiny_run.save(tmp_path / "gone", tiny_run.config(None, "", data=config))
+    with pytest.raises(InputError, match=problem):
+        read(monkeypatch, unread(), tmp_path / "gone")
+
+
+def test_a_run_that_is_not_calibrated_is_warned_of(tmp_path, capsys):
+    run = tiny_run.save(tmp_path / "plain", tiny_run.config(None, "", data=DataConfig(rate=50.0)))
+    assert recordings._poses_by(experiment(run), Lines(), load_run) is not None
+    assert f"warning: {run}: its filter is not calibrated" in capsys.readouterr().err
+
+
+def test_a_resumed_run_takes_the_same_poses_from_another_place(
+    earlier, smoothed, monkeypatch, tmp_path
+):
+    """And refuses those of another network. What is compiled does not depend on the place."""
+    seeds = {"train": 0, "val": 2}
+    monkeypatch.setattr(
+        loading, "read_split", lambda _, __, split, *___: iter([tapped(seeds[split])])
+    )
+    config = experiment(earlier, tmp_path / "run", epochs=1)
+    assert recordings.set_up(WindowTask, config, Silence())[0].config.data.poses_by is None
+    loop.train(config)
+    kept = yaml.safe_load((tmp_path / "run" / "splits.yaml").read_text())
+    assert kept["data.poses_by"] == [recordings._digest_of_run(load_run(earlier))]
+    moved = shutil.copytree(earlier, tmp_path / "moved")
+    loop.train(experiment(moved, tmp_path / "run", epochs=1), resume=True)
+    other = tiny_run.save(tmp_path / "other", load_run(earlier).config, size=0.3)
+    with pytest.raises(InputError, match=r"begun with other recordings in split .data\.poses_by."):
+        loop.train(experiment(other, tmp_path / "run", epochs=1), resume=True)
+    assert len(smoothed) == 4
 
 
 @pytest.mark.slow

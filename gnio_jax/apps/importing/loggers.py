@@ -355,7 +355,8 @@ def _recording(
     of_accel = " + ".join(part.file.name for part in parts) + (f" in {unit}" if unit else "")
     note = f"{path.name}: {app}; time in {clock}, {gyro.file.name} in {gyro.unit}, {of_accel}"
     known = Units(clock, gyro.unit, unit, sign)
-    return Recording(path, gyro.sensor("gyro"), accel, known, notes=(note,))
+    raw = gyro.file.place.stem == "GyroscopeUncalibrated"
+    return Recording(path, gyro.sensor("gyro"), accel, known, notes=(note,), raw_gyro=raw)
 
 
 def _only(kind: str, kinds: dict[str, list[_Set]], path: Path) -> list[_Set]:

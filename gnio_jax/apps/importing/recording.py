@@ -87,6 +87,8 @@ class Recording(NamedTuple):
     track: Track | None = None
     notes: tuple[str, ...] = ()
     """What was recognised, chosen or left out, one sentence each."""
+    raw_gyro: bool = False
+    """Whether it is known that the phone takes no bias off the gyro."""
 
 
 class Imported(NamedTuple):
@@ -199,7 +201,8 @@ def as_sequence(source: Recording, stated: Units, rate: float | None, name: str)
         str(source.path),
         Samples(gyro.time, rates, str(source.gyro.file)),
         Samples(accel.time, forces, str(source.accel.file)),
-        {"dataset": "csv", "group": name, "truth": "none"},
+        {"dataset": "csv", "group": name, "truth": "none"}
+        | ({"imu_compensated": "no"} if source.raw_gyro else {}),
         float(gyro.start),
     )
     sequence = None

@@ -68,6 +68,20 @@ def test_sensor_logger(tmp_path, platform, standardised, dropped, words):
     assert sequence.attributes["start_time"] - EPOCH * 1e-9 == pytest.approx(0.01, abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["Gyroscope.csv", "GyroscopeUncalibrated.csv"])
+def test_a_gyro_whose_bias_is_its_own_says_so(tmp_path, name):
+    """Where there are both, the other one is taken."""
+    members = sensor_logger()
+    members["GyroscopeUncalibrated.csv"] = members["Gyroscope.csv"]
+    if name != "Gyroscope.csv":
+        del members["Gyroscope.csv"]
+    sequence, notes = import_recording(zipped(tmp_path / "walk.zip", members))
+    compare(sequence)
+    assert name in " ".join(notes)
+    raw = name == "GyroscopeUncalibrated.csv"
+    assert sequence.attributes.get("imu_compensated") == ("no" if raw else None)
+
+
 def test_a_folder_reads_as_its_zip(tmp_path):
     members = sensor_logger("ios")
     packed, _ = import_recording(zipped(tmp_path / "walk.zip", members))
