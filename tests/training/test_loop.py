@@ -18,7 +18,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
 from gnio_jax.training import checkpoint, loop, optimizer, run_folder, task, window_task
 from gnio_jax.training.losses import Losses
-from gnio_jax.training.task import Recordings
+from gnio_jax.training.recordings import Recordings
 from gnio_jax.training.window_task import WindowTask
 from tests.support.drawn_state import fresh_state
 from tests.support.tiny_network import Tiny

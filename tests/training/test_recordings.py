@@ -16,7 +16,7 @@ from gnio_jax.data import loading
 from gnio_jax.errors import InputError
 from gnio_jax.models import Network
 from gnio_jax.reporting import Lines, Silence
-from gnio_jax.training import loop, recordings
+from gnio_jax.training import recordings, run_folder
 from gnio_jax.training.checkpoint import load_run
 from gnio_jax.training.window_task import WindowTask
 from gnio_jax.types import Waypoints
@@ -202,16 +202,20 @@ def test_a_resumed_run_takes_the_same_poses_from_another_place(
     monkeypatch.setattr(
         loading, "read_split", lambda _, __, split, *___: iter([tapped(seeds[split])])
     )
-    config = experiment(earlier, tmp_path / "run", epochs=1)
-    assert recordings.set_up(WindowTask, config, Silence())[0].config.data.poses_by is None
-    loop.train(config)
-    kept = yaml.safe_load((tmp_path / "run" / "splits.yaml").read_text())
+
+    def opened(run, resume=True):
+        config = experiment(run, tmp_path / "run")
+        task, found = recordings.set_up(WindowTask, config, Silence())
+        assert task.config.data.poses_by is None
+        with run_folder.opened(config, found, {}, resume):
+            return yaml.safe_load((tmp_path / "run" / "splits.yaml").read_text())
+
+    kept = opened(earlier, resume=False)
     assert kept["data.poses_by"] == [recordings._digest_of_run(load_run(earlier))]
-    moved = shutil.copytree(earlier, tmp_path / "moved")
-    loop.train(experiment(moved, tmp_path / "run", epochs=1), resume=True)
+    assert opened(shutil.copytree(earlier, tmp_path / "moved")) == kept
     other = tiny_run.save(tmp_path / "other", load_run(earlier).config, size=0.3)
-    with pytest.raises(InputError, match=r"begun with other recordings in split .data\.poses_by."):
-        loop.train(experiment(other, tmp_path / "run", epochs=1), resume=True)
+    with pytest.raises(InputError, match=r"begun with other recordings in split 'data\.poses_by'"):
+        opened(other)
     assert len(smoothed) == 4
 
 
