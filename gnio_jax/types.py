@@ -67,6 +67,14 @@ class Sequence(NamedTuple):
     """The origin: dataset, session, group, subject, device, placement, truth, licence, ...
     (str, float or bool)."""
 
+    def known_where(self, valid: Bool[np.ndarray, "n"]) -> Sequence:
+        """The sequence with its reference where `valid` says so, and none elsewhere."""
+        poses = (self.orientation, self.position, self.velocity)
+        orientation, position, velocity = (np.where(valid[:, None], x, np.nan) for x in poses)
+        return self._replace(
+            orientation=orientation, position=position, velocity=velocity, valid=valid
+        )
+
 
 class Windows(NamedTuple):
     """A batch of training windows in the gravity-aligned frame whose first sample has zero yaw."""

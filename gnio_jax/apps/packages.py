@@ -320,9 +320,6 @@ def publish(workdir: Path, out: Path, said: Description, which: Which = "best") 
     run = checkpoint.load_run(workdir, which)
     figures, made_by = _figures(workdir), f"gnio-jax {version('gnio-jax')}"
     content = to_bytes(run.variables)
-    windows = dataclasses.replace(run.config.data, poses_by=None)
-    folders: dict[str, Any] = {"workdir": None, "data_root": None, "init_from": None}
-    own = dataclasses.replace(run.config, data=windows, **folders)
     about = About(
         said.name,
         run.config.model.name,
@@ -333,7 +330,7 @@ def publish(workdir: Path, out: Path, said: Description, which: Which = "best") 
         _measured(figures, run.config.datasets),
         made_by,
         _card(said, run, made_by, figures, workdir).split("\n"),
-        configuration.plain(own),
+        configuration.plain(configuration.without_places(run.config)),
         fingerprint(content),
     )
     manifest = {"format": FORMAT, "version": VERSION, **about._asdict()}

@@ -200,7 +200,7 @@ def summarise(
         from_start=float(np.linalg.norm(position[-1] - position[0])),
         expected_error=error,
         rest=_share_at_rest(ready, ekf),
-        running=_share_running(ready),
+        running=_share_running(ready, ekf),
         climb=float(np.ptp(found.trajectory.position[: last + 1, 2])),
         accepted=float(used.mean()) if len(used) else None,
         errors={},
@@ -269,9 +269,9 @@ def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
     return float(quiet.reshape(-1, ekf.config.samples_per_clone).all(axis=1).mean())
 
 
-def _share_running(ready: Recording) -> float:
+def _share_running(ready: Recording, ekf: FilterSetup) -> float:
     """Share of the seconds in which the IMU is shaken as in a run; of what was measured."""
-    second = round(len(ready.accel) / (ready.time[-1] - ready.time[0]))
+    second = round(1.0 / ekf.config.dt)
     off = np.linalg.norm(ready.accel, axis=1) - GRAVITY
     off = off if ready.imu_valid is None else off[ready.imu_valid]
     seconds = off[: len(off) // second * second].reshape(-1, second)

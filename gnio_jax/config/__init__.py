@@ -21,6 +21,7 @@ from gnio_jax.config.files import (
     validate,
     value_from_words,
     with_seeds,
+    without_places,
 )
 from gnio_jax.config.requests import (
     CalibrateConfig,
@@ -77,4 +78,5 @@ __all__ = [
     "validate",
     "value_from_words",
     "with_seeds",
+    "without_places",
 ]

@@ -94,6 +94,14 @@ def with_seeds(config: TrainConfig, seeds: Sequence[int]) -> list[TrainConfig]:
     return [dataclasses.replace(config, seed=seed, workdir=f"{folder}_s{seed}") for seed in seeds]
 
 
+def without_places(config: TrainConfig) -> TrainConfig:
+    """The experiment but for where its folders and the runs that it begins with lie: a run that is
+    resumed may have other ones, and a package has none."""
+    windows = dataclasses.replace(config.data, poses_by=None)
+    nowhere: dict[str, Any] = {"workdir": None, "data_root": None, "init_from": None}
+    return dataclasses.replace(config, data=windows, **nowhere)
+
+
 def newest_run(folder: str | Path = "runs") -> Path:
     """The run below `folder` that was trained last; calibrated copies of a run do not count. Raises
     `InputError` when there is none."""

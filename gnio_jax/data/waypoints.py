@@ -106,16 +106,13 @@ def with_poses(sequence: Sequence) -> Sequence:
         raise Refusal(sequence.name, f"no {SHORTEST_SECONDS:g} s of it lie on a leg")
     course = PchipInterpolator(waypoints.time, waypoints.position, extrapolate=True)
     place, velocity = (np.pad(course(time, order), ((0, 0), (0, 1))) for order in (0, 1))
-    known = valid[:, None]
-    orientation = quaternions(about_z(np.full(len(time), legs.yaw)) * level)
     return sequence._replace(
-        orientation=np.where(known, orientation, np.nan),
-        position=np.where(known, place, np.nan),
-        velocity=np.where(known, velocity, np.nan),
-        valid=valid,
+        orientation=quaternions(about_z(np.full(len(time), legs.yaw)) * level),
+        position=place,
+        velocity=velocity,
         waypoints=None,
         attributes=sequence.attributes | {"yaw_residual_degrees": legs.residual},
-    )
+    ).known_where(valid)
 
 
 def levelled(

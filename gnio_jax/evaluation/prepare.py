@@ -146,11 +146,12 @@ def prepare(
         trusted, mask = whole.valid[:, None], whole.imu_valid
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
+        placement = str(sequence.attributes.get("placement", "unknown"))
         recordings.append(
             Recording(
                 name=sequence.name,
                 group=str(data.group(sequence)),
-                placement=_placement(sequence),
+                placement="" if placement == "unknown" else placement,
                 time=whole.time[ends],
                 gyro=whole.gyro[:-1],
                 accel=whole.accel[:-1],
@@ -169,11 +170,6 @@ def prepare(
             )
         )
     return recordings, left_out
-
-
-def _placement(sequence: Sequence) -> str:
-    found = str(sequence.attributes.get("placement", ""))
-    return "" if found == "unknown" else found
 
 
 def measured_rows(sequence: Sequence) -> Int[np.ndarray, "m"]:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gnio_jax import config as configuration
@@ -30,7 +29,7 @@ from gnio_jax.models import Network
 from gnio_jax.reporting import Reporter
 from gnio_jax.training.checkpoint import Run, load_run
 from gnio_jax.training.task import Task, visits
-from gnio_jax.types import Array, Prediction, Sequence
+from gnio_jax.types import Sequence
 
 Load = Callable[[str], Run]
 """Reads the run, or the package of weights, of this name; a function of a module, since other
@@ -112,9 +111,7 @@ def set_up(
         problem = f"is {size}, but there are only {epoch} {task.unit}"
         raise InputError("optim.batch_size", problem, "lower it")
     recordings = Recordings(parallel.everywhere(task.joined(sources)), held_out, splits)
-    of_data = dataclasses.replace(config.data, poses_by=None)
-    nowhere: dict[str, Any] = {"workdir": None, "data_root": None, "init_from": None}
-    anywhere = dataclasses.replace(config, data=of_data, seed=0, **nowhere)
+    anywhere = dataclasses.replace(configuration.without_places(config), seed=0)
     return task(model, anywhere, epoch // size, parts), recordings
 
 
@@ -216,18 +213,7 @@ def smoothed_poses(walk: Sequence, by: PosesBy) -> Reading:
             poses = filtering.waypoint_poses(resampled, predict, setup).sequence
         except InputError as error:
             return Reading([], refusals=(str(error),))
-    valid = legs.valid & poses.valid
-    known = valid[:, None]
-    return Reading(
-        [
-            poses._replace(
-                valid=valid,
-                orientation=np.where(known, poses.orientation, np.nan),
-                position=np.where(known, poses.position, np.nan),
-                velocity=np.where(known, poses.velocity, np.nan),
-            )
-        ]
-    )
+    return Reading([poses.known_where(legs.valid & poses.valid)])
 
 
 @functools.cache
@@ -238,17 +224,13 @@ def _labeller(by: PosesBy) -> tuple[float, Predict, filtering.FilterSetup]:
     if _digest_of_run(run) != by.digest:
         raise InputError(by.run, "has changed while it made poses", "begin the training anew")
     network, windows = Network.of(run.model, run.variables), run.config.data
-
-    def predict(windows: Array) -> Prediction:
-        return network.apply(network.variables, windows.astype(jnp.float32))
-
+    predict = functools.partial(network.apply, network.variables)
     return windows.rate, predict, filtering.filter_setup(windows, run.config.filter)
 
 
 def _digest_of_run(run: Run) -> str:
-    """Of its settings, but for its folders, and its weights."""
-    nowhere: dict[str, Any] = {"workdir": None, "data_root": None, "init_from": None}
-    settings = configuration.flat(dataclasses.replace(run.config, **nowhere))
+    """Of its settings, wherever it lies, and its weights."""
+    settings = configuration.flat(configuration.without_places(run.config))
     return _digest(sorted(settings.items()), run.variables)
 
 
@@ -257,9 +239,15 @@ def _cache_entry(walk: Sequence, by: PosesBy) -> Path:
     make poses of them."""
     arrays = [walk.time, walk.gyro, walk.accel, walk.imu_valid, walk.waypoints]
     name = _digest([walk.name, sorted(walk.attributes.items()), by.digest], arrays)
+    return cache_entry(name, _sources())
+
+
+@functools.cache
+def _sources() -> list[Path]:
+    """The files that decide what poses a walk gets, beside those of `data`."""
     package = Path(__file__).parents[1]
     rooms = [path for room in ("filtering", "models") for path in (package / room).rglob("*.py")]
-    return cache_entry(name, sorted([*package.glob("*.py"), *rooms, Path(__file__)]))
+    return sorted([*package.glob("*.py"), *rooms, Path(__file__)])
 
 
 def _digest(values: list[Any], arrays: Any) -> str:

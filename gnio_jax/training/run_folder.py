@@ -27,9 +27,6 @@ from gnio_jax.files import write_text
 from gnio_jax.training.recordings import Recordings
 from gnio_jax.training.task import Row
 
-MAY_CHANGE = ("workdir", "data_root", "init_from", "data.poses_by")
-"""Settings that a resumed run may change: where things lie, not what is computed."""
-
 # Made when the module is imported, so type checkers do not know them.
 _Event, _SessionLog = (getattr(event_pb2, name) for name in ("Event", "SessionLog"))
 
@@ -58,9 +55,10 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     if not kept.exists():
         problem = "holds no run to resume (config.yaml is missing)"
         raise InputError(workdir, problem, "start it without --resume")
-    ours, theirs = (configuration.flat(each) for each in (config, configuration.load(kept)))
+    both = map(configuration.without_places, (config, configuration.load(kept)))
+    ours, theirs = map(configuration.flat, both)
     for name in ours | theirs:
-        if name not in MAY_CHANGE and ours.get(name) != theirs.get(name):
+        if ours.get(name) != theirs.get(name):
             problem = f"'{name}' was {theirs.get(name)} and is now {ours.get(name)}"
             raise InputError(kept, problem, "resume with the same settings")
     return workdir
@@ -137,7 +135,7 @@ def compare_processes(config: TrainConfig, recordings: Recordings, variables: An
         leaves = [np.atleast_1d(leaf) for leaf in jax.tree.leaves(parallel.on_host(tree))]
         return [(leaf.shape, leaf[:: len(leaf) // 999 + 1].tobytes()) for leaf in leaves]
 
-    settings = {k: v for k, v in configuration.flat(config).items() if k not in MAY_CHANGE}
+    settings = configuration.flat(configuration.without_places(config))
     for what, value, remedy in (
         ("settings", settings, "start all with the same options, also --config"),
         (

@@ -38,7 +38,7 @@ def earlier(tmp_path, monkeypatch):
 
 
 def experiment(run, workdir="", **changes):
-    windows = DataConfig(rate=50.0, poses_by=str(run))
+    windows = DataConfig(rate=50.0, poses_by=run and str(run))
     return tiny_run.config(None, workdir, data=windows, dataset="synthetic", **changes)
 
 
@@ -66,7 +66,7 @@ def smoothed(earlier, monkeypatch):
         assert jnp.ones(()).dtype == np.float64
         if len(asked) == 1:
             expected = network.apply(network.variables, jnp.float32(WINDOW))
-            found = predict(jnp.asarray(WINDOW))
+            found = predict(jnp.float32(WINDOW))
             np.testing.assert_array_equal(found.displacement, expected.displacement)
             assert setup == wanted and setup.raw_gyro_bias == 0.03
         if walk.name == "survey 1":
