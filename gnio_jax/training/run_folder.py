@@ -110,8 +110,9 @@ def _refuse_other_recordings(path: Path, splits: dict[str, list[str]]) -> None:
         problem = f"cannot be read ({' '.join(str(error).split())})"
         remedy = "remove it, and it is written again from the recordings"
         raise InputError(path, problem, remedy) from None
-    for split, names in splits.items():
-        theirs = before.get(split) if isinstance(before, dict) else None
+    before = before if isinstance(before, dict) else {}
+    for split in splits | before:
+        names, theirs = splits.get(split, []), before.get(split)
         if names != theirs:
             changed = sorted(set(names) ^ set(theirs if isinstance(theirs, list) else []))
             what = f", e.g. {changed[0]}" if changed else ", their order does"

@@ -217,6 +217,8 @@ def test_a_resumed_run_takes_the_same_poses_from_another_place(
     with pytest.raises(InputError, match=r"begun with other recordings in split 'data\.poses_by'"):
         opened(other)
     assert len(smoothed) == 4
+    with pytest.raises(InputError, match=r"begun with other recordings in split 'data\.poses_by'"):
+        opened(None)
 
 
 @pytest.mark.slow
