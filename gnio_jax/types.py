@@ -101,8 +101,8 @@ class Prediction(NamedTuple):
 
     def covariance(self, least: float, dtype: Any) -> Float[jax.Array, "*b 3 3"]:
         """Covariance of `displacement`, m²: diag(exp 2u), u raised to `least`."""
-        log_std = jnp.maximum(self.log_std.astype(dtype), least)
-        return jnp.exp(2 * log_std)[..., None] * np.eye(3, dtype=dtype)
+        variance = jnp.exp(2 * jnp.maximum(jnp.asarray(self.log_std, dtype), least))
+        return jnp.vectorize(jnp.diag, signature="(d)->(d,d)")(variance)
 
     def normalised(
         self, error: Float[jax.Array, "*b d"], least: float | None

@@ -271,13 +271,13 @@ def _repeated(
         std = std._replace(gyro_bias=own)
     state = initial_state(config, *walk.start[:4], std=std)
     assert walk.given is not None
-    covariance = jax.vmap(jnp.diag)(walk.given.std**2)
+    value, covariance, _ = walk.given
     fixed = config, settings.noise, walk.imu_valid, config.displacement_frame
 
     def run(state: FilterState, displacement: Array) -> FilterHistory:
         return run_filter(state, walk.gyro, walk.accel, displacement, covariance, *fixed)[1]
 
-    return run, state, jnp.asarray(walk.given.value)
+    return run, state, jnp.asarray(value)
 
 
 def _prior(free: Float[Array, "u"], start: Float[Array, "u"]) -> Float[Array, ""]:

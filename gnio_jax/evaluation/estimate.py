@@ -185,14 +185,15 @@ def filter_inputs(
     config: FilterConfig,
 ) -> Inputs:
     """The recordings side by side, filled up to so many strides with what changes nothing before
-    it. Rows of `given` without a displacement get a standard deviation of 1 m, which has a
-    derivative and no effect."""
+    it. Rows of `given` without a displacement get a covariance of 1 m², which has a derivative and
+    no effect."""
     samples, stacked = strides * config.samples_per_clone, None
     if given is not None:
         rows = []
         for each in given:
-            std = filled_up(np.nan_to_num(each.std, nan=1.0), strides)
-            rows.append(Displacements(filled_up(each.value, strides, np.nan), std))
+            known = np.isfinite(each.covariance).all((1, 2), keepdims=True)
+            covariance = filled_up(np.where(known, each.covariance, np.eye(3)), strides)
+            rows.append(Displacements(filled_up(each.value, strides, np.nan), covariance))
         stacked = _stacked(rows)
     return Inputs(
         _stacked([each.start for each in recordings]),
@@ -220,7 +221,7 @@ def _run(
         state = initial_state(config, *own.start[:4], std=own.start.std)
         if apply is None:
             assert own.given is not None
-            frame, covariance = "given", jax.vmap(jnp.diag)(own.given.std**2)
+            frame, covariance = "given", own.given.covariance
             history = run_filter(state, *signals, own.given.value, covariance, *fixed)[1]
         else:
             frame = config.displacement_frame
@@ -268,7 +269,7 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) 
         recording.reference,
         Displacements(
             _after(np.nan, history.displacement),
-            _after(np.nan, history.measurement_std),
+            _after(np.nan, history.measurement_covariance),
             {name: _after(np.nan, value) for name, value in history.diagnostics.items()},
         ),
         Filtered(

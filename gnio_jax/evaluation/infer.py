@@ -29,20 +29,25 @@ class Displacements(NamedTuple):
 
     value: Float[Array, "k 3"]
     """m, expressed in the yaw frame of the window's start."""
-    std: Float[Array, "k 3"]
-    """m."""
+    covariance: Float[Array, "k 3 3"]
+    """m²."""
     diagnostics: dict[str, Float[Array, "k ..."]] = {}
+
+    @property
+    def std(self) -> Float[np.ndarray, "k 3"]:
+        """Standard deviations, m."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
 
 def given_displacements(recording: Recording, std: float) -> Displacements:
     """The displacements of the reference, with a standard deviation in m."""
     value = _at_window_ends(recording.displacement, recording)
-    return Displacements(value, np.full_like(value, std))
+    return Displacements(value, np.tile(std**2 * np.eye(3), (len(value), 1, 1)))
 
 
 def no_displacements(recording: Recording) -> Displacements:
-    nothing = np.full((recording.strides, 3), np.nan)
-    return Displacements(nothing, nothing)
+    rows = recording.strides
+    return Displacements(np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan))
 
 
 def infer(
@@ -121,10 +126,11 @@ def _of_recording(
         start = window_starts(len(recording.gyro) + 1, windows.seen, windows.stride)
         whole = without_any(~recording.imu_valid, start, windows.seen)
         value = np.where(whole[:, None], value, np.nan)
-    std = np.maximum(np.exp(found.log_std), least_std)
+    with np.errstate(divide="ignore"):
+        least = np.log(least_std)
     return Displacements(
         _at_window_ends(value, recording),
-        _at_window_ends(std, recording),
+        _at_window_ends(np.asarray(found.covariance(least, np.float64)), recording),
         {name: _at_window_ends(each, recording) for name, each in found.diagnostics.items()},
     )
 

@@ -115,9 +115,9 @@ def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
     that it starts as the estimate does."""
     seen = in_one_frame(estimate, alignment)
     rows = len(seen.trajectory.time)
-    none = np.full((rows, 3), np.nan)
-    found = seen.displacements or Displacements(none, none)
-    filtered = seen.filtered or Filtered(np.full((rows, 3, 3), np.nan), none[:, 0], none[:, 0])
+    none, blank = np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan)
+    found = seen.displacements or Displacements(none, blank)
+    filtered = seen.filtered or Filtered(blank, none[:, 0], none[:, 0])
     begin, (stamps, waypoints) = seen.trajectory.time[0], seen.waypoints or NO_WAYPOINTS
     return View(
         seen.name,

@@ -39,9 +39,9 @@ class FilterHistory(NamedTuple):
     """m/s²"""
     displacement: Float[Array, "k 3"]
     """The measurement, m, in the yaw frame of the oldest clone; NaN where none."""
-    measurement_std: Float[Array, "k 3"]
-    """Its standard deviations after scaling by `NoiseModel.measurement_scale` and `std_factor`, m;
-    NaN where none."""
+    measurement_covariance: Float[Array, "k 3 3"]
+    """Its covariance after scaling by `NoiseModel.measurement_scale` and `std_factor`, m²; NaN
+    where none."""
     innovation: Float[Array, "k 3"]
     """Measured − predicted displacement, m; NaN where no measurement."""
     covariance_diagonal: Float[Array, "k 15"]
@@ -76,13 +76,18 @@ class FilterHistory(NamedTuple):
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a
     network."""
 
+    @property
+    def measurement_std(self) -> Float[jax.Array, "k 3"]:
+        """Standard deviations of the measurement after scaling, m; NaN where none."""
+        return jnp.sqrt(jnp.diagonal(self.measurement_covariance, axis1=1, axis2=2))
+
     def given(self, noise: NoiseModel) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
         """Displacements (K, 3), m, and their covariances (K, 3, 3), m², before the scaling of
         `noise`, which must be the run's: with them `run_filter(..., frame="own")` repeats a run of
         `run_odometry` without its network."""
         factor = jnp.stack([jnp.asarray(value) for value in noise.std_factor])
-        variance = self.measurement_std**2 / (noise.measurement_scale * factor**2)[None]
-        return jnp.asarray(self.displacement), jax.vmap(jnp.diag)(variance)
+        scale = noise.measurement_scale * factor[:, None] * factor[None]
+        return jnp.asarray(self.displacement), self.measurement_covariance / scale[None]
 
 
 class StepRecord(NamedTuple):
@@ -110,7 +115,6 @@ def finished_history(
 
     # S is the identity where there is no measurement, so that the logarithm has a derivative there.
     log_likelihood = -0.5 * (update.nis + 3 * math.log(2 * math.pi)) - jnp.log(update.volume)
-    std = jnp.sqrt(jnp.diagonal(records.displacement.covariance, axis1=1, axis2=2))
     diagonal = jnp.diagonal(covariance, axis1=1, axis2=2) if whole else covariance
     at_rest = others[0].accepted if config.zero_velocity_std > 0 else jnp.zeros_like(update.present)
 
@@ -122,7 +126,7 @@ def finished_history(
     return FilterHistory(
         *records.mean,
         displacement=where_present(records.displacement.displacement),
-        measurement_std=where_present(std),
+        measurement_covariance=where_present(records.displacement.covariance),
         innovation=where_present(update.residual),
         covariance_diagonal=diagonal,
         covariance=covariance if whole else None,

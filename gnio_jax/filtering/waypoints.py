@@ -98,7 +98,7 @@ def waypoint_poses(
     first = slice(_first(config))
     level = level_state(config, signals[0][first], signals[1][first], setup.initial_std)
     _, history = _odometry(predict, level, *signals, config, noise, valid)
-    covariance = jax.vmap(jnp.diag)(history.measurement_std**2)  # with the factors of `noise`
+    covariance = history.measurement_covariance  # with the factors of `noise`
     displacement = jnp.where(jnp.arange(padded)[:, None] < count, history.displacement, jnp.nan)
     turn, origin, weight, missed = _aligned(at_taps(history.position), place, after, place_std)
     yaw = np.arctan2(turn[1, 0], turn[0, 0])

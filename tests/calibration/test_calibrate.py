@@ -161,8 +161,12 @@ def estimate(error, std):
     rows = len(error) + 2
     path = Trajectory(np.arange(rows), np.zeros((rows, 3)), np.zeros((rows, 4)))
     before = np.full((2, 3), np.nan)
-    found = (np.concatenate([before, each]) for each in (1.0 + error, std))
-    return Estimate("walk", path, path, Displacements(*found))
+    value, std = (np.concatenate([before, each]) for each in (1.0 + error, std))
+    return Estimate("walk", path, path, Displacements(value, uncorrelated(std)))
+
+
+def uncorrelated(std):
+    return std[..., None] ** 2 * np.eye(3)
 
 
 def test_the_factors_are_those_of_the_errors():
@@ -261,7 +265,9 @@ def walks_and_truth():
     std = filtering.InitialStd(*np.ones((6, WALKS)))  # a fit takes that of the settings
     raw = np.zeros(WALKS, bool)
     start = Start(*runs[:3], np.zeros((WALKS, 3)), std, raw)
-    given = Displacements(runs.displacement, np.full_like(runs.displacement, SIGMA / 3))
+    given = Displacements(
+        runs.displacement, uncorrelated(np.full_like(runs.displacement, SIGMA / 3))
+    )
     return Inputs(start, runs.gyro, runs.accel, None, given), runs.position
 
 
@@ -403,7 +409,8 @@ def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
     after = np.arange(N * STRIDES)[:, None] >= N * known
     nothing = np.arange(STRIDES)[:, None] >= known
     rows = Displacements(
-        np.where(nothing, np.nan, given.given.value), np.where(nothing, 1.0, given.given.std)
+        np.where(nothing, np.nan, given.given.value),
+        np.where(nothing[..., None], np.eye(3), given.given.covariance),
     )
     still, falling = [0.0, 0.0, 9.81], [90.0, 0.0, 9.81]  # to 360 m/s, beyond the filter's bound
     evidences = [
@@ -423,7 +430,7 @@ def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
     alone = given._replace(
         gyro=given.gyro[:, : N * known],
         accel=given.accel[:, : N * known],
-        given=Displacements(given.given.value[:, :known], given.given.std[:, :known]),
+        given=Displacements(given.given.value[:, :known], given.given.covariance[:, :known]),
     )
     free = free_parameters(TRUE, PATHS)
     fixed = {"names": tuple(free), "config": innovation_config(DATA, TRUE)}

@@ -202,6 +202,18 @@ def test_random_walk(fail_scale, correlation, axes, every):
         assert_close(outcome.nis[there], wanted["fix_nis"][there], 0, 1e-6)
 
 
+def test_what_was_measured_can_be_given_again():
+    """With covariances whose axes are correlated."""
+    config = GATED(DT, N, CLONES)
+    noise = noise_of(config)._replace(std_factor=(1.5, 0.5, 2.0))
+    _, history = ours(config, noise)
+    displacement, covariance = WALK[-2:]
+    measured = np.isfinite(history.nis)
+    assert np.abs(covariance[measured][:, 0, 1]).min() > 0 and measured.sum() > INTERVALS / 2
+    for found, wanted in zip(history.given(noise), (displacement, covariance), strict=True):
+        assert_close(found[measured], wanted[measured], 0, 1e-12)
+
+
 def test_without_size_and_without_fixes_nothing_changes():
     """Also where the only fix is refused. The variance of a correlated error is 1 at all times."""
     config, (_, wanted) = GATED(DT, N, CLONES), plain()

@@ -43,13 +43,14 @@ def estimate(name, seed, n=400, truth=True):
     moved = position + np.cumsum(random.normal(0, 0.03, (n, 3)), 0)
     displacement = np.full((n, 3), np.nan)
     displacement[11:] = np.array([1.6, 0, 0]) + random.normal(0, 0.1, (n - 11, 3))
+    covariance = np.tile(0.3**2 * np.eye(3), (n, 1, 1))
     spread = 0.03 * np.sqrt(np.arange(n) + 1)
     accepted = np.where(np.arange(n) < 11, np.nan, (np.arange(n) % 10 > 0).astype(float))
     return Estimate(
         name,
         Trajectory(time, moved, orientation),
         reference,
-        Displacements(displacement, np.full((n, 3), 0.3), {"gate": np.tanh(displacement)}),
+        Displacements(displacement, covariance, {"gate": np.tanh(displacement)}),
         Filtered(
             spread[:, None, None] ** 2 * np.eye(3),
             np.where(np.isnan(accepted), np.nan, 3.0),
