@@ -466,6 +466,8 @@ POSITION_ERRORS = ("ate", "waypoint_rms")
 """One of them is the error of the positions of a sequence."""
 OF_REFERENCE = {"path_length", "legs"}
 """They are finite whatever the estimate is."""
+SAME_TIME = 1e-3
+"""Stamps that differ by no more are of one time, s."""
 SHARES = {"nees_coverage", "nees_coverage_2d", "nis_coverage", "accepted"}
 """Metrics that are small when they are bad: 0 for an estimate that diverged."""
 
@@ -495,8 +497,14 @@ def measure(
     `ate*`, `rte*`, `drift` and `yaw_rmse` see the estimate under `alignment`, which is fitted in
     3-D for the horizontal ones too. NEES is taken with the start aligned, because the filter's
     covariance is relative to its start. An estimate with a row that is not finite has diverged:
-    every metric that a finite one would have is infinite, and the shares are 0.
+    every metric that a finite one would have is infinite, and the shares are 0. Raises `ValueError`
+    for a reference with other stamps.
     """
+    stamps = (estimate.time, reference.time)
+    if waypoints is None and (
+        len(set(map(len, stamps))) > 1 or np.ptp(stamps, 0).max() > SAME_TIME
+    ):
+        raise ValueError("reference: has other stamps than the estimate; interpolate it at those")
     trusted = finite_rows(reference.position)[:, None]
     poses = (np.where(trusted, part, np.nan) for part in reference[1:])
     reference = Trajectory(reference.time, *poses)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from gnio_jax.evaluation.metrics import POSITION_ERRORS, Measures
+from gnio_jax.evaluation.metrics import POSITION_ERRORS, SHARES, Measures
 
 Scores = Mapping[str, Measures]
 """Sequence → its metrics."""
@@ -34,7 +34,7 @@ class Summary(NamedTuple):
     median: float | None
     """Over all sequences and seeds: of an error, infinite where half of them diverged."""
     interval: Interval | None
-    """95 % interval of the mean."""
+    """95 % interval of the mean. That of a share ends at 0 and at 100 %."""
     sequences: int
     """In the mean."""
     groups: int
@@ -95,11 +95,14 @@ def summarise(seeds: Sequence[Scores], metric: str, groups: Mapping[str, Any]) -
     kept = [name for name in found if name not in diverged]
     rows = np.array([found[name] for name in kept]).reshape(len(kept), len(seeds))
     drawn = [groups[name] for name in kept]
+    reach = interval(rows.mean(1), drawn) if kept else None
+    if reach and metric in SHARES:
+        reach = max(reach[0], 0.0), min(reach[1], 100.0)
     return Summary(
         mean=float(rows.mean()) if kept else None,
         seeds=rows.mean(0).tolist() if kept else [],
         median=float(np.median(every)) if found else None,
-        interval=interval(rows.mean(1), drawn) if kept else None,
+        interval=reach,
         sequences=len(kept),
         groups=len({str(group) for group in drawn}),
         diverged=sum(diverged.get(name, 0) for name in found),

@@ -364,3 +364,11 @@ def test_agreement_with_evo(tmp_path):
     other.align(reference)
     aligned = align(estimate, truth, "se3").position
     assert metrics.ate(aligned, truth.position) == rmse(evo.APE(part), other)
+
+
+def test_a_reference_with_other_stamps_is_no_reference():
+    truth = walk()
+    later = truth._replace(time=truth.time + 5.0)
+    for reference in (later, Trajectory(*(part[:-1] for part in truth))):
+        with pytest.raises(ValueError, match="has other stamps than the estimate"):
+            metrics.measure(truth, reference)

@@ -93,7 +93,7 @@ def test_divergence_is_of_the_sequence_and_leaves_every_mean():
     assert {metric: of.diverged for metric, of in found.items()} == lost
     assert found["nees"].interval is None
     reach = 12.7062 * 5  # t of one degree of freedom
-    assert found["accepted"].interval == pytest.approx((75 - reach, 75 + reach), rel=1e-4)
+    assert found["path_length"].interval == pytest.approx((15 - reach, 15 + reach), rel=1e-4)
     assert found["ate"].median == 3.0 and found["nees"].median == np.inf
 
 
@@ -109,6 +109,16 @@ def test_seeds_are_averaged_over_the_sequences_that_all_have():
 
 
 # --- differences
+
+
+def test_the_interval_of_a_share_ends_where_shares_do():
+    def of(shares):
+        scores = {str(i): Measures({"accepted": x}, {}, False) for i, x in enumerate(shares)}
+        return summarise([scores], "accepted", {name: name for name in scores}).interval
+
+    assert of([99.0, 60.0]) == (0.0, 100.0)
+    low, high = of([90.0, 91.0, 92.0, 93.0])
+    assert 85 < low < 91.5 < high < 98
 
 
 def test_a_difference_by_hand():
