@@ -87,7 +87,8 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     out = tmp_path / "calibrated"
     words = ["calibrate", "--workdir", str(run), "--out", str(out), "--average-headings"]
     app.main([*words, "--fit", "measurement", "noise", "window"])
-    told = capsys.readouterr().out
+    told, warned = capsys.readouterr()
+    assert "warning: the fit stopped after 2 steps" in warned
     assert "noise.std_factor" in told and f"gnio evaluate --workdir {out}" in told
     assert splits_read == ["val"]
     before, after = (checkpoint.load_run(folder) for folder in (run, out))
@@ -317,10 +318,12 @@ def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(raw, ex
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told():
+def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told(monkeypatch):
     """Of other walks, with other factors of the axes and another start."""
     given, _ = walks_and_truth()
-    (warning,) = fit(given, TRUE, most_steps=1).warnings
+    monkeypatch.setitem(fitting.PHYSICAL, "noise.measurement_scale", (1e8, 1e9))
+    warning, outside = fit(given, TRUE, most_steps=1).warnings
+    assert outside.startswith("filter.noise.measurement_scale came out as ")
     assert warning.startswith("the fit stopped after 1 steps, ") and "--fit" in warning
     options = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(CalibrateConfig)}
     assert set(re.findall(r"--[a-z-]+", warning)) <= options  # no remedy that there is not

@@ -86,7 +86,7 @@ def test_another_copy_of_the_package_in_the_working_folder_is_told(tmp_path, mon
     (tmp_path / "gnio_jax").mkdir()
     (tmp_path / "gnio_jax" / "__init__.py").write_text("")
     assert capsys.readouterr().err == ""
-    console.warn_of_other_sources()
+    console.run(lambda: None)
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("warning: ") and "pip install -e ." in line
 

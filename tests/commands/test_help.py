@@ -76,6 +76,18 @@ def test_help_of_the_overviews_names_every_command_and_that_of_train_the_configs
     assert "--optim.epochs INT Passes over the training windows. (default: 200)" in text
 
 
+def test_nobody_is_asked_for_too_many_options():
+    """Without the arguments that have no name. All other settings have `--set`."""
+    count = {
+        words: sum(
+            option.name.startswith("--")
+            for option in options.options_of(options.options_type(command))
+        )
+        for words, command in commands()
+    }
+    assert count["train",] <= 60 and sum(count.values()) <= 150
+
+
 def test_bash_completes_commands_and_options(capsys):
     app.main(["--completion"])
     script = capsys.readouterr().out

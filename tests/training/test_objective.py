@@ -110,6 +110,9 @@ def test_velocity_and_covariance_by_hand():
     np.testing.assert_allclose(found_losses(prediction, windows, config).total, expected, rtol=1e-5)
     with pytest.raises(ValueError, match="velocity for every sample"):
         found_losses(prediction._replace(diagnostics={}), windows, config)
+    fewer = prediction._replace(diagnostics=said | {"velocity": said["velocity"][:, :1]})
+    with pytest.raises(AssertionError, match="shape"):
+        found_losses(fewer, windows, config)
 
 
 def ctins(task_log_std, log_std, error=0.1):
@@ -184,12 +187,12 @@ def test_plateau_waits_for_its_epochs_and_starts_counting_anew(monkeypatch):
     monkeypatch.setattr(optimizer, "PLATEAU_FACTOR", 0.5)
     config = OptimConfig(schedule="plateau")
     # a fall by less than a ten-thousandth is none
-    errors = [1.0, 0.9, 0.9, 0.89999, 0.95, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8]
+    errors = [np.nan, 1.0, 0.9, 0.9, 0.89999, 0.95, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8]
     factors, plateau = [], optimizer.Plateau()
     for error in errors:
         plateau = optimizer.watch(plateau, error, config)
         factors.append(plateau.factor)
-    assert factors == [1, 1, 1, 1, 0.5, 0.5, 0.5, 0.5, 0.25, 0.25, 0.25, 0.125]
+    assert factors == [1, 1, 1, 1, 1, 0.5, 0.5, 0.5, 0.5, 0.25, 0.25, 0.25, 0.125]
     assert optimizer.watch(optimizer.Plateau(), 1.0, OptimConfig()) == optimizer.Plateau()
 
 

@@ -267,6 +267,15 @@ def test_a_skipped_step_does_not_shift_the_schedule(training, start):
     assert same(taken[0].variables, taken[1].variables)
 
 
+def test_segments_in_single_precision_are_refused(training, start):
+    training, source = training
+    shapes = jax.eval_shape(training.draw, KEY, source, jnp.zeros(4, jnp.int32))
+    segment, begin = jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes)
+    single = segment._replace(gyro=jnp.asarray(segment.gyro, jnp.float32))
+    with pytest.raises(AssertionError, match="float64"):
+        training.losses(start, (single, begin), jnp.int32(0))
+
+
 def test_training_segments_are_turned_by_any_yaw(training):
     training, source = training
     found = []

@@ -61,6 +61,41 @@ def test_steps_and_validation_are_compiled_once(training):
     assert int(state.step) == 7 and progress.failed_step == 4
 
 
+class Flat(Tiny):
+    """Its displacements have no vertical."""
+
+    output_dim: int = 2
+
+
+def test_the_vertical_counts_only_where_it_is_predicted(training, monkeypatch):
+    """In the steps and in the validation."""
+    training, (source, held_out, _), state = training
+    axes = []
+
+    def losses(prediction, windows, config, stage, count):
+        axes.append(count)
+        return Losses(*jnp.zeros((3, *prediction.displacement.shape[:0])))
+
+    monkeypatch.setattr(window_task, "losses", losses)
+    stage = loss_stage(training.config.loss, 0, 9)
+    with jax.enable_x64(False):
+        for model in (Tiny(), Flat()):
+            other = dataclasses.replace(training, model=model)
+            batch = jax.eval_shape(other.draw, KEY, source, jnp.zeros(4, jnp.int32))
+            jax.eval_shape(other.losses, state.variables, batch, jnp.int32(0))
+            jax.eval_shape(
+                functools.partial(window_task.validate, task=other), state, held_out["tlio"], stage
+            )
+    assert axes == [3, 3, 2, 2]
+
+
+def test_an_order_shorter_than_a_batch_is_refused(training):
+    training, (source, *_), state = training
+    order, numbers = jnp.zeros(15, jnp.int32), (jnp.int32(0), jnp.int32(1), jnp.float32(1))
+    with jax.enable_x64(False), pytest.raises(AssertionError, match="dimension"):
+        jax.eval_shape(lambda: training.take_steps(state, source, order, *numbers, KEY))
+
+
 def test_no_type_of_a_fresh_state_is_weak(recording):
     """Steps give types that are none: the second one would be compiled anew."""
     create = functools.partial(fresh_state, Tiny(), config(recording, ""), 3)
