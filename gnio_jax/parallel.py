@@ -9,6 +9,7 @@ process the functions here return their arguments.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -24,6 +25,7 @@ Tree = TypeVar("Tree")
 
 BATCH = "batch"
 """Name of the mesh's axis along which devices share a batch."""
+HIGHEST_PORT = 65535
 
 
 def initialise(distributed: str | None = None, devices: int | None = None) -> None:
@@ -32,7 +34,8 @@ def initialise(distributed: str | None = None, devices: int | None = None) -> No
     distributed: "HOST:PORT,PROCESSES,ID": where process 0 listens, how many processes there are,
     and the number of this one. Slurm, Open MPI and Kubernetes provide this themselves; without
     either, the process runs alone. devices: as how many devices a CPU appears. Raises `InputError`
-    for a text of another form, for less than one device, and if the processes do not meet.
+    for a text of another form, for less than one device, and where an address cannot be used. Where
+    the others do not come within five minutes, JAX ends the process with a report of its own.
     """
     if devices is not None:
         _check_devices(devices)
@@ -41,7 +44,8 @@ def initialise(distributed: str | None = None, devices: int | None = None) -> No
     if distributed is not None:
         host_port, *numbers = distributed.split(",")
         host, _, port = host_port.rpartition(":")
-        if not (host and len(numbers) == 2 and all(map(str.isdecimal, [port, *numbers]))):
+        whole = all(re.fullmatch("[0-9]{1,5}", each) for each in (port, *numbers))
+        if not (host and len(numbers) == 2 and whole and 0 < int(port) <= HIGHEST_PORT):
             problem = f"must be HOST:PORT,PROCESSES,ID, found '{distributed}'"
             raise InputError("--distributed", problem, "such as 10.0.0.1:4321,2,0")
         given = host_port, int(numbers[0]), int(numbers[1])

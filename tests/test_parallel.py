@@ -313,7 +313,9 @@ def test_processes_with_other_samples_or_weights_are_refused(monkeypatch):
         ("localhost:port,2,0", "must be HOST:PORT,PROCESSES,ID"),
         ("localhost:4321,2,-1", "must be HOST:PORT,PROCESSES,ID"),
         ("localhost:4321,2,2", "gives this process the number 2 of 2; count the processes from 0"),
-        ("localhost:99999,2,0", "the processes did not meet"),
+        ("localhost:99999,2,0", "must be HOST:PORT,PROCESSES,ID"),
+        ("localhost:4321,1234567890123456789012,0", "must be HOST:PORT,PROCESSES,ID"),
+        ("localhost:٤٣٢١,2,0", "must be HOST:PORT,PROCESSES,ID"),
     ],
 )
 def test_a_wrong_text_is_one_line(text, expected):

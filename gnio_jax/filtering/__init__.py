@@ -1,7 +1,7 @@
 """Stochastic-cloning extended Kalman filter: inertial propagation, displacement measurements,
 network in the loop.
 
-Needs only JAX and the geometry: the network is any function from windows to a `Prediction`.
+The network is any function from windows to a `Prediction`.
 """
 
 from gnio_jax.config import ConsideredStd, CorrelatedError, FilterSettings, InitialStd, NoiseModel

@@ -19,6 +19,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import orbax.checkpoint as ocp
+import yaml
 from flax import linen as nn
 
 from gnio_jax import config as configuration
@@ -279,3 +280,31 @@ def _shapes(variables: Any) -> dict[str, list[int]]:
     leaves = jax.tree_util.tree_leaves_with_path(variables)
     names = {path: jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves}
     return {names[path]: list(leaf.shape) for path, leaf in leaves}
+
+
+# The recordings of a run
+# ------------------------------------------------------------------------------------------------
+
+
+def learnt_from(workdir: Path, config: TrainConfig, dataset: str) -> set[str]:
+    """Names of the recordings of a dataset that the network of a run was trained on; none where
+    the folder does not say so."""
+    path = workdir / "splits.yaml"
+    try:
+        splits = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return set()
+    names = recordings_by_name(
+        splits.get(config.data.train_split) if isinstance(splits, dict) else None
+    )
+    if config.datasets == (dataset,):
+        return set(names)
+    own = f"{dataset}/"
+    return {name.removeprefix(own) for name in names if name.startswith(own)}
+
+
+def recordings_by_name(recordings: Any) -> dict[str, int | None]:
+    """Recordings and their lengths in samples; None where names alone are known."""
+    if isinstance(recordings, list):
+        return dict.fromkeys(map(str, recordings))
+    return recordings if isinstance(recordings, dict) else {}

@@ -43,9 +43,10 @@ class Recordings(NamedTuple):
     """Windows or segments of the training split, on the devices."""
     held_out: dict[str, Any]
     """Those of the validation split of each dataset by its name, likewise."""
-    splits: dict[str, list[str]]
-    """Names of the recordings of each split; of several datasets, with theirs before them. Where a
-    run has made poses, its digest stands there too, as `data.poses_by`."""
+    splits: dict[str, dict[str, int] | list[str]]
+    """Names of the recordings of each split, of several datasets with theirs before them, and their
+    lengths in samples. Where a run has made poses, its digest stands there too, as
+    `data.poses_by`."""
 
 
 class PosesBy(NamedTuple):
@@ -82,7 +83,7 @@ def set_up(
     reporter.line(f"reading {', '.join(names)}: {train} and {val}")
     sources, held_out, splits = [], {}, {}
     for split, training in ((train, True), (val, False)):
-        splits[split] = []
+        splits[split] = {}
         for name in names:
             label = f"{name}/" if len(names) > 1 else ""
             samples: dict[str, int] = {}
@@ -92,7 +93,7 @@ def set_up(
                 sources.append(source)
             else:
                 held_out[name] = parallel.everywhere(source)
-            splits[split] += [label + each for each in samples]
+            splits[split] |= {label + each: count for each, count in samples.items()}
             hours = sum(samples.values()) / config.data.rate / 3600
             contents = f"{hours:.2f} h, {task.count(source):,} {task.unit}"
             reporter.line(f"  {label}{split}: {len(samples)} sequences, {contents}")

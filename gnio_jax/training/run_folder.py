@@ -24,6 +24,7 @@ from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
+from gnio_jax.training.checkpoint import recordings_by_name
 from gnio_jax.training.recordings import Recordings
 from gnio_jax.training.task import Row
 
@@ -102,8 +103,9 @@ def opened(
         os.close(folder)
 
 
-def _refuse_other_recordings(path: Path, splits: dict[str, list[str]]) -> None:
-    """Hold-outs are drawn from the recordings that a copy of the data holds: those may differ."""
+def _refuse_other_recordings(path: Path, splits: dict[str, dict[str, int] | list[str]]) -> None:
+    """Hold-outs are drawn from the recordings that a copy of the data holds: those may differ, and
+    so may recordings of one name. An earlier version kept the names alone."""
     try:
         before = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -112,9 +114,13 @@ def _refuse_other_recordings(path: Path, splits: dict[str, list[str]]) -> None:
         raise InputError(path, problem, remedy) from None
     before = before if isinstance(before, dict) else {}
     for split in splits | before:
-        names, theirs = splits.get(split, []), before.get(split)
-        if names != theirs:
-            changed = sorted(set(names) ^ set(theirs if isinstance(theirs, list) else []))
+        own, theirs = (recordings_by_name(each.get(split)) for each in (splits, before))
+        if None in theirs.values():
+            own = dict.fromkeys(own)
+        if list(own.items()) != list(theirs.items()):
+            changed = sorted(
+                name for name in own | theirs if own.get(name, -1) != theirs.get(name, -1)
+            )
             what = f", e.g. {changed[0]}" if changed else ", their order does"
             problem = (
                 f"the run was begun with other recordings in split '{split}' "

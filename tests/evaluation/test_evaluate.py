@@ -88,7 +88,11 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     command("--workdir", workdir, "--estimator", "integrate", "--no-plots")
     rerun = ["--rerun", tmp_path / "w.rrd"] if importlib.util.find_spec("rerun") else []
     imu_only = ("--estimator", "imu_only", "--init", "static", "--no-plots", *rerun)
+    assert "has learnt from" not in "".join(capsys.readouterr())
+    (workdir / "splits.yaml").write_text("train: {synthetic_2_handheld: 1500, other: 1}")
     command("--workdir", workdir, *imu_only)
+    told = "".join(capsys.readouterr())
+    assert "the network has learnt from 1 of 3 recordings, e.g. synthetic_2_handheld" in told
     assert (tmp_path / "w.rrd").exists() == bool(rerun)
     names = {p.name for p in (workdir / "eval").iterdir()}
     others = {"synthetic_test_integrate", "synthetic_test_imu_only_static-init"}

@@ -57,7 +57,10 @@ def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished)
     total = 100 * found[-1]["mse"] + 1e-4 * found[-1]["nll"]
     assert found[-1]["loss"] == pytest.approx(total, rel=1e-5)
     splits = yaml.safe_load((workdir / "splits.yaml").read_text())
-    assert splits == {"train": ["a", "b"], "val": ["c"]}
+    assert {split: list(names) for split, names in splits.items()} == {
+        "train": ["a", "b"],
+        "val": ["c"],
+    }
     assert list((workdir / "tensorboard").glob("events*"))
     best = min(found, key=lambda row: row["val_loss"])
     assert checkpoint.load_run(workdir, "best").step == best["step"]
@@ -143,6 +146,12 @@ def test_a_run_is_not_resumed_with_other_recordings(recording, finished, tmp_pat
         with pytest.raises(InputError, match=problem):
             loop.train(run, resume=True)
     assert (tmp_path / "run" / "splits.yaml").read_bytes() == before
+    (tmp_path / "data" / "train_list.txt").write_text("a\nb\n")
+    longer = yaml.safe_load(before)
+    longer["train"]["b"] += 100
+    (tmp_path / "run" / "splits.yaml").write_text(yaml.safe_dump(longer, sort_keys=False))
+    with pytest.raises(InputError, match=r"split 'train' \(1 differ, e\.g\. b\)"):
+        loop.train(run, resume=True)
     (tmp_path / "run" / "splits.yaml").write_text("{")
     with pytest.raises(InputError, match=r"splits\.yaml: cannot be read"):
         loop.train(run, resume=True)

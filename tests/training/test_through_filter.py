@@ -265,6 +265,15 @@ def test_a_skipped_step_does_not_shift_the_schedule(training, start):
     state = state._replace(step=jnp.int32(1))
     taken = [take(training, each, source, 1)[0] for each in (state, skipped)]
     assert same(taken[0].variables, taken[1].variables)
+    # Adam's first step is as long as the rate, whatever the gradient is.
+    moved = [
+        max(np.abs(x - y).max() for x, y in zip(*map(jax.tree.leaves, pair), strict=True))
+        for pair in (
+            (each.variables["params"], begun(training, start).variables["params"])
+            for each in (taken[0], take(training, begun(training, start), source, 1)[0])
+        )
+    ]
+    assert moved[0] / moved[1] == pytest.approx(rates[1] / rates[0], rel=0.1)
 
 
 def test_segments_in_single_precision_are_refused(training, start):
