@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -50,12 +52,22 @@ def validate(sequence: Sequence, source: object) -> Sequence:
     return sequence._replace(orientation=orientation, device_orientation=device)
 
 
+def from_one(index: int) -> int:
+    """The row that holds an entry where nothing stands before the first."""
+    return index + 1
+
+
 def _refuse(
-    bad: Bool[np.ndarray, " n"], field: str, problem: str, source: object, remedy: str
+    bad: Bool[np.ndarray, " n"],
+    field: str,
+    problem: str,
+    source: object,
+    remedy: str,
+    row: Callable[[int], int] = from_one,
 ) -> None:
-    """Raise `InputError` where a row is bad; rows are named from 1."""
+    """Raise `InputError` where an entry is bad; `row` says which row of the file holds it."""
     if bad.any():
-        rows = f"in {bad.sum()} rows, first in row {np.argmax(bad) + 1}"
+        rows = f"in {bad.sum()} rows, first in row {row(int(np.argmax(bad)))}"
         raise InputError(source, f"field '{field}' {problem} {rows}", remedy)
 
 
@@ -84,15 +96,20 @@ def _check_motion(sequence: Sequence, source: object) -> None:
     valid, position = sequence.valid, sequence.position
     if not valid.any():
         return
-    remedy = "repair these rows or mark them invalid"
-    fast = valid & (np.abs(sequence.velocity) > FASTEST).any(axis=1)
-    _refuse(fast, "velocity", f"is beyond {FASTEST:g} m/s", source, remedy)
-    far = valid & (np.abs(position) > FARTHEST).any(axis=1)
-    _refuse(far, "position", f"is beyond {FARTHEST:g} m", source, remedy)
     farthest_step = np.maximum(FASTEST * np.diff(sequence.time), LARGEST_STEP)[:, None]
-    jump = (np.abs(np.diff(position, axis=0)) > farthest_step).any(axis=1)
-    jump = np.concatenate([[False], valid[1:] & valid[:-1] & jump])
-    _refuse(jump, "position", "jumps", source, remedy)
+    jumps = (np.abs(np.diff(position, axis=0)) > farthest_step).any(axis=1)
+    jumps = np.concatenate([[False], valid[:-1] & jumps])
+    for field, problem, bad in (
+        ("velocity", f"is beyond {FASTEST:g} m/s", np.abs(sequence.velocity).max(axis=1) > FASTEST),
+        ("position", f"is beyond {FARTHEST:g} m", np.abs(position).max(axis=1) > FARTHEST),
+        ("position", "jumps", jumps),
+    ):
+        if (bad := bad & valid).any():
+            # A sequence on a clock of its own no longer has the rows of its file.
+            first = sequence.time[np.argmax(bad)] - sequence.time[0]
+            problem = f"field '{field}' {problem} in {bad.sum()} rows"
+            problem += f", first {first:.3f} s after the start"
+            raise InputError(source, problem, "repair these rows or mark them invalid")
 
 
 def _check_waypoints(sequence: Sequence, source: object) -> None:
@@ -116,19 +133,28 @@ def _check_waypoints(sequence: Sequence, source: object) -> None:
         raise InputError(source, f"field 'waypoints' {problem}", "repair or leave out these")
 
 
-def check_finite(values: Float[np.ndarray, "n ..."], field: str, source: object) -> None:
-    """Raise `InputError` where a column that must be complete holds NaN or Inf."""
+def check_finite(
+    values: Float[np.ndarray, "n ..."],
+    field: str,
+    source: object,
+    row: Callable[[int], int] = from_one,
+) -> None:
+    """Raise `InputError` where a column that must be complete holds NaN or Inf. `row` says which
+    row of the file holds an entry."""
     finite = np.isfinite(values)
     if not finite.all():
         bad = ~finite.reshape(len(values), -1).all(axis=1)
-        _refuse(bad, field, "is NaN or Inf", source, "repair or cut the recording there")
+        _refuse(bad, field, "is NaN or Inf", source, "repair or cut the recording there", row)
 
 
-def check_increasing(time: Float[np.ndarray, "n"], source: object) -> None:
-    """Raise `InputError` where the stamps (s) do not increase."""
+def check_increasing(
+    time: Float[np.ndarray, "n"], source: object, row: Callable[[int], int] = from_one
+) -> None:
+    """Raise `InputError` where the stamps (s) do not increase. `row` says which row of the file
+    holds an entry."""
     backward = np.concatenate([[False], np.diff(time) <= 0])
     remedy = "sort the rows and drop repeated ones"
-    _refuse(backward, "time", "does not increase", source, remedy)
+    _refuse(backward, "time", "does not increase", source, remedy, row)
 
 
 def check_gyro(

@@ -29,9 +29,9 @@ BAD = [
     (changed(GOOD, "orientation", 5, np.nan), "'orientation'", "row 6"),
     (changed(GOOD, "position", 5, np.nan), "'position'", "mark these rows invalid"),
     (changed(GOOD, "velocity", 5, np.inf), "'velocity'", "row 6"),
-    (changed(GOOD, "velocity", 5, 400.0), "'velocity'", "row 6"),
-    (changed(GOOD, "position", 5, 1e9), "'position'", "row 6"),
-    (changed(GOOD, "position", 5, 12.0), "'position'", "jumps in 2 rows, first in row 6"),
+    (changed(GOOD, "velocity", 5, 400.0), "'velocity'", "in 1 rows, first 0.050 s after"),
+    (changed(GOOD, "position", 5, 1e9), "'position'", "in 1 rows, first 0.050 s after"),
+    (changed(GOOD, "position", 5, 12.0), "'position'", "jumps in 2 rows, first 0.050 s after"),
     (
         changed(GOOD._replace(device_orientation=GOOD.orientation), "device_orientation", 5, 2.0),
         "'device_orientation'",

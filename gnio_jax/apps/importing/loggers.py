@@ -382,4 +382,5 @@ def _added(motion: Sensor, gravity: Sensor) -> Sensor:
     order = np.flatnonzero(seen)[np.argsort(stamps[seen], kind="stable")]
     inside = (time >= stamps[order[0]]) & (time <= stamps[order[-1]])
     down = interpolate(time[inside], stamps[order], gravity.values[order])
-    return motion._replace(stamps=motion.stamps[inside], values=motion.values[inside] + down)
+    both = motion.where(inside)
+    return both._replace(values=both.values + down)

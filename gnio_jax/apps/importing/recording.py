@@ -4,12 +4,13 @@ order, units and signs, the one clock of all recordings (`data.assembly`), the r
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Bool, Float, Num
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.parsing import units
@@ -25,7 +26,7 @@ from gnio_jax.data.parsing.stamps import (
 from gnio_jax.data.parsing.tables import Table, open_text, read_text
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.self_check import self_check
-from gnio_jax.data.validation import WINDOW_SECONDS, check_finite
+from gnio_jax.data.validation import WINDOW_SECONDS, check_finite, from_one
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
 from gnio_jax.types import Sequence
@@ -61,6 +62,17 @@ class Sensor(NamedTuple):
     file: Path
     stamps: Num[np.ndarray, " n"]
     values: Float[np.ndarray, "n 3"]
+    row: Callable[[int], int] = from_one
+    """The row of the file that holds a sample, for messages."""
+
+    def where(self, kept: Bool[np.ndarray, " n"]) -> Sensor:
+        """The samples in these rows."""
+        own, stamps, values = np.flatnonzero(kept), self.stamps[kept], self.values[kept]
+
+        def row(index: int) -> int:
+            return self.row(int(own[index]))
+
+        return self._replace(stamps=stamps, values=values, row=row)
 
 
 class Track(NamedTuple):
@@ -155,7 +167,8 @@ def sensor_of(name: str, table: Table, time: str, *axes: str) -> Sensor:
     whole = time in table.columns and table.columns[time].dtype.kind in "iu"
     # Columns that are shorter than others end in NaN, which is no sample.
     stamps = table.stamps(time) if whole else _column(table, time)
-    return Sensor(name, table.path, stamps, np.stack([_column(table, a) for a in axes], axis=1))
+    values = np.stack([_column(table, axis) for axis in axes], axis=1)
+    return Sensor(name, table.path, stamps, values, table.row)
 
 
 def _column(table: Table, name: str) -> Float[np.ndarray, " n"]:
@@ -227,20 +240,21 @@ class _Clocked(NamedTuple):
 def _clocked(sensor: Sensor, unit: str | None, notes: list[str]) -> _Clocked:
     """`unit` is that of the stamps, None detects it. What was detected or repaired is added to
     `notes`."""
-    name, file, stamps, values = sensor
-    empty = np.isnan(values).all(axis=1)
+    name, file = sensor.name, sensor.file
+    empty = np.isnan(sensor.values).all(axis=1)
     if empty.any() and not empty.all():
         # Loggers that write every sensor into one table leave the others' columns empty.
         notes.append(
             f"{file.name}: {empty.sum()} of {len(empty)} rows have no value of {name} and "
             "are left out for it"
         )
-        stamps, values = stamps[~empty], values[~empty]
+        sensor = sensor.where(~empty)
+    stamps, values = sensor.stamps, sensor.values
     if (count := len(np.unique(stamps))) < 2:
         problem = f"holds {count} stamps of field '{name}'"
         raise InputError(file, problem, "record for longer")
-    check_finite(stamps.astype(np.float64), "time", file)
-    check_finite(values, name, file)
+    check_finite(stamps.astype(np.float64), "time", file, sensor.row)
+    check_finite(values, name, file, sensor.row)
     detected, rate = time_unit(stamps - stamps.min())
     if unit is None and detected is None:
         raise InputError(

@@ -119,7 +119,7 @@ def _streams(table: Table) -> Streams:
     check_columns(path, table.columns, wanted, remedy)
     time = table.take("time")
     streams = Streams.of_imu(path.stem, path, time, table.take(*GYRO), table.take(*ACCEL))
-    check_increasing(time, path)
+    check_increasing(time, path, table.row)
     check_seconds(time, path)
     poses, device = reference(table, time), None
     if poses is None and attitude[0] in table.columns:

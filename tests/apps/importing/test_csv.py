@@ -43,6 +43,20 @@ def write_logger(path, unit="ns", gyro=1.0, accel=1.0, separator=",", spoil=None
     return write(path, list(columns), [column[rows] for column in columns.values()], separator)
 
 
+def test_rows_are_those_that_an_editor_shows(tmp_path):
+    """Behind comments, the header and rows of another sensor, whatever is wrong."""
+    path = write_native(tmp_path / "walk.csv", reference=False)
+    header, *rows = path.read_text().splitlines()
+    names = header.split(",")
+    for column, value in (("gyro_y", "nan"), ("gyro_y", "three"), ("accel_z", "inf"), ("time", "")):
+        cells = rows[41].split(",")
+        cells[names.index(column)] = value
+        other = ["100.001", *[""] * (len(names) - 1)]
+        lines = ["# mine", header, *rows[:20], ",".join(other), *rows[20:41], ",".join(cells)]
+        path.write_text("\n".join([*lines, *rows[42:]]))
+        refused(path, rf"row {len(lines)}\b")
+
+
 # --- units and signs
 
 

@@ -328,7 +328,7 @@ BAD = {
     "csv": [
         ("walk.csv", without("qx"), "column 'qx' is missing while 'qw' is there"),
         ("walk.csv", without("pz"), "column 'pz' is missing"),
-        ("walk.csv", cell(8, "time", "0.0"), "field 'time'", "does not increase", "row 8"),
+        ("walk.csv", cell(8, "time", "0.0"), "field 'time'", "does not increase", "row 9"),
         ("walk.csv", cell(9, "qw", "3.0"), "'qw', 'qx', 'qy', 'qz'", "not a unit quater", "row 10"),
         ("walk.csv", scaled("time", 1e3), "not in seconds", "looks like ms: divide it by 1000"),
         ("walk.csv", scaled("time", 1e9), "field 'time'", "looks like ns: divide it by 1e+09"),

@@ -80,7 +80,8 @@ def test_rows_are_those_that_an_editor_shows(tmp_path):
     path = write_native(tmp_path / "walk.csv")
     header, *rows = path.read_text().splitlines()
     names = header.split(",")
-    for column, value in (("gyro_y", ""), ("gyro_y", "inf"), ("gyro_y", "three"), ("qw", "5")):
+    bad = [("gyro_y", ""), ("gyro_y", "inf"), ("gyro_y", "three"), ("qw", "5"), ("time", "100")]
+    for column, value in bad:
         cells = rows[41].split(",")
         cells[names.index(column)] = value
         lines = ["# mine", "", header, *rows[:20], "", "# pause", *rows[20:41], ",".join(cells)]
