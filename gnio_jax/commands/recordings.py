@@ -70,16 +70,18 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
     start = "" if sequence.valid.any() else " --init static"
     following = f"gnio evaluate --dataset csv --data-root {folder} --split test{start}"
     lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
+    beside = [path for path in csv_files.files_of(folder) if path.name != asked.out.name]
+    others = [p for p in beside if p.suffix.lower() not in HDF5 or p.stem == asked.out.stem]
     if lists:
         line = f"add the line {asked.out.name} to {lists[-1]}.txt"
         lines.append(
             f"{folder} has lists of its splits: {line}, otherwise this recording is not read"
         )
-    elif any(folder.glob("*.csv")):
+    elif others:
         following = f"gnio track {asked.out}"
         lines.append(
-            f"{folder} holds CSV files too: gnio evaluate would read them as recordings; write "
-            "the imported ones to a folder of their own"
+            f"{folder} holds {others[0].name} too, which gnio evaluate would read as a recording; "
+            "write the imported ones to a folder of their own"
         )
     console.say(f"{asked.out}: {sequence.name}")
     for line in lines:

@@ -314,17 +314,22 @@ def test_import_of_a_phones_file_returns_the_walk(place, capsys):
     assert data.read_hdf5(place / "own" / "again.h5").time.shape == (1000,)
 
 
-def test_what_follows_an_import_beside_its_own_csv_can_be_followed(place, capsys):
+@pytest.mark.parametrize("beside", ["walk.csv", "WALK.CSV", "walk.hdf5"])
+def test_what_follows_an_import_beside_its_own_csv_can_be_followed(place, capsys, beside):
     """As recordings of the folder, walk.csv and walk.h5 would have one name."""
-    write_phone(place / "walk.csv", (*csv.GYRO, *csv.ACCEL), accel=-1.0)
-    run("data", "import", "walk.csv", "--out", "walk.h5")
+    (place / "other").mkdir()
+    source = place / ("other/a.csv" if beside == "walk.hdf5" else beside)
+    write_phone(source, (*csv.GYRO, *csv.ACCEL), accel=-1.0)
+    if beside == "walk.hdf5":
+        run("data", "import", str(source), "--out", beside)
+    run("data", "import", str(source), "--out", f"{beside[:4]}.h5")
     *_, note, warning, following = capsys.readouterr().out.splitlines()
-    assert warning.startswith("warning: sign: gravity reads on -z in walk.csv")
-    assert "gnio evaluate would read them as recordings" in note
-    assert following == "next: gnio track walk.h5"
+    assert warning.startswith(f"warning: sign: gravity reads on -z in {source.name}")
+    assert f". holds {beside} too, which gnio evaluate would read as a recording" in note
+    assert following == f"next: gnio track {beside[:4]}.h5"
     with pytest.raises(InputError, match="has the name of"):
         data.load("csv", place, "test")
-    assert read_imported(place / "walk.h5").sequence.name == "walk"
+    assert read_imported(place / f"{beside[:4]}.h5").sequence.name == beside[:4]
 
 
 # --- mistakes

@@ -59,8 +59,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
     if split not in SPLITS or any((root / f"{name}.txt").is_file() for name in SPLITS):
         paths = listed(root / f"{split}.txt", partial(_find, root), root, DATASET.layout)
     else:
-        files = (path for path in root.glob("[!.]*") if path.suffix.lower() in _FILES)
-        paths = sorted(path for path in files if path.is_file())
+        paths = files_of(root)
         if not paths:
             raise InputError(root, "holds no recording (*.csv, *.h5, *.hdf5)", layout)
         if split != "test":
@@ -71,6 +70,12 @@ def recordings(root: Path, split: str) -> list[Recording]:
         if (other := named.setdefault(path.stem, path)) != path:
             raise InputError(path, f"has the name of {other}", "rename or remove one of them")
     return [Recording(name, partial(read, path)) for name, path in sorted(named.items())]
+
+
+def files_of(root: Path) -> list[Path]:
+    """The files that are recordings of a folder without lists."""
+    files = (path for path in root.glob("[!.]*") if path.suffix.lower() in _FILES)
+    return sorted(path for path in files if path.is_file())
 
 
 def list_splits(root: Path) -> tuple[str, ...]:
