@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from gnio_jax.data.parsing.tables import hdf5_field, hdf5_node, parsed_as
 from gnio_jax.data.validation import validate
 from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
@@ -26,8 +27,7 @@ from gnio_jax.types import Sequence, Waypoints
 _FORMAT = "gnio-jax sequence 1"
 _OPTIONAL_FIELDS = ("device_orientation", "imu_valid")
 _FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")
-LARGEST_RATIO = 100
-"""A compressed field may be so many times larger in memory than in the file."""
+_WAYPOINTS = tuple(f"waypoints/{field}" for field in Waypoints._fields)
 _ATTRIBUTE_TYPES = (str, bool, int, float, np.bool_, np.integer, np.floating)
 
 
@@ -50,17 +50,11 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
     """Read and validate what `write_hdf5` wrote. Raises `InputError` on a missing, cut-short or
     foreign file."""
     path = Path(path)
-    try:
-        with h5py.File(path, "r") as file:
-            sequence = _read(file, path)
-    except FileNotFoundError:
-        raise InputError(path, "no such file") from None
-    except InputError:
-        raise
-    except Exception as error:  # a damaged file makes the parser fail in any way
-        problem = f"cannot be read as HDF5, it may be cut short ({error})"
-        raise InputError(path, problem, "convert or copy it again") from None
-    return validate(sequence, path)
+    if not path.exists():
+        raise InputError(path, "no such file")
+    with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
+        stored = _stored(file, path)
+    return _sequence(stored, path)
 
 
 def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
@@ -79,45 +73,50 @@ def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
         attributes[key] = value
 
 
-def _read(group: h5py.Group, path: Path) -> Sequence:
-    if (form := group.attrs.get("format")) != _FORMAT:
+class _Stored(NamedTuple):
+    """What a group holds, as HDF5 has it."""
+
+    about: dict[str, Any]
+    """Its own attributes."""
+    fields: dict[str, np.ndarray | None]
+    """Of a group of the package's format; None for what is missing."""
+    attributes: dict[str, Any]
+    """Of the sequence."""
+
+
+def _stored(group: h5py.Group, path: Path) -> _Stored:
+    """Read a group, and judge nothing but its size: what fails here is the file's fault."""
+    about, names = dict(group.attrs), (*_FIELDS, *_OPTIONAL_FIELDS, *_WAYPOINTS)
+    ours = about.get("format") == _FORMAT
+    fields = {name: hdf5_field(group, name, path) for name in names if ours}
+    inner = hdf5_node(group, "attributes", path)
+    return _Stored(about, fields, {} if inner is None else dict(inner.attrs))
+
+
+def _sequence(stored: _Stored, path: Path) -> Sequence:
+    """The sequence of a group, validated. Raises `InputError`."""
+    if (form := stored.about.get("format")) != _FORMAT:
         problem = f"is not a '{_FORMAT}' file (format: {form!r})"
         raise InputError(path, problem, "convert the recording with gnio data convert")
-    fields = (*_FIELDS, *(field for field in _OPTIONAL_FIELDS if field in group))
-    values: dict[str, Any] = {field: _array(group, field, path) for field in fields}
-    if "waypoints" in group:
-        parts = (_array(group, f"waypoints/{field}", path) for field in Waypoints._fields)
-        values["waypoints"] = Waypoints(*parts)
-    stored = group["attributes"].attrs if "attributes" in group else {}
-    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in stored.items()}
-    return Sequence(name=str(group.attrs.get("name", path.stem)), attributes=plain, **values)
+    there = {name for name, values in stored.fields.items() if values is not None}
+    fields = (*_FIELDS, *(field for field in _OPTIONAL_FIELDS if field in there))
+    values: dict[str, Any] = {field: _values(stored, field, path) for field in fields}
+    if there.intersection(_WAYPOINTS):
+        values["waypoints"] = Waypoints(*(_values(stored, name, path) for name in _WAYPOINTS))
+    attributes = stored.attributes.items()
+    plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in attributes}
+    name = str(stored.about.get("name", path.stem))
+    return validate(Sequence(name=name, attributes=plain, **values), path)
 
 
-def _array(group: h5py.Group, field: str, path: Path) -> np.ndarray:
-    """Booleans of what is valid, float64 of every other field.
-
-    A field lies in the file itself: a link to another place is refused, and so is a field that
-    would be far larger in memory than in the file.
-    """
+def _values(stored: _Stored, field: str, path: Path) -> np.ndarray:
+    """Booleans of what is valid, float64 of every other field."""
     kind, content = ("b", "booleans") if field.endswith("valid") else ("f", "numbers")
-    link, problem = group.get(field, getlink=True), ""
-    elsewhere = isinstance(link, h5py.ExternalLink | h5py.SoftLink)
-    stored = None if elsewhere else group.get(field)
-    if stored is None:
-        problem = "is a link" if elsewhere else "is missing"
-    elif not isinstance(stored, h5py.Dataset) or stored.dtype.kind != kind or not stored.shape:
-        problem = f"is not an array of {content}"
-    elif (
-        stored.external
-        or stored.is_virtual
-        or stored.nbytes > LARGEST_RATIO * stored.id.get_storage_size() + 1_000_000
-    ):
-        problem = f"would take {stored.nbytes} bytes, which the file does not hold"
-    if problem:
-        raise InputError(path, f"field '{field}' {problem}", "convert the recording again")
-    assert isinstance(stored, h5py.Dataset)
-    value = stored[()]
-    return value if kind == "b" else value.astype(np.float64, copy=False)
+    values = stored.fields[field]
+    if values is not None and values.dtype.kind == kind and values.shape:
+        return values if kind == "b" else values.astype(np.float64, copy=False)
+    problem = "is missing" if values is None else f"is not an array of {content}"
+    raise InputError(path, f"field '{field}' {problem}", "convert the recording again")
 
 
 # --- the cache
@@ -189,11 +188,12 @@ def write_reading(entry: Path, reading: Reading) -> None:
 def read_reading(entry: Path) -> Reading | None:
     """A reading that was kept; None where there is no sound one."""
     try:
-        with h5py.File(entry, "r") as file:
-            sequences = [validate(_read(file[number], entry), entry) for number in sorted(file)]
+        with parsed_as(entry, "HDF5"), h5py.File(entry, "r") as file:
+            stored = [_stored(file[number], entry) for number in sorted(file)]
             notes, refusals = (
                 tuple(json.loads(file.attrs[name])) for name in ("notes", "refusals")
             )
-    except Exception:  # a damaged file makes the parser fail in any way
+        sequences = [_sequence(each, entry) for each in stored]
+    except InputError:
         return None
     return Reading(sequences, notes, refusals) if sequences or refusals else None

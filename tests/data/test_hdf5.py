@@ -4,6 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
+from gnio_jax.data import hdf5
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.errors import InputError
 from gnio_jax.types import Waypoints
@@ -65,6 +66,29 @@ def test_hdf5_that_is_cut_short_or_foreign_is_named(tmp_path):
     fails("format")
     path.unlink()
     fails("no such file")
+
+
+def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path, monkeypatch):
+    path = tmp_path / "walk.h5"
+    write_hdf5(path, circle())
+
+    def raising(error):
+        def fails(*_, **__):
+            raise error
+
+        return fails
+
+    for error in (NameError("ours"), TypeError("ours"), AttributeError("ours")):
+        monkeypatch.setattr(hdf5, "Sequence", raising(error))
+        with pytest.raises(type(error), match="ours"):
+            read_hdf5(path)
+    monkeypatch.undo()
+    monkeypatch.setattr(hdf5, "hdf5_field", raising(MemoryError()))
+    with pytest.raises(InputError, match="does not fit into memory"):
+        read_hdf5(path)
+    monkeypatch.setattr(hdf5, "hdf5_field", raising(NameError("ours")))
+    with pytest.raises(NameError):
+        read_hdf5(path)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):

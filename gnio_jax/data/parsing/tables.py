@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,6 +24,11 @@ from gnio_jax.data.validation import UNIT_NORM_TOLERANCE
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
 
+if TYPE_CHECKING:
+    import h5py
+
+LARGEST_RATIO = 100
+"""A compressed field of HDF5 may be so many times larger in memory than in the file."""
 OURS = (AssertionError, NameError, ImportError)
 """What no damaged file makes a parser raise: it is a mistake of ours, or of the installation."""
 
@@ -271,6 +276,39 @@ def _is_number(cell: str, decimal: str) -> bool:
 
 
 # --- other formats
+
+
+def hdf5_node(group: h5py.Group, name: str, path: Path) -> Any:
+    """What an HDF5 group holds under a name ("group/field"); None where there is nothing. Raises
+    `InputError` for a link to another place."""
+    import h5py
+
+    node: Any = group
+    for part in name.split("/"):
+        if not isinstance(node, h5py.Group):
+            return None
+        if isinstance(node.get(part, getlink=True), h5py.ExternalLink | h5py.SoftLink):
+            raise damaged(path, f"field '{name}' is a link")
+        node = node.get(part)
+    return node
+
+
+def hdf5_field(group: h5py.Group, name: str, path: Path) -> np.ndarray | None:
+    """The array under a name; None where there is none.
+
+    It lies in the file itself: raises `InputError` for a link to another place, and for what would
+    be far larger in memory than in the file.
+    """
+    import h5py
+
+    node = hdf5_node(group, name, path)
+    if not isinstance(node, h5py.Dataset):
+        return None
+    most = LARGEST_RATIO * node.id.get_storage_size() + 1_000_000
+    if node.external or node.is_virtual or node.nbytes > most:
+        problem = f"would take {node.nbytes} bytes, which the file does not hold"
+        raise damaged(path, f"field '{name}' {problem}")
+    return np.asarray(node)
 
 
 def read_hdf5_fields(path: Path, names: Iterable[str]) -> Table:
