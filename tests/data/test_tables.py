@@ -60,6 +60,32 @@ def test_fields_of_binary_files_have_one_length_and_hold_numbers(tmp_path):
                 table.take(f"{prefix}{name}", width=width)
 
 
+def test_hdf5_holds_what_it_gives(tmp_path):
+    """A link may lead to any file, and a few bytes unpack to gigabytes: neither is followed."""
+    path = tmp_path / "a.h5"
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["group/time"] = np.arange(5.0)
+    with h5py.File(path, "w") as file:
+        file["in/group/time"] = np.arange(5.0)
+        file["field"] = h5py.ExternalLink("other.h5", "group/time")
+        file["group"] = h5py.ExternalLink("other.h5", "group")
+        file["soft"] = h5py.SoftLink("/in/group")
+        file.create_dataset("bomb", (10**10,), "f8", chunks=(10**6,), compression="gzip")
+        layout = h5py.VirtualLayout((5,), "f8")
+        layout[:] = h5py.VirtualSource(tmp_path / "other.h5", "group/time", (5,))
+        file.create_virtual_dataset("virtual", layout)
+    assert list(read_hdf5_fields(path, ["in/group/time", "in/gone", "gone/time"]).columns) == [
+        "in/group/time"
+    ]
+    for name in ("field", "group/time", "soft/time"):
+        with pytest.raises(InputError, match=rf"a\.h5: field '{name}' is a link"):
+            read_hdf5_fields(path, [name])
+    for name, size in (("bomb", 80_000_000_000), ("virtual", 40)):
+        problem = f"field '{name}' would take {size} bytes, which the file does not hold"
+        with pytest.raises(InputError, match=problem):
+            read_hdf5_fields(path, [name])
+
+
 def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path):
     path = tmp_path / "a.npz"
     for error in (AssertionError, NameError, ImportError):

@@ -315,13 +315,10 @@ def read_hdf5_fields(path: Path, names: Iterable[str]) -> Table:
     """Those of the fields `names` (of any depth, "group/field") that an HDF5 file has."""
     import h5py
 
-    fields: dict[str, np.ndarray] = {}
     with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
-        for name in names:
-            node = file.get(name)
-            if isinstance(node, h5py.Dataset):
-                fields[name] = np.asarray(node)
-    return Table(path, fields, "field")
+        fields = {name: hdf5_field(file, name, path) for name in names}
+    there = {name: values for name, values in fields.items() if values is not None}
+    return Table(path, there, "field")
 
 
 def read_npz(path: Path) -> Table:
