@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import warnings
@@ -74,6 +75,12 @@ def held_out(people: Mapping[str, str], share: float = 0.1, most: float = 0.25) 
         if held:
             return {name for name, person in owner.items() if person in held}
     return set()
+
+
+def drawn(seed: str, name: str) -> float:
+    """A number from 0 to 1, drawn by a name alone: what is shared out by it stays where it is,
+    whatever else a copy of the data holds."""
+    return int(hashlib.sha256(f"{seed} {name}".encode()).hexdigest()[:8], 16) / 2**32
 
 
 def listed(path: Path, find: Callable[[str], Path | None], root: Path, layout: str) -> list[Path]:

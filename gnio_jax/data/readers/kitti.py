@@ -27,7 +27,6 @@ pieces of one drive are never divided between splits.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import warnings
@@ -43,6 +42,7 @@ from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.stamps import in_order
 from gnio_jax.data.parsing.tables import damaged, read_npz, shortened, text_of
+from gnio_jax.data.splits import drawn
 from gnio_jax.data.validation import FASTEST, check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import stretches
@@ -95,7 +95,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
 def share_of(drive: str) -> str:
     """Split of a drive, from its name alone."""
-    place = int(hashlib.sha256(f"{SEED} {drive}".encode()).hexdigest()[:8], 16) / 2**32
+    place = drawn(SEED, drive)
     return "train" if place < 0.7 else "val" if place < 0.8 else "test"
 
 

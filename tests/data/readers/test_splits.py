@@ -70,8 +70,8 @@ shali_bag1 yajie_leg1
         text deep/building2/known/metadata.json {{"9": {{"subjectID": 2}},"10": {{"subjectID": 2}}}}
         text deep/building3/unknown/metadata.json {{"0": {json.dumps(PEOPLE[-1])}}}
         split train building1_train_0 building1_train_1 building1_train_2 building1_train_3 \
-building1_train_4 building1_train_5 building1_train_8 building1_train_9
-        split val building1_train_6 building1_train_7
+building1_train_6 building1_train_7 building1_train_8 building1_train_9
+        split val building1_train_4 building1_train_5
         split known,seen,test building1_known_0 building2_known_9 building2_known_10
         split unknown,unseen building3_unknown_0""",
     "euroc": r"""
@@ -178,7 +178,7 @@ WRONG = [
     # dataset, what becomes of files (None: gone), split, problem
     ("ridi", {"deep/list_train_publish_v2.txt": "dan_bag1"}, "val", "would be empty"),
     ("ridi", {"deep/list_test_publish_v2.txt": None}, "test", "the list cannot be read"),
-    ("idol", {f"deep/building1/train/{n}.feather": None for n in range(2, 10)}, "val", "empty"),
+    ("idol", {f"deep/building1/train/{n}.feather": None for n in range(2, 10)}, "val", "0 of 1"),
     ("idol", {"deep/building3/unknown/0.feather": None}, "unseen", "holds no recording in"),
     ("euroc", {"V1_02_medium/mav0/imu0/data.csv": None}, "val", "sequences are V1_02_medium"),
     ("tumvi", {}, "test", "holds no sequence of split 'test'"),
@@ -216,7 +216,7 @@ def test_a_split_that_is_not_there_is_refused(copied, tmp_path, name, changes, s
 
 @pytest.mark.filterwarnings("ignore:.*absent")
 def test_who_is_held_out_is_written_in_every_sequence(copied):
-    for name, who in (("ridi", "ma"), ("idol", "subject3")):
+    for name, who in (("ridi", "ma"), ("idol", "subject2")):
         root = copied(name)
         for split in ("train", "val"):
             for each in data.get(name).recordings(root, split):
@@ -227,8 +227,25 @@ def test_who_is_held_out_is_written_in_every_sequence(copied):
     (root / "deep/building1/train/metadata.json").unlink()
     nameless = r"metadata\.json does not name the subject of 10 recordings, e\.g\. .*0\.feather"
     with pytest.warns(UserWarning, match=nameless):
-        (val,) = data.get("idol").recordings(root, "val")
-    assert val.attributes["subject"] == val.name
+        train = data.get("idol").recordings(root, "train")
+    assert all(each.attributes["subject"] == each.name for each in train)
+
+
+def test_who_validates_does_not_depend_on_what_a_copy_holds(tmp_path):
+    folder, split_of = tmp_path / "building1" / "train", {}
+    folder.mkdir(parents=True)
+    entries = {str(n): {"subjectID": n % 20} for n in range(60)}
+    (folder / "metadata.json").write_text(json.dumps(entries))
+    for people in (range(20), range(0, 20, 2), range(3), range(11, 17)):
+        for n in range(60):
+            (folder / f"{n}.feather").unlink(missing_ok=True)
+            if n % 20 in people:
+                (folder / f"{n}.feather").touch()
+        for split in ("train", "val"):
+            for each in data.get("idol").recordings(tmp_path, split):
+                assert split_of.setdefault(each.name, split) == split
+    held = [entries[name.rpartition("_")[2]] for name, split in split_of.items() if split == "val"]
+    assert {entry["subjectID"] for entry in held} == {2, 13} and len(held) == 6
 
 
 def test_the_truth_chooses_an_orientation_where_one_trains_alone(copied, monkeypatch):
