@@ -402,24 +402,32 @@ def convert(
     The folder `out` is written whole or not at all. It must be new or empty, or hold an earlier
     conversion of the same recordings with the same settings, which is then replaced. `rate`: Hz,
     None keeps each recording's own. `workers` processes share the work. Raises `InputError` when
-    `out` holds anything else, two recordings would be one file, or none can be used.
+    `out` holds anything else, two sequences would be one file, or none can be used.
     """
     settings = {"dataset": dataset.name, "split": split, "rate": rate}
     if dataset.needs_root:
         settings["root"] = str(root.resolve())
     _check_target(out, settings)
     recordings, splits, notes = find_recordings(dataset, root, split)
-    first: dict[str, str] = {}
-    for name in recordings:
-        if (other := first.setdefault(file_stem(name), name)) != name:
-            problem = f"'{other}' and '{name}' would be one file, {file_stem(name)}.h5"
+    owners: dict[str, str] = {}
+
+    def check_file(name: str, recording: str) -> None:
+        """No other recording may own the file of this sequence."""
+        stem = file_stem(name)
+        if (other := owners.setdefault(stem, recording)) != recording:
+            problem = f"'{other}' and '{recording}' would be one file, {stem}.h5"
             raise InputError(root, problem, "rename one of them")
+
+    for name in recordings:
+        check_file(name, name)
     stems, left_out, hours = {}, {}, 0.0
     with replacing_folder(out) as folder:
         items = [(recording, dataset, folder, rate) for recording in recordings.values()]
         results = in_processes(_check_and_write, items, workers, progress)
         for name, (rows, told) in zip(recordings, results, strict=True):
             used = [row for row in rows if not row.reason]
+            for row in used:  # pieces of a recording have names of their own
+                check_file(row.name, name)
             stems[name] = [file_stem(row.name) for row in used]
             left_out |= {row.name: row.reason for row in rows if row.reason}
             hours += sum(row.check.duration for row in used if row.check) / 3600.0

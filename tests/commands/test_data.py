@@ -5,6 +5,7 @@ import dataclasses
 import json
 import shutil
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,11 +15,13 @@ from gnio_jax import data
 from gnio_jax.apps.importing import read_imported
 from gnio_jax.commands import app
 from gnio_jax.data import loading
+from gnio_jax.data.dataset import Recording
 from gnio_jax.data.readers import DATASETS, tlio
 from gnio_jax.data.readers import csv_files as csv
 from gnio_jax.errors import InputError
 from tests.support import indoor_location_files
 from tests.support import known_walk as walk
+from tests.support.circle import circle
 from tests.support.command_lines import run
 from tests.support.sequences import assert_same_arrays
 from tests.support.tlio_files import write_sequence
@@ -272,6 +275,22 @@ def test_two_recordings_never_become_one_file(root, place):
     (place / "own" / "also.csv").write_text("")
     with pytest.raises(InputError, match=r"also\.h5: has the name of .*also\.csv; rename or remo"):
         data.load("csv", place / "own")
+
+
+def test_a_piece_never_takes_the_file_of_another_recording(tmp_path):
+    def pieces(*names):
+        return partial(list, [circle(seconds=30.0)._replace(name=name) for name in names])
+
+    found = [
+        Recording("walk_piece1", pieces("walk_piece1")),
+        Recording("walk", pieces("walk_piece1", "walk_piece2")),
+    ]
+    for given in (found, found[::-1]):
+        about = dataclasses.replace(data.get("tlio"), recordings=lambda *_, given=given: given)
+        problem = r"'walk\w*' and 'walk\w*' would be one file, walk_piece1\.h5; rename one"
+        with pytest.raises(InputError, match=problem):
+            loading.convert(about, tmp_path, tmp_path / "out", "test")
+        assert not (tmp_path / "out").exists()
 
 
 # --- import
