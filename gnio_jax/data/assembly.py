@@ -78,7 +78,6 @@ def assemble(
     streams: Streams,
     rate: float | None = None,
     *,
-    native: float | None = None,
     divide: bool = False,
     whole: bool = False,
     max_speed: float = np.inf,
@@ -87,8 +86,6 @@ def assemble(
     """The recording at `rate` Hz (None: the faster sensor's own, to four digits), validated but not
     self-checked.
 
-    `native`
-        Rate (Hz) that the stamps must have to 5 %; None takes any of `RATES`.
     `divide`
         Makes a sequence of each piece between gaps longer than a window (`WINDOW_SECONDS`), since a
         filter integrates whatever lies between its first and last sample. Pieces that hold no
@@ -108,7 +105,7 @@ def assemble(
     streams = ordered(streams)
     gyro, accel = streams.gyro, streams.accel
     for sensor in (gyro, accel):
-        _check_rate(sensor, native)
+        _check_rate(sensor)
     check_accel(accel.values, accel.source, accel.time)
     check_gyro(gyro.values, gyro.source, gyro.time)
     found = _shared_spans(streams, whole)
@@ -171,16 +168,14 @@ def ordered(streams: Streams) -> Streams:
     )
 
 
-def _check_rate(samples: Samples, native: float | None) -> None:
+def _check_rate(samples: Samples) -> None:
     if len(samples.time) < 2:
         problem = f"holds {len(samples.time)} samples"
         raise InputError(samples.source, problem, "record for longer")
     rate = 1.0 / float(np.median(np.diff(samples.time)))
-    slowest, fastest, expected = RATES[0] * 0.99, RATES[1] * 1.01, f"{RATES[0]:g} to {RATES[1]:g}"
-    if native is not None:
-        slowest, fastest, expected = native * 0.95, native * 1.05, f"about {native:g}"
-    if not slowest <= rate <= fastest:
-        problem = f"field 'time' runs at {rate:.4g} Hz, expected {expected} Hz"
+    slowest, fastest = RATES
+    if not slowest * 0.99 <= rate <= fastest * 1.01:
+        problem = f"field 'time' runs at {rate:.4g} Hz, expected {slowest:g} to {fastest:g} Hz"
         raise InputError(samples.source, problem, "check the unit of the stamps")
 
 

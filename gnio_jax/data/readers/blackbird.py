@@ -81,7 +81,7 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
     poses = Poses(time, turn * attitude, turn.apply(pose[:, :3]), velocity, source=str(path))
     streams = Streams.of_imu(name or folder.name, path, time, gyro, accel)
     streams = streams._replace(attributes=about, start=float(stamps[0]), poses=poses)
-    return assemble(streams, RATE, native=RATE)
+    return assemble(streams, RATE)
 
 
 def _velocity(path: Path, stamps: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"] | None:

@@ -174,7 +174,7 @@ def read(folder: Path, about: Dataset | None = None) -> list[Sequence]:
     }
     streams = Streams.of_imu(name, path, time, table.take(*GYRO), table.take(*ACCEL))
     streams = streams._replace(attributes=attributes, start=start * 1e-9, poses=poses)
-    return assemble(streams, RATE, native=RATE)
+    return assemble(streams, RATE)
 
 
 def read_table(path: Path) -> Table:

@@ -47,6 +47,8 @@ subjects 0 to 4, and one of each ten up to 39."""
 PHONE_TO_RIG = Rotation.from_rotvec([-0.01853, 0.02801, 3.12916])
 """How the phone is bolted on, from gyro and reference of the whole set; the authors' own words are
 x → −x, y → −y."""
+SHORTEST = 10.0
+"""s of poses, and of the rig's accelerometer, that tell level and lag."""
 FASTEST_WALKER = 6.0
 """m/s: faster than this not a person walks but an odometry that relocalises."""
 MAX_TILT = 20.0
@@ -133,6 +135,7 @@ def read(path: Path) -> list[Sequence]:
     stamps = table.take("timestamp")
     rows, start = distinct(stamps, path, "timestamp"), float(np.median(stamps))
     time = stamps[rows] - start
+    fewest = SHORTEST / float(np.median(np.diff(time)))
     gyro, accel = table.axes("iphoneGyro", "XYZ")[rows], table.axes("iphoneAcc", "XYZ")[rows]
     pull = float(np.median(np.linalg.norm(accel, axis=1)))
     if not 0.5 < pull < 2.0:
@@ -142,14 +145,14 @@ def read(path: Path) -> list[Sequence]:
     position = table.axes("processedPos", "XYZ", gaps=True)[rows]
     # A quaternion of zeros is no attitude, as little as NaN is.
     known = orientation.any(axis=1) & finite_rows(orientation) & finite_rows(position)
-    if known.sum() < max(10 * RATE, 0.5 * len(rows)):
+    if known.sum() < max(fewest, 0.5 * len(rows)):
         problem = f"hold a pose in only {known.sum()} of {len(rows)} rows"
         raise Refusal(path, f"columns 'orient', 'processedPos' {problem}")
     rig = table.rotations(*(f"orient{axis}" for axis in "WXYZ"), rows=rows[known])
 
     # The map is levelled by the rig's own accelerometer.
     felt = table.axes("stencilAcc", "XYZ", gaps=True)[rows][known]
-    if (measured := finite_rows(felt)).sum() < 10 * RATE:
+    if (measured := finite_rows(felt)).sum() < fewest:
         raise Refusal(path, f"columns 'stencilAcc' hold numbers in only {measured.sum()} rows")
     level = levelling(rig[measured].apply(felt[measured]).mean(axis=0))
     if (tilt := float(np.degrees(level.magnitude()))) > MAX_TILT:
@@ -187,7 +190,7 @@ def read(path: Path) -> list[Sequence]:
         poses=Poses(time[known] - fit.lag, attitude, place, source=str(path)),
         device=_device(table, time, rows),
     )
-    return assemble(streams, RATE, native=RATE, divide=True, max_speed=FASTEST_WALKER)
+    return assemble(streams, RATE, divide=True, max_speed=FASTEST_WALKER)
 
 
 def _device(table: Table, time: Float[np.ndarray, " n"], rows: np.ndarray) -> Samples | None:

@@ -56,6 +56,8 @@ shares of the names."""
 
 LONGEST_GAP = 0.1
 """A drive is divided where packets are missing for longer than this, s."""
+SLOWEST_STEP = 0.05
+"""s between packets, half of what the 10 Hz export has."""
 SHORTEST_PIECE = 3.0
 """s; what is shorter holds too few windows to be worth a sequence."""
 LARGEST_JUMP = 0.5
@@ -148,9 +150,7 @@ def read_packets(oxts: Path) -> list[Sequence]:
     time = (stamps - start).astype(np.int64) * 1e-9
     order, repairs = in_order(time, packets, times)
     time, packets = time[order], packets[order]
-    if np.median(np.diff(time)) > 0.05:
-        problem = f"runs at {1 / np.median(np.diff(time)):.3g} Hz, as the _sync export does"
-        raise InputError(times, f"field 'time' {problem}", "get the _extract archive")
+    _check_rate(time, times)
 
     def values(*names: str) -> Float[np.ndarray, "n w"]:
         return packets[:, [_VALUES.index(name) for name in names]]
@@ -179,11 +179,18 @@ def read_piece(path: Path) -> list[Sequence]:
     table = read_npz(path)
     time, imu = table.take("t"), table.take("u", width=6)
     check_increasing(time, path)
+    _check_rate(time, path)
     position, velocity, angles = (table.take(n, width=3) for n in ("p_gt", "v_gt", "ang_gt"))
     attitude = Rotation.from_euler("ZYX", angles[:, ::-1])
     streams = Streams.of_imu(_piece_name(path), path, time, imu[:, :3], imu[:, 3:])
     poses = Poses(time, attitude, position, velocity, source=str(path))
     return _assembled(streams._replace(poses=poses), _drive_of(path.stem), {})
+
+
+def _check_rate(time: Float[np.ndarray, " n"], path: Path) -> None:
+    if (step := float(np.median(np.diff(time)))) > SLOWEST_STEP:
+        problem = f"field 'time' runs at {1 / step:.3g} Hz, as the _sync export does"
+        raise InputError(path, problem, "get the _extract archive")
 
 
 def _assembled(streams: Streams, drive: str, repairs: dict[str, float]) -> list[Sequence]:
@@ -197,7 +204,7 @@ def _assembled(streams: Streams, drive: str, repairs: dict[str, float]) -> list[
         "licence": DATASET.licence,
     }
     streams = streams._replace(attributes=about | repairs)
-    return assemble(streams, RATE, native=RATE, max_drift=LARGEST_JUMP)
+    return assemble(streams, RATE, max_drift=LARGEST_JUMP)
 
 
 def _piece_name(path: Path) -> str:

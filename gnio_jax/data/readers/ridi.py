@@ -35,8 +35,6 @@ from gnio_jax.numerics import quaternions, rotations
 from gnio_jax.types import Sequence
 
 RATE = 200.0
-NATIVE_RATE = 202.3
-"""Hz, of data.csv."""
 FASTEST_WALKER = 6.0
 """m/s: faster than this not a person walks but a visual odometry that relocalises."""
 
@@ -135,13 +133,8 @@ def read(folder: Path) -> list[Sequence]:
         "imu_compensated": "Android's gyro bias" if arcore and not table else "no",
         "licence": DATASET.licence,
     }
-    pieces = assemble(
-        streams._replace(attributes=about),
-        RATE,
-        native=NATIVE_RATE if table else None,
-        divide=True,
-        max_speed=FASTEST_WALKER,
-    )
+    streams = streams._replace(attributes=about)
+    pieces = assemble(streams, RATE, divide=True, max_speed=FASTEST_WALKER)
     for number, piece in enumerate(pieces):
         if piece.device_orientation is not None:
             own, first = rotations(piece.device_orientation), int(np.argmax(piece.valid))

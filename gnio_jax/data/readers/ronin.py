@@ -121,7 +121,7 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
         poses=Poses(time, orientation[kept], position[kept], source=str(path)),
         device=Samples(time, quaternions(game[kept]), str(path)),
     )
-    return assemble(streams, RATE, native=RATE, max_speed=FASTEST_WALKER)
+    return assemble(streams, RATE, max_speed=FASTEST_WALKER)
 
 
 # --- info.json

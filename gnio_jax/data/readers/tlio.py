@@ -68,7 +68,7 @@ def read(folder: Path) -> list[Sequence]:
     }
     poses = Poses(time, attitude, position, velocity, source=str(path))
     streams = streams._replace(attributes=about, start=start * 1e-6, poses=poses)
-    return assemble(streams, RATE, native=RATE)
+    return assemble(streams, RATE)
 
 
 def _columns(path: Path) -> tuple[dict[str, slice], int]:
