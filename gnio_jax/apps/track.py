@@ -19,6 +19,7 @@ from gnio_jax.apps import export, rerun
 from gnio_jax.apps.importing import GAPS, Imported
 from gnio_jax.apps.packages import Weights
 from gnio_jax.config import TrainConfig
+from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError
@@ -213,6 +214,7 @@ def summarise(
     if np.isfinite(found.reference.position).any() or found.waypoints is not None:
         summary = summary._replace(errors=metrics.score([found])[found.name].values)
     own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
+    own_rate = min(own_rate, float(sequence.attributes.get(RECORDED_RATE, own_rate)))
     warnings = [*recording.warnings, *_warnings(summary, own_rate, 1.0 / ekf.config.dt)]
     holes = ready.imu_valid is not None
     if holes or any(GAPS in note for note in recording.notes):

@@ -31,6 +31,9 @@ from gnio_jax.errors import InputError
 from gnio_jax.numerics import spans, stretches
 from gnio_jax.types import Sequence, Waypoints
 
+RECORDED_RATE = "recorded_rate"
+"""Attribute of every sequence that was assembled: Hz of the faster sensor, whatever the sequence's
+own clock became. Content above half of it is in no sample."""
 STAMP_ROUNDING = 1e-6
 """s: what float64 leaves of differences of unix stamps, and more."""
 
@@ -114,7 +117,9 @@ def assemble(
         problem = f"has a gap of {first - last:.3f} s after {last - gyro.time[0]:.2f} s"
         problem = f"field 'time' {problem}, longer than {WINDOW_SECONDS:g} s"
         raise InputError(gyro.source, problem, "cut the recording there")
-    rate = rate or max(rounded_rate(gyro.time), rounded_rate(accel.time))
+    recorded = max(rounded_rate(gyro.time), rounded_rate(accel.time))
+    streams = streams._replace(attributes=streams.attributes | {RECORDED_RATE: recorded})
+    rate = rate or recorded
     pieces = [_on_clock(streams, rate, *span, max_speed, max_drift) for span in found]
     shortest = WINDOW_SECONDS - STAMP_ROUNDING
     kept = [piece for piece in pieces if _seconds_of_use(streams, piece, whole) >= shortest]

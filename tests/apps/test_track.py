@@ -141,6 +141,9 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_
     assert summary_of(tmp_path / "again")["notes"] == summary_of(folder)["notes"]
     ours, theirs = (read_tum(x / "trajectory.txt").position for x in (tmp_path / "again", folder))
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    # What was resampled to a higher rate has no more in it.
+    gnio("data", "import", slow, "--rate", "100", "--out", tmp_path / "fast.h5")
+    assert f"warning: {rate}" in gnio("track", tmp_path / "fast.h5", "--out", tmp_path / "fast")
 
 
 def test_what_is_refused(mistake, runs, tmp_path):

@@ -221,7 +221,9 @@ def test_every_piece_with_a_window_is_kept_and_named():
         count = round(100 * (last - first)) + 1
         np.testing.assert_allclose(piece.time, np.arange(count) / 100, atol=1e-9)
         np.testing.assert_allclose(piece.position[:, 0], first + piece.time, atol=1e-9)
-        assert piece.attributes == {"group": "someone", "start_time": pytest.approx(100.0 + first)}
+        start = pytest.approx(100.0 + first)
+        about = {"group": "someone", "start_time": start, "recorded_rate": 100.0}
+        assert piece.attributes == about
         # It holds at least the one window it was kept for.
         assert len(windows.window_source([piece], config, stride=10).start) >= 1
     # No estimate runs through a hole.
