@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 from jaxtyping import Float, Int
 
 from gnio_jax.apps.importing.recording import Recording, Sensor, Track, Units
@@ -145,6 +146,8 @@ def _reading(path: Path, kind: str) -> Iterator[None]:
 def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
     from rosbags import rosbag1, rosbag2
 
+    if kind == "rosbag2" and path.is_dir():
+        _check_compression(path)
     reader = stack.enter_context((rosbag1 if kind == "rosbag1" else rosbag2).Reader(path))
     decode = _decoder("ros1" if kind == "rosbag1" else "cdr")
 
@@ -156,6 +159,17 @@ def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
 
     found = ((one.topic, one.msgtype, one.msgcount) for one in reader.connections)
     return _Bag(path, _joined(found), messages)
+
+
+def _check_compression(path: Path) -> None:
+    """Raise `InputError` for a bag whose files are compressed as a whole: the library would unpack
+    them to the disk, whatever their size. (Single messages it unpacks in memory, one by one.)"""
+    with (path / "metadata.yaml").open(encoding="utf-8") as file:
+        content = yaml.safe_load(file)
+    about = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
+    if isinstance(about, dict) and str(about.get("compression_mode")).lower() == "file":
+        remedy = "unpack its file (zstd -d FILE.zstd) and import that"
+        raise InputError(path, "is compressed as a whole (compression_mode FILE)", remedy)
 
 
 def _mcap(path: Path, stack: ExitStack) -> _Bag:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 import sys
+import tempfile
 
 import numpy as np
 import pytest
+from rosbags import rosbag2
+from rosbags.rosbag2.reader import zstd
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.apps.importing import ros
@@ -195,6 +198,22 @@ def test_only_what_a_library_cannot_read_is_called_damage(tmp_path, monkeypatch,
     monkeypatch.setattr(ros, "_stamp", fails)
     with pytest.raises(error):
         import_recording(path)
+
+
+def test_a_bag_compressed_as_a_whole_is_unpacked_by_its_owner(tmp_path, monkeypatch):
+    """The library would do so itself, to the disk and whatever the size."""
+    compressed = rosbag2.Writer(tmp_path / "walk", version=9)
+    modes, formats = rosbag2.CompressionMode, rosbag2.CompressionFormat
+    compressed.set_compression(modes.FILE, formats.ZSTD)
+    monkeypatch.setattr(rosbag2, "Writer", lambda *_, **__: compressed)
+    folder = write(tmp_path, "rosbag2", imu(Maker("rosbag2")))
+    (packed,) = folder.glob("*.zstd")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))  # which is not there
+    words = r"walk: is compressed as a whole .*; unpack its file \(zstd -d FILE\.zstd\) and import"
+    refused(folder, words)
+    unpacked = tmp_path / packed.stem
+    unpacked.write_bytes(zstd.decompress(packed.read_bytes()))
+    compare_imu(import_recording(unpacked)[0])
 
 
 def test_what_no_bag_is_read_for(tmp_path, monkeypatch):
