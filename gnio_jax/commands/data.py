@@ -178,8 +178,8 @@ def _json(row: Any) -> dict[str, Any]:
 def convert(asked: ConvertOptions, _call: options.Call) -> None:
     """A dataset as the package's HDF5: a file for each recording, a list for each split.
 
-    Recordings that fail the self-check are left out. The same command continues a conversion that
-    was stopped.
+    Recordings that fail the self-check are left out. The folder is written whole or not at all: a
+    conversion that was stopped leaves nothing, and the same command begins anew.
 
     examples:
       {prog} oxiod ~/converted/oxiod

@@ -227,6 +227,10 @@ def test_a_conversion_is_whole_or_not_there(root, reads, monkeypatch, capsys):
         app.main(command)
     assert left.value.code == 130 and "also" in reads
     assert sorted(path.name for path in root.parent.iterdir()) == ["heads"]
+    with pytest.raises(SystemExit):
+        app.main(["data", "convert", "--help"])
+    told = "a conversion that was stopped leaves nothing, and the same command begins anew"
+    assert told in " ".join(capsys.readouterr().out.split())
     monkeypatch.setattr(loading, "write_hdf5", real)
     run(*command)
     files = {path.name: path.read_bytes() for path in converted.iterdir()}
