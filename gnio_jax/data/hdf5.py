@@ -1,7 +1,8 @@
 """Sequences as HDF5, the package's own file format, and the cache, whose entries are such files.
 
 The cache keeps what is slow to make: parsed text, aligned clocks. Its folder is $GNIO_CACHE, else
-$XDG_CACHE_HOME/gnio-jax, else ~/.cache/gnio-jax; it may be deleted at any time.
+$XDG_CACHE_HOME/gnio-jax, else ~/.cache/gnio-jax; it may be deleted at any time. It holds one entry
+of each recording and form: a new one takes the place of those that nothing would read any more.
 """
 
 from __future__ import annotations
@@ -148,8 +149,9 @@ def cache_entry(name: str, files: Iterable[str | os.PathLike[str]]) -> Path:
     """The file that keeps the reading of the recording `name` (with its form) from these files.
 
     It has another name as soon as a file has another path, size or modification time, or a source
-    file of the package that takes part in reading is another. Raises `InputError` for a file that
-    is missing.
+    file of the package that takes part in reading is another. What stands before the "-" is that of
+    the recording, told by its name and its first file. Raises `InputError` for a file that is
+    missing.
     """
     states = []
     for file in files:
@@ -159,8 +161,11 @@ def cache_entry(name: str, files: Iterable[str | os.PathLike[str]]) -> Path:
         except OSError as error:
             raise InputError(path, f"cannot be read ({error.strerror})") from None
         states.append([str(path), status.st_size, status.st_mtime_ns])
-    key = hashlib.sha256(json.dumps([_sources(), name, states]).encode()).hexdigest()[:32]
-    return cache_folder() / f"{key}.h5"
+    recording, state = (
+        hashlib.sha256(json.dumps(each).encode()).hexdigest()[:32]
+        for each in ([name, [path for path, *_ in states[:1]]], [_sources(), states])
+    )
+    return cache_folder() / f"{recording}-{state}.h5"
 
 
 @functools.cache
@@ -175,14 +180,19 @@ def _sources() -> str:
 
 
 def write_reading(entry: Path, reading: Reading) -> None:
-    """Keep a reading without damage, whole or not at all. Where nothing can be written, recordings
-    are read every time."""
+    """Keep a reading without damage, whole or not at all, in the place of earlier ones of the same
+    recording. Where nothing can be written, recordings are read every time."""
     with contextlib.suppress(OSError), replacing(entry) as temporary:
         with h5py.File(temporary, "w") as file:
             file.attrs["notes"] = json.dumps(reading.notes)
             file.attrs["refusals"] = json.dumps(reading.refusals)
             for number, sequence in enumerate(reading.sequences):
                 _write(file.create_group(f"{number:04}"), sequence, entry)
+    recording, _, _ = entry.name.partition("-")
+    for other in entry.parent.glob(f"{recording}-*.h5"):
+        if other != entry:  # who reads it at this moment may finish, and who misses it reads anew
+            with contextlib.suppress(OSError):
+                other.unlink()
 
 
 def read_reading(entry: Path) -> Reading | None:

@@ -327,6 +327,25 @@ def test_a_changed_file_or_package_is_read_again(source, tmp_path, monkeypatch):
     assert call(reader, source, other) == 5
 
 
+def test_a_new_entry_takes_the_place_of_those_of_the_same_recording(source, cache, monkeypatch):
+    reader, form = Reader(), Recording("walk", Reader(), (source,), slow=True, form="syn")
+    call(reader, source)
+    call(reader, source, name="other")
+    read_recording(form)
+    before = set(cache.iterdir())
+    source.write_text("1,2,3,4")
+    call(reader, source)
+    assert len(before) == 3 and len(set(cache.iterdir()) & before) == 2
+    monkeypatch.setattr(hdf5, "_sources", lambda: "of another version")
+    call(reader, source)
+    after = set(cache.iterdir())
+    assert len(after) == 3 and len(after & before) == 2
+    for name in ("walk", "other"):
+        call(reader, source, name=name)
+    read_recording(form)
+    assert len(set(cache.iterdir())) == 3 and not set(cache.iterdir()) & before
+
+
 def test_the_sources_that_decide_what_is_read_are_part_of_the_key(monkeypatch):
     hdf5._sources.cache_clear()
     before, read = hdf5._sources(), Path.read_bytes
