@@ -52,6 +52,14 @@ def test_poses_of_every_kind_and_rate_come_to_the_imus_place(kind, rate):
     compare(found, 2e-3, 0.5, 0.05)
 
 
+def test_a_loss_is_not_valid_where_drifts_are_looked_for():
+    stamps = np.arange(0.0, 30.0, 1.0 / 60.0)
+    stamps = stamps[(stamps < 10.0) | (stamps > 10.5)]
+    poses = tracked(stamps, velocity=point_velocity(stamps))
+    found = reference_at(CLOCK, walk.rate(CLOCK), poses, max_drift=1e3)
+    assert not found.valid[(CLOCK > 10.0) & (CLOCK < 10.5)].any() and found.valid.mean() > 0.97
+
+
 @pytest.mark.parametrize("noisy", [False, True])
 def test_a_loss_is_not_valid_and_does_not_reach_its_surroundings(noisy):
     stamps = np.arange(0.0, 30.0, 1.0 / 60.0)

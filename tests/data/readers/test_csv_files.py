@@ -90,6 +90,14 @@ def test_rows_are_those_that_an_editor_shows(tmp_path):
             csv.read(path)
 
 
+def test_a_file_gives_its_recording_the_name(tmp_path):
+    """Two files of one name would be one recording, whatever stands in them."""
+    (sequence,) = csv.read(write_native(tmp_path / "walk.csv"))
+    data.write_hdf5(tmp_path / "again.h5", sequence)
+    (again,) = csv.read(tmp_path / "again.h5")
+    assert (sequence.name, again.name) == ("walk", "again")
+
+
 def test_all_columns_that_are_missing_are_told_with_the_command(tmp_path):
     path = tmp_path / "robot.csv"
     path.write_text("timestamp_ms,wx,wy,wz,Acc X (g),acc_y,what\n1,2,3,4,5,6,7\n2,2,3,4,5,6,7\n")

@@ -93,6 +93,10 @@ def test_packets_whose_names_have_no_leading_zeros_come_back(tmp_path):
         packet.rename(packet.with_name(f"{int(packet.stem)}.txt"))
     (sequence,) = kitti.read_packets(oxts)
     assert len(sequence.time) == 400 and sequence.valid.all()
+    # By their names the last is 99.txt, which has a stamp.
+    stamps = oxts / "timestamps.txt"
+    stamps.write_text("\n".join(stamps.read_text().splitlines()[:120]))
+    refused(lambda: kitti.read_packets(oxts), stamps, "holds 120 stamps", "a packet 399")
 
 
 def tenth(fields):
