@@ -83,6 +83,12 @@ class Dataset:
         """The splits that may be asked for at this root."""
         return self.list_splits(root) if self.list_splits else self.splits
 
+    def described(self, sequence: Sequence) -> Sequence:
+        """A sequence with the name and licence of its dataset; one that was converted keeps those
+        that it had."""
+        about = {"dataset": self.name, "licence": self.licence}
+        return sequence._replace(attributes=about | sequence.attributes)
+
 
 # --- by name
 

@@ -102,7 +102,7 @@ def read_split(
         if reading.damage is not None:
             _warn_of(refused)
             raise reading.damage
-        for sequence in reading.sequences:
+        for sequence in map(dataset.described, reading.sequences):
             if sequence.name in names:
                 problem = f"two sequences of split '{split}' have the name '{sequence.name}'"
                 raise InputError(root, problem, "rename or remove one of them")
@@ -367,6 +367,7 @@ def _check_and_draw(
 def check_recording(recording: Recording, dataset: Dataset) -> tuple[list[Checked], Reading]:
     """Read a recording and check its sequences; what is wrong with it is reported, not raised."""
     reading = read_recording(recording)
+    reading = reading._replace(sequences=[*map(dataset.described, reading.sequences)])
     checks = [(sequence.name, check_sequence(sequence, dataset)) for sequence in reading.sequences]
     if checks:
         return [Checked(name, (), c, "; ".join(c.failures)) for name, c in checks], reading

@@ -131,6 +131,23 @@ def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, da
     assert notes == [(text, UserWarning) for text in [*told, refused]]
 
 
+def test_a_sequence_says_whose_it_is_unless_it_was_converted(tmp_path):
+    def read(**attributes):
+        return [
+            circle(seconds=4.0)._replace(name="".join(attributes) or "own", attributes=attributes)
+        ]
+
+    about = dataset(
+        Recording("own", read), Recording("other", partial(read, dataset="oxiod", licence="theirs"))
+    )
+    for sequences in (
+        list(read_split(about, tmp_path, "test")),
+        [check_recording(each, about)[1].sequences[0] for each in about.recordings(None, "")],
+    ):
+        told = [(each.attributes["dataset"], each.attributes["licence"]) for each in sequences]
+        assert told == [("tlio", data.get("tlio").licence), ("oxiod", "theirs")]
+
+
 def test_recordings_that_are_left_out_for_one_reason_are_one_line(tmp_path):
     alike = [slow(tmp_path, name, refusal="holds 2 waypoints") for name in "bcd"]
     about = dataset(slow(tmp_path, "a"), *alike, slow(tmp_path, "e", refusal="its clock is ruined"))

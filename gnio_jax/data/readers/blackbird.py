@@ -67,7 +67,6 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
     upside_down = attitude.apply(accel).mean(axis=0)[2] < 0
     turn = Rotation.from_rotvec([np.pi if upside_down else 0.0, 0.0, 0.0])
     about = {
-        "dataset": "blackbird",
         "group": folder.parent.name,
         "session": "/".join(folder.parts[-4:-1]),
         "placement": "quadrotor",
@@ -75,7 +74,6 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
         "native_world": "z-down, turned" if upside_down else "z-up",
         "truth": "motion capture",
         "imu_compensated": "constant bias",
-        "licence": DATASET.licence,
     }
     velocity = velocity if velocity is None else turn.apply(velocity)
     poses = Poses(time, turn * attitude, turn.apply(pose[:, :3]), velocity, source=str(path))

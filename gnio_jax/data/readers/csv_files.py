@@ -132,7 +132,7 @@ def _streams(table: Table) -> Streams:
         if known.any():  # an attitude alone is no reference: it is the device's own
             own = quaternions(table.rotations(*attitude, rows=known))
             device = Samples(time[known], own, str(path))
-    about = {"dataset": "csv", "group": path.stem, "truth": "given" if poses else "none"}
+    about = {"group": path.stem, "truth": "given" if poses else "none"}
     return streams._replace(poses=poses, device=device, attributes=about)
 
 

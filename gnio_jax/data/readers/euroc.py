@@ -85,43 +85,30 @@ _SHORT = {
 
 def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording]:
     """The recordings of a split."""
-    about = _about(dataset)
     known = EUROC_SPLITS if dataset == "euroc" else TUMVI_SPLITS
-    wanted = "test" if split == "seen" else split
-    chosen = [
-        folder
-        for name, folder in find_sequences(root, about).items()
-        if _split_of(name, known) == wanted
-    ]
-    if not chosen:
+    split_of = {name: own for own, names in known.items() for name in names}
+    wanted, folders = "test" if split == "seen" else split, find_sequences(root)
+    chosen = [path for name, path in folders.items() if split_of.get(name, "test") == wanted]
+    if folders and not chosen:
         remedy = f"its sequences are {', '.join(known[wanted])}"
         raise InputError(root, f"holds no sequence of split '{split}'", remedy)
-    return [_recording(folder, about) for folder in chosen]
+    return [_recording(folder, dataset) for folder in chosen]
 
 
-def _about(dataset: str) -> Dataset:
-    return next(entry for entry in DATASETS if entry.name == dataset)
-
-
-def _recording(folder: Path, about: Dataset) -> Recording:
+def _recording(folder: Path, dataset: str) -> Recording:
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *REFERENCES)]
     files = [sensor / name for sensor in sensors for name in ("data.csv", "sensor.yaml")]
     return Recording(
         short_name(folder.name),
-        partial(_read_by_name, folder, about.name),
+        partial(read, folder, dataset),
         files=tuple(path for path in files if path.is_file()),
         slow=True,
-        form=about.name,
+        form=dataset,
     )
 
 
-def _read_by_name(folder: Path, dataset: str) -> list[Sequence]:
-    """Another process has a `Dataset` of its own: only the name goes there."""
-    return read(folder, _about(dataset))
-
-
-def find_sequences(root: Path, about: Dataset) -> dict[str, Path]:
-    """Short name -> folder of every sequence below `root`. Raises `InputError` when there is none.
+def find_sequences(root: Path) -> dict[str, Path]:
+    """Short name -> folder of every sequence below `root`.
 
     TUM-VI is published in two sizes of the images, `dataset-room1_512_16` and
     `dataset-room1_1024_16`: the walk is the same, and is taken once.
@@ -134,8 +121,6 @@ def find_sequences(root: Path, about: Dataset) -> dict[str, Path]:
                 "dataset-calib"
             ):
                 found.setdefault(short_name(mav.parent.name), mav.parent)
-    if not found:
-        raise InputError(root, "holds no mav0/imu0/data.csv", f"expected layout: {about.layout}")
     return dict(sorted(found.items()))
 
 
@@ -145,17 +130,12 @@ def short_name(folder: str) -> str:
     return match[1] if match else folder
 
 
-def _split_of(name: str, splits: dict[str, tuple[str, ...]]) -> str:
-    return next((split for split, names in splits.items() if name in names), "test")
-
-
 # --- one sequence
 
 
-def read(folder: Path, about: Dataset | None = None) -> list[Sequence]:
+def read(folder: Path, dataset: str = "euroc") -> list[Sequence]:
     """One sequence of its folder (the one that holds `mav0`). Raises `InputError` naming file and
     field."""
-    about = about or EUROC
     mav, name = folder / "mav0", short_name(folder.name)
     path = mav / "imu0" / "data.csv"
     table = read_table(path)
@@ -166,11 +146,9 @@ def read(folder: Path, about: Dataset | None = None) -> list[Sequence]:
         problem = f"has no reference ({' or '.join(REFERENCES)})/data.csv"
         raise InputError(mav, problem, "bring a recording without one into the dataset 'csv'")
     attributes = {
-        "dataset": about.name,
         "group": name,
-        "placement": "drone" if about is EUROC else "handheld",
+        "placement": "drone" if dataset == "euroc" else "handheld",
         "truth": "motion capture" if poses.noisy else "tracker and IMU, smoothed",
-        "licence": about.licence,
     }
     streams = Streams.of_imu(name, path, time, table.take(*GYRO), table.take(*ACCEL))
     streams = streams._replace(attributes=attributes, start=start * 1e-9, poses=poses)
@@ -296,5 +274,4 @@ TUMVI = Dataset(
     layout="<root>/dataset-<sequence>_512_16/mav0/{imu0,mocap0}/data.csv, stamps in ns",
     licence="CC BY 4.0",
 )
-DATASET = EUROC
 DATASETS = (EUROC, TUMVI)

@@ -170,7 +170,6 @@ def read(path: Path) -> list[Sequence]:
         problem = f"are out of step with 'iphoneGyro' by {LONGEST_POSE_LAG:g} s or more"
         raise Refusal(path, f"columns 'orient' {problem}")
     about = {
-        "dataset": "idol",
         "group": _name(path),
         "subject": "unknown",
         "building": path.parent.parent.name,
@@ -178,7 +177,6 @@ def read(path: Path) -> list[Sequence]:
         "placement": "handheld rig",
         "truth": "lidar-visual-inertial odometry (Kaarta Stencil)",
         "imu_compensated": "no",
-        "licence": DATASET.licence,
         "lag": fit.lag,
         "rate_correlation": fit.correlation,
         "tilt_degrees": tilt,

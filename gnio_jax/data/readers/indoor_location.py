@@ -95,14 +95,12 @@ def read(path: Path) -> list[Sequence]:
     )
     device = re.search(r"Brand:(\S+)\s+Model:(\S+)", header)
     about = {
-        "dataset": "indoor_location",
         "group": f"{path.parent.parent.parent.name}_{_floor(path)}",
         "subject": "unknown",
         "device": " ".join(device.groups()) if device else "Android phone",
         "placement": "handheld",
         "truth": "waypoints",
         "imu_compensated": "Android's gyro bias",
-        "licence": DATASET.licence,
     }
     streams = Streams(
         _name(path),

@@ -195,13 +195,11 @@ def _check_rate(time: Float[np.ndarray, " n"], path: Path) -> None:
 
 def _assembled(streams: Streams, drive: str, repairs: dict[str, float]) -> list[Sequence]:
     about = {
-        "dataset": "kitti",
         "group": drive,
         "session": drive[:10],
         "placement": "car",
         "truth": "INS with RTK-GPS (OXTS RT3003)",
         "imu_compensated": "reference",
-        "licence": DATASET.licence,
     }
     streams = streams._replace(attributes=about | repairs)
     return assemble(streams, RATE, max_drift=LARGEST_JUMP)

@@ -133,7 +133,6 @@ class Walk(NamedTuple):
         """What is known of the walk without reading it."""
         own = "user1" if self.scene in SINGLE_USER else "unknown"
         return {
-            "dataset": "oxiod",
             "scene": self.scene,
             "session": self.session,
             "group": self.session,
@@ -141,7 +140,6 @@ class Walk(NamedTuple):
             "subject": self.folder if self.scene == "multi users" else own,
             "device": self.folder if self.scene == "multi devices" else "iPhone 7 Plus",
             "placement": self.placement,
-            "licence": DATASET.licence,
         }
 
 

@@ -124,14 +124,12 @@ def read(folder: Path) -> list[Sequence]:
     streams = _from_table(folder) if table else _from_text_files(folder, arcore)
     words = re.findall("|".join(_PLACEMENTS), folder.name)
     about = {
-        "dataset": "ridi",
         "group": _subject(folder.name),
         "subject": _subject(folder.name),
         "device": "Android phone" if arcore and not table else "Tango phone",
         "placement": _PLACEMENTS[words[0]] if words else "unknown",
         "truth": f"{'ARCore' if arcore and not table else 'Tango'} VIO of the phone itself",
         "imu_compensated": "Android's gyro bias" if arcore and not table else "no",
-        "licence": DATASET.licence,
     }
     streams = streams._replace(attributes=about)
     pieces = assemble(streams, RATE, divide=True, max_speed=FASTEST_WALKER)

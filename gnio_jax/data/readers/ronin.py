@@ -98,7 +98,6 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
     orientation = chest[0] * rotations(on_chest) * followed[0].inv() * followed
 
     attributes = {
-        "dataset": "ronin",
         "group": folder.name.partition("_")[0],
         "subject": folder.name.partition("_")[0],
         "device": shortened(info.get("device", "unknown")),
@@ -107,7 +106,6 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
         "position_of": "chest",
         "orientation_source": source,
         "imu_compensated": "calibration of the recording's start",
-        "licence": DATASET.licence,
     }
     if isinstance(error, int | float) and abs(error) <= 360.0:
         attributes["orientation_error_degrees"] = float(error)

@@ -59,12 +59,10 @@ def read(folder: Path) -> list[Sequence]:
     to_body = attitude.inv()
     streams = Streams.of_imu(folder.name, path, time, to_body.apply(gyro), to_body.apply(accel))
     about = {
-        "dataset": "tlio",
         "group": folder.name,
         "placement": "head",
         "truth": "visual-inertial (VIO or motion capture)",
         "imu_compensated": "reference",
-        "licence": DATASET.licence,
     }
     poses = Poses(time, attitude, position, velocity, source=str(path))
     streams = streams._replace(attributes=about, start=start * 1e-6, poses=poses)

@@ -165,7 +165,6 @@ def read(folder: Path) -> list[Sequence]:
         raise Refusal(both, f"cannot be aligned with the phone ({error})") from None
     check_fit(fit, both, LIMITS)
     about = {
-        "dataset": "tyrex",
         "group": walk.person,
         "subject": walk.person,
         "device": walk.device,
@@ -173,7 +172,6 @@ def read(folder: Path) -> list[Sequence]:
         "gait": "running" if walk.way.startswith("Running") else "walking",
         "truth": "Qualisys",
         "imu_compensated": "no" if walk.device.startswith("iPhone") else "Android's gyro bias",
-        "licence": DATASET.licence,
         "accel_clipped": clipped(phone.accel.values),
         "lag": float(np.mean(fit.lag)),
         "accel_delay_removed": fit.accel_delay,

@@ -56,7 +56,6 @@ def test_an_estimate_comes_back_at_the_stamps_of_the_imu(tmp_path, header, step,
     assert time[0] == pytest.approx(1.005, abs=1e-6)
     assert time[-1] == pytest.approx(11.0 - step, abs=step + 0.005)
     assert sequence.valid.all() and sequence.name == "V1_01_easy"
-    assert sequence.attributes["dataset"] == "euroc"
     assert self_check(sequence, pedestrian=False).failures == ()
 
 
@@ -104,7 +103,7 @@ def test_a_mount_that_appears_makes_another_entry_of_the_cache_and_a_truth_is_ne
 def test_a_trackers_gaps_are_not_valid_and_its_attitudes_come_back(tmp_path):
     mav = tmp_path / "dataset-room1_512_16" / "mav0"
     recorded(mav, 24.0, bias=0.02, gaps=((5.0, 8.2), (12.0, 12.07), (15.0, 15.3)))
-    (sequence,) = euroc.read(mav.parent, euroc.TUMVI)
+    (sequence,) = euroc.read(mav.parent, "tumvi")
     # At the ends of a stretch the smoother has poses on one side alone.
     compare(sequence, speed=0.02, bias=0.02)
     time = known_time(sequence)
@@ -113,7 +112,7 @@ def test_a_trackers_gaps_are_not_valid_and_its_attitudes_come_back(tmp_path):
     gap = (time > 4.98) & (time < 8.22) | (time > 14.98) & (time < 15.32)
     assert sequence.valid[~gap].mean() > 0.995
     assert sequence.valid[(time > 12.0) & (time < 12.07)].all()
-    assert sequence.name == "room1" and sequence.attributes["dataset"] == "tumvi"
+    assert sequence.name == "room1" and sequence.attributes["placement"] == "handheld"
     assert self_check(sequence).failures == ()
 
 
@@ -122,7 +121,7 @@ def test_a_noisy_tracker_is_smoothed_and_its_flips_are_bridged(tmp_path):
     gaps, flips = ((12.0, 14.1), (18.0, 18.13)), (4.0, 10.0, 10.3, 17.5)
     mount = files.mount("ZXY", [80, -10, 15], [0.03, 0.06, -0.04])
     recorded(mav, 24.0, bias=-0.01, gaps=gaps, noise=1.0, flips=flips, mount=mount)
-    (sequence,) = euroc.read(mav.parent, euroc.TUMVI)
+    (sequence,) = euroc.read(mav.parent, "tumvi")
     time, valid = known_time(sequence), sequence.valid
     assert valid[(time < 11.9) | (time > 14.2)].mean() > 0.97
     turn = rotations(sequence.orientation[valid]).inv() * known_walk.attitude(time[valid])
@@ -150,7 +149,7 @@ def test_a_few_doubtful_poses_between_gaps_make_no_swing(tmp_path):
         return stamps[keep], values[keep]
 
     folder = recorded(tmp_path / "dataset-room1_512_16" / "mav0", 14.0, spoil=thin)
-    (sequence,) = euroc.read(folder, euroc.TUMVI)
+    (sequence,) = euroc.read(folder, "tumvi")
     time, valid = known_time(sequence), sequence.valid
     assert np.linalg.norm(sequence.position - known_walk.position(time), axis=1)[valid].max() < 0.03
     assert np.abs(sequence.velocity - known_walk.velocity(time))[valid].max() < 0.5

@@ -1,5 +1,4 @@
-"""At 40 to 60 Hz recordings are read by every reader as at the published rate; what no IMU does is one
-line."""
+"""Recordings at 40 to 60 Hz are read by every reader; what no IMU does is one line."""
 
 from __future__ import annotations
 

@@ -60,7 +60,6 @@ def test_a_walk_comes_back_in_the_phones_frame(tmp_path, start_frame):
     assert about == ("a011", "a011", "asus4", "chest")
     assert a["orientation_source"] == "game_rv"
     assert a["imu_compensated"] == "calibration of the recording's start"
-    assert "non-commercial" in a["licence"]
 
 
 @pytest.mark.parametrize(

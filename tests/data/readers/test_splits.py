@@ -210,7 +210,7 @@ def test_a_split_that_is_not_there_is_refused(copied, tmp_path, name, changes, s
         else:
             (root / place).rmdir() if (root / place).is_dir() else (root / place).unlink()
     with pytest.raises(InputError) as caught:
-        data.get(name).recordings(root, split)
+        next(data.load_each(name, root, split))
     assert str(caught.value).startswith(str(root)) and problem in str(caught.value)
 
 

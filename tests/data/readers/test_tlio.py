@@ -33,5 +33,4 @@ def test_imu_comes_back_in_the_body_frame_and_attitude_wxyz(tmp_path, columns):
     np.testing.assert_array_equal(sequence.velocity, velocity)
     assert sequence.valid.all() and sequence.name == "walk"
     assert sequence.attributes["imu_compensated"] == "reference"
-    assert sequence.attributes["licence"] == "CC BY-NC 4.0"
     assert data.self_check(sequence).failures == ()
