@@ -52,8 +52,8 @@ class Dataset:
     name: str
     """The name of `--dataset`."""
     recordings: Callable[[Path, str], list[Recording]]
-    """(root, split) -> its recordings, not yet read. The split is one that may be asked for. Raises
-    `InputError`."""
+    """(root, split) -> its recordings, not yet read. The split is one that may be asked for. Empty
+    where nothing of the dataset is there; raises `InputError` where only the split is missing."""
     splits: tuple[str, ...]
     """Known splits."""
     rate: float

@@ -302,7 +302,7 @@ def find_recordings(dataset: Dataset, root: Path, wanted: str) -> Found:
                 mistakes[split] = error
         for text in (str(each.message) for each in caught):
             found.notes.extend([text] if text not in found.notes else [])
-    if not found.recordings and mistakes:
+    if not found.recordings and len(mistakes) == (len(known) if wanted == "all" else 1):
         # Where a split takes everything, it says best why there is nothing.
         raise mistakes.get("all", next(iter(mistakes.values())))
     if not found.recordings:

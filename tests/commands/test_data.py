@@ -94,7 +94,7 @@ def test_list_tells_everything_and_reads_nothing(root, monkeypatch, capsys):
     assert "/tlio: 5 recordings (train 3, val 1, test 1)" in text.replace(" /tlio", "/tlio")
     assert "computed: 34 recordings (train 24, val 4, test 6)" in text
     assert f"{data.get('ronin').licence} here not found source" in text
-    assert "no recording (" in text and "holds no drive of KITTI" in text
+    assert "no recording (" in text and "split 'all' of dataset 'kitti' holds no recording" in text
     assert f"looked in {root.parent} and data" in out
 
 

@@ -83,13 +83,13 @@ _MOST = np.array(
 
 def recordings(root: Path, split: str) -> list[Recording]:
     """The drives of a split, or their pieces where these are files of their own."""
-    found = []
-    for drive, paths in find_drives(root).items():
+    found, drives = [], find_drives(root)
+    for drive, paths in drives.items():
         if share_of(drive) == split and paths[0].is_dir():
             found.append(Recording(drive, partial(read_packets, paths[0])))
         elif share_of(drive) == split:
             found += [Recording(_piece_name(path), partial(read_piece, path)) for path in paths]
-    if not found:
+    if drives and not found:
         problem = f"none of its drives falls into split '{split}'"
         raise InputError(root, problem, "take another split or more drives")
     return found
@@ -102,8 +102,8 @@ def share_of(drive: str) -> str:
 
 
 def find_drives(root: Path) -> dict[str, list[Path]]:
-    """Drive -> its folder of packets, or else its npz files. Raises `InputError` where there is no
-    drive, or only the 10 Hz export."""
+    """Drive -> its folder of packets, or else its npz files. Raises `InputError` where there is
+    only the 10 Hz export."""
     drives, slow = defaultdict[str, list[Path]](list), set()
     for depth in ("", "*/", "*/*/", "*/*/*/"):
         for path in sorted(root.glob(f"{depth}oxts")):
@@ -123,8 +123,6 @@ def find_drives(root: Path) -> dict[str, list[Path]]:
         if not drives:
             raise InputError(root, problem, remedy)
         warnings.warn(f"{root}: {problem}; left out; {remedy}", stacklevel=3)
-    if not drives:
-        raise InputError(root, "holds no drive of KITTI", f"expected layout: {DATASET.layout}")
     return dict(sorted(drives.items()))
 
 

@@ -147,18 +147,14 @@ class Walk(NamedTuple):
 
 
 def find_walks(root: Path) -> list[Walk]:
-    """Every walk below `root`, whose scenes may lie some folders deeper. Raises `InputError` when
-    there is none."""
-    walks = [
+    """Every walk below `root`, whose scenes may lie some folders deeper."""
+    return [
         walk
         for scene in (*SINGLE_USER, *UNSEEN, LARGE_SCALE)
         for place in _scene_folders(root, scene)
         for folder in sorted(path for path in place.iterdir() if path.is_dir())
         for walk in _walks_of(scene, folder)
     ]
-    if not walks:
-        raise InputError(root, "holds no recording of OxIOD", f"expected layout: {LAYOUT}")
-    return walks
 
 
 def _scene_folders(root: Path, scene: str) -> list[Path]:
@@ -215,8 +211,9 @@ def recordings(root: Path, split: str) -> list[Recording]:
         lists alone leave little to train on in a partial copy. A network trained on these has seen
         users and devices of `unseen`: evaluate it on `sessions_test` alone.
     """
-    chosen = select(find_walks(root), split, root)
-    if not chosen:
+    walks = find_walks(root)
+    chosen = select(walks, split, root) if walks else []
+    if walks and not chosen:
         remedy = "see the warnings above, or choose another split"
         raise InputError(root, f"no recording of split '{split}' is present", remedy)
     return [recording_of(walk) for walk in chosen]

@@ -123,14 +123,11 @@ def recordings(root: Path, split: str) -> list[Recording]:
     """
     found = find_folders(root, lambda folder: walk_of(folder) is not None)
     walks = [walk for folder in found.values() if (walk := walk_of(folder)) is not None]
-    if not walks:
-        layout = f"expected layout: {DATASET.layout}"
-        raise InputError(root, "holds no recording of Tyrex", layout)
-    walks = sorted((w for w in walks if split in ("all", _split(w))), key=lambda w: w.folder.name)
-    if not walks:
+    chosen = sorted((w for w in walks if split in ("all", _split(w))), key=lambda w: w.folder.name)
+    if walks and not chosen:
         people = f"'{TRAINS}' trains, and the other people validate and test"
         raise InputError(root, f"holds no walk of split '{split}'", f"complete the data: {people}")
-    return [_recording(walk) for walk in walks]
+    return [_recording(walk) for walk in chosen]
 
 
 def _split(walk: Walk) -> str:

@@ -179,7 +179,7 @@ WRONG = [
     ("ridi", {"deep/list_train_publish_v2.txt": "dan_bag1"}, "val", "would be empty"),
     ("ridi", {"deep/list_test_publish_v2.txt": None}, "test", "the list cannot be read"),
     ("idol", {f"deep/building1/train/{n}.feather": None for n in range(2, 10)}, "val", "0 of 1"),
-    ("idol", {"deep/building3/unknown/0.feather": None}, "unseen", "holds no recording in"),
+    ("idol", {"deep/building3/unknown/0.feather": None}, "unseen", "holds no sequence"),
     ("euroc", {"V1_02_medium/mav0/imu0/data.csv": None}, "val", "sequences are V1_02_medium"),
     ("tumvi", {}, "test", "holds no sequence of split 'test'"),
     ("kitti", {"train__2011_09_26_drive_0009_extract0.npz": None}, "val", "none of its drives"),
