@@ -12,6 +12,8 @@ from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
 FASTEST = 300.0
 """m/s: faster than anything that carries such an IMU."""
+FASTEST_WALKER = 6.0
+"""m/s: faster than this not a person walks but a visual odometry that relocalises."""
 LARGEST_STEP = 10.0
 """m by which positions that were held for a while, or corrected, may jump all the same."""
 FARTHEST = 1e8

@@ -34,7 +34,7 @@ from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.parsing.stamps import distinct
 from gnio_jax.data.parsing.tables import Table, damaged, json_object, read_feather, shortened
 from gnio_jax.data.splits import drawn
-from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, WINDOW_SECONDS
+from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE, WINDOW_SECONDS
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, levelling
 from gnio_jax.types import STANDARD_G, Sequence
@@ -49,8 +49,6 @@ PHONE_TO_RIG = Rotation.from_rotvec([-0.01853, 0.02801, 3.12916])
 x → −x, y → −y."""
 SHORTEST = 10.0
 """s of poses, and of the rig's accelerometer, that tell level and lag."""
-FASTEST_WALKER = 6.0
-"""m/s: faster than this not a person walks but an odometry that relocalises."""
 MAX_TILT = 20.0
 """Degrees by which the map may be tilted; beyond, the attitude is not what it should be."""
 

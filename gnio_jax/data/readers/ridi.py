@@ -30,13 +30,12 @@ from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
 from gnio_jax.data.parsing.tables import Table, read_text
 from gnio_jax.data.splits import find_folders, find_list, held_out, listed
+from gnio_jax.data.validation import FASTEST_WALKER
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import quaternions, rotations
 from gnio_jax.types import Sequence
 
 RATE = 200.0
-FASTEST_WALKER = 6.0
-"""m/s: faster than this not a person walks but a visual odometry that relocalises."""
 
 _TABLE = Path("processed") / "data.csv"
 _ARCORE = "android_sensor_pose.txt"

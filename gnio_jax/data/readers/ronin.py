@@ -27,13 +27,11 @@ from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.tables import damaged, json_object, read_hdf5_fields, shortened
 from gnio_jax.data.splits import find_folders, find_list, listed
-from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, check_increasing
+from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE, check_increasing
 from gnio_jax.numerics import integrate_gyro, quaternions, rotations
 from gnio_jax.types import Sequence
 
 RATE = 200.0
-FASTEST_WALKER = 6.0
-"""m/s: faster than this not a person walks but a visual odometry that relocalises."""
 MAX_GAME_ERROR = 20.0
 """Degrees by which the game rotation vector may end off the truth and still be preferred in
 training, as the authors have it."""
