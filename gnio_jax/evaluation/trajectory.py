@@ -194,5 +194,5 @@ def _read_columns(path: Path, names: str) -> Table:
         problem = f"has {table.width()} columns, not {len(known)}"
         raise InputError(path, problem, f"they are {names}")
     table = table.renamed(known)
-    check_increasing(table.take("t"), path)
+    check_increasing(table.take("t"), path, table.row)
     return table
