@@ -14,10 +14,12 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
 
     Results go to WORKDIR/eval/<dataset>_<split>_<estimator>/: metrics.json, metrics.csv,
     trajectories/ and references/ in TUM format (for evo), plots/, and report.html, a page with map,
-    curves and a time slider. Every table has two rows to compare with: never_moves, the start pose
-    throughout, and perfect_displacements, the same estimator fed with the reference's
-    displacements. A walk that has waypoints and no poses is compared with its waypoints. A run that
-    has learnt from several datasets is evaluated on one of them, which --dataset names.
+    curves and a time slider. Figures that stand there of another --data-root are kept: then the
+    folder's name ends with that of the data. Every table has two rows to compare with: never_moves,
+    the start pose throughout, and perfect_displacements, the same estimator fed with the
+    reference's displacements. A walk that has waypoints and no poses is compared with its
+    waypoints. A run that has learnt from several datasets is evaluated on one of them, which
+    --dataset names.
 
     examples:
       {prog}                       the newest run below runs/

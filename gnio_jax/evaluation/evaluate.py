@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import math
 import zlib
 from importlib.metadata import version
@@ -134,7 +135,7 @@ def evaluate(
         left_out,
         {each.name: each.placement for each in recordings if each.placement},
     )
-    folder = workdir / "eval" / folder_name(config, run.config)
+    folder = folder_of(workdir, config, run.config)
     write(folder, report, estimates, run.config, command, config.plots, stage("drawing"))
     return Evaluation(report, estimates, recordings, folder)
 
@@ -190,16 +191,29 @@ def _usual_orientation(config: EvaluateConfig) -> Orientation:
     return "reference" if _infers(config) else "filter"
 
 
+def folder_of(workdir: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
+    """The folder of a run for the results of a resolved `config`. One that holds figures of other
+    recordings keeps them: then the name ends with the place of these, also from now on."""
+    folder = workdir / "eval" / folder_name(config, run)
+    if config.data_root is None:
+        return folder
+    place = Path(config.data_root)
+    own = folder.with_name(f"{folder.name}_{place.name}-{zlib.crc32(bytes(place)):08x}-root")
+    try:
+        there = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        taken = there["settings"]["data_root"] != config.data_root
+    except (OSError, ValueError, LookupError, TypeError):  # nothing that names its recordings
+        taken = False
+    return own if taken or own.exists() else folder
+
+
 def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     """<dataset>_<split>_<estimator>, then every choice of a resolved `config` that is not the
-    default: other figures never take the place of these."""
+    default."""
     usual = vars(EvaluateConfig(orientation=_usual_orientation(config)))
     own = vars(config)
     parts = [config.dataset, config.split, config.estimator]
     parts += [text.format(own[x]) for x, text in NAMED.items() if own[x] != usual[x]]
-    if config.data_root and not _is_usual_root(config.dataset, config.data_root, run):
-        root = Path(config.data_root)
-        parts.append(f"{root.name}-{zlib.crc32(str(root).encode()):08x}-root")
     if config.estimator != "integrate":
         trained, own = configuration.flat(run.filter), configuration.flat(config.filter)
         for name in {**trained, **own}:
@@ -208,16 +222,6 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
                 text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
                 parts.append(f"{name}-{text}")
     return "_".join(map(str, parts))
-
-
-def _is_usual_root(dataset: str, root: str, run: TrainConfig) -> bool:
-    """Whether a folder of data is the one that an evaluation takes where none is named, or bears
-    the name of its dataset where there is no such folder."""
-    try:
-        own = run.data_root if dataset in run.datasets else None
-        return Path(root) == data.find_root(dataset, own).resolve()
-    except InputError:
-        return Path(root).name in (data.get(dataset).folders or (dataset,))
 
 
 def _settings(

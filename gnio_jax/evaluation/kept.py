@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from gnio_jax import config as configuration
 from gnio_jax.config import EvaluateConfig, plain
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.evaluate import evaluate, folder_name, resolve
+from gnio_jax.evaluation.evaluate import evaluate, folder_of, resolve
 from gnio_jax.evaluation.report import Report, read
 from gnio_jax.reporting import Reporter
 
@@ -44,7 +44,7 @@ def look(config: EvaluateConfig) -> Kept:
         run = checkpoint.load_run(workdir, config.checkpoint)
         trained = run.config
     config = resolve(config, trained)
-    folder = workdir / "eval" / folder_name(config, trained)
+    folder = folder_of(workdir, config, trained)
     report, problem = None, "it is not evaluated yet"
     if (folder / "metrics.json").exists():
         try:

@@ -15,10 +15,11 @@ from gnio_jax import data
 from gnio_jax.config import EvaluateConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import evaluate, report
-from gnio_jax.evaluation.evaluate import folder_name, resolve
+from gnio_jax.evaluation.evaluate import folder_name, folder_of, resolve
 from tests.support import tiny_run
 from tests.support.estimators import CONFIG, with_waypoints
 from tests.support.filter_settings import changed
+from tests.support.reports import report_of, write_report
 
 ROOT = Path(__file__).parents[2]
 TRAINED = TrainConfig(
@@ -184,22 +185,28 @@ def test_folders_tell_choices_apart(asked, name):
     assert name_of(**asked) == f"synthetic_test_{name}"
 
 
-def test_recordings_of_another_folder_have_a_folder_of_their_own(tmp_path, monkeypatch):
-    """The run's own recordings are those of A; B1 and B2 bear one name."""
-    roots = [tmp_path / name for name in ("A", "1/B", "2/B", "csv")]
+def test_figures_of_other_recordings_are_left_alone(tmp_path, monkeypatch):
+    """Also where both folders of data bear the dataset's name, and where $GNIO_DATA names them."""
+    roots = [tmp_path / name / "csv" for name in "ABC"]
     for root in roots:
         root.mkdir(parents=True)
+
+    def evaluated(**asked):
+        config = resolve(EvaluateConfig("w", dataset="csv", **asked), TRAINED)
+        folder = folder_of(tmp_path / "run", config, TRAINED)
+        of = {"data_root": config.data_root, "definitions": 1}  # of an older version, too
+        return write_report(folder, report_of({"a": 1.0}, {"a": "x"}, **of))
+
+    folders = [evaluated(data_root=str(root)) for root in roots]
+    assert folders[0].name == "csv_test_ekf" and len(set(folders)) == 3
+    assert all(each.name.startswith("csv_test_ekf_csv-") for each in folders[1:])
     monkeypatch.chdir(tmp_path)
-    run = dataclasses.replace(TRAINED, dataset="csv", data_root="A")
-    names = [name_of(run, data_root=str(root)) for root in roots]
-    assert names[0] == name_of(run) == name_of(run, data_root="A/../A") == "csv_test_ekf"
-    assert len(set(names)) == 4 and all("_B-" in name for name in names[1:3])
-    # A run on other recordings: where nothing is usual, a folder of the dataset's own name is.
-    names = [name_of(data_root=str(root), dataset="csv") for root in roots]
-    assert len(set(names)) == 4 and names[3] == "csv_test_ekf"
-    assert resolve(EvaluateConfig("w", dataset="csv", data_root="A"), TRAINED).data_root == str(
-        tmp_path / "A"
-    )
+    for own, root in zip(folders, roots, strict=True):
+        assert evaluated(data_root=f"A/../{root.relative_to(tmp_path)}") == own
+        monkeypatch.setenv("GNIO_DATA", str(root.parent))
+        assert evaluated() == own
+    shutil.rmtree(folders[0])
+    assert evaluated(data_root=str(roots[1])) == folders[1]  # its figures stand in one place
     assert resolve(EvaluateConfig("w", data_root="A"), TRAINED).data_root is None  # it is computed
 
 
