@@ -58,6 +58,18 @@ class Row(NamedTuple):
         """How its trajectories are estimated."""
         return " and ".join(dict.fromkeys(tabulate.way(each.settings) for each in self.reports))
 
+    def recordings(self, metric: str | None = None) -> set[str]:
+        """Those that all seeds have, also with a value of a metric."""
+        found = [
+            {
+                n
+                for n, own in each.scores.items()
+                if not metric or own.values.get(metric) is not None
+            }
+            for each in self.reports
+        ]
+        return set.intersection(*found)
+
 
 class Comparison(NamedTuple):
     """What a comparison shows."""
@@ -101,6 +113,10 @@ def compare(
     ]
     reports = [report for row in rows for report in row.reports]
     _check_recordings([source.folder for source in sources], reports)
+    for row in rows[1:]:
+        if not row.recordings() & rows[0].recordings():
+            problem = f"shares no recording with {rows[0].label} that all seeds have"
+            raise InputError(row.label, problem, "compare evaluations of the same recordings")
     cells = tabulate.cells([row.reports for row in rows], _metrics(reports, config.metrics))
     return Comparison(rows, cells)
 
@@ -230,15 +246,21 @@ def title(found: Comparison) -> str:
 
 
 def lines(found: Comparison) -> list[list[str]]:
-    """The cells of `HEADER`: each metric's rows one below the other."""
+    """The cells of `HEADER`: each metric's rows one below the other. Means that are not over the
+    same recordings say over how many they are."""
     table = []
     for metric, cells in found.cells.items():
         column = tabulate.column(metric)
+        alike = all(
+            row.recordings(metric) == found.rows[0].recordings(metric) for row in found.rows
+        )
         for place, (row, (mean, difference)) in enumerate(zip(found.rows, cells, strict=True)):
             better = ""
             if difference and difference.compared and not difference.withheld:
                 better = f"{difference.better} of {difference.compared}"
-            head = ["" if place else column.title, row.label, tabulate.mean(mean, column.digits)]
+            text = tabulate.mean(mean, column.digits)
+            text += "" if alike else f" over {mean.sequences}"
+            head = ["" if place else column.title, row.label, text]
             table.append([*head, tabulate.difference(difference, column.digits), better])
     return table
 
@@ -255,6 +277,17 @@ def explanations(found: Comparison) -> list[str]:
     if len({row.way for row in rows}) > 1:
         ways = "; ".join(f"{row.label}: {row.way}" for row in rows)
         remarks.append(f"The rows were estimated with different settings: {ways}.")
+    first = rows[0].recordings()
+    if any(row.recordings() != first for row in rows):
+        others = "; ".join(
+            f"{row.label} has {len(row.recordings() & first)} of them and "
+            f"{len(row.recordings() - first)} others"
+            for row in rows[1:]
+        )
+        remarks.append(
+            "The rows are not of the same recordings, so their means cannot be compared, only "
+            f"their differences. {rows[0].label} has {len(first)}; {others}."
+        )
     if options := filter_options(found):
         remarks.append(f"The rows differ in options of the filter: {', '.join(options)}.")
     return remarks + tabulate.marks(cells)

@@ -77,6 +77,33 @@ def test_what_diverged_is_counted_and_in_no_difference(runs):
     assert any(said.startswith("‡ ") for said in comparison.explanations(found))
 
 
+def test_means_over_other_recordings_say_so(runs):
+    """a and c against b and c; of d and e there is nothing to compare."""
+    groups = dict.fromkeys("abcde", "ann")
+    write(runs / "more", {"b": 5.0, "c": 3.0}, groups=GROUPS)
+    for row, ates in (("few", {"a": 1.0, "c": 5.0}), ("others", {"d": 1.0, "e": 2.0})):
+        write(runs / row, ates, groups=groups | GROUPS)
+    found = compare(runs / "few", runs / "more")
+    assert comparison.lines(found) == [
+        ["ATE (m)", "few", "3.00 over 2", "", ""],
+        ["", "more", "4.00 over 2", "-2.00 over 1", "1 of 1"],
+    ]
+    said = comparison.explanations(found)
+    assert (
+        "not of the same recordings" in said[1]
+        and "few has 2; more has 1 of them and 1 others" in said[1]
+    )
+    found = comparison.lines(compare(runs / "plain_s0", runs / "new"))
+    assert not any("over" in cell for line in found for cell in line)
+    with pytest.raises(InputError, match=r"^others: shares no recording with few"):
+        compare(runs / "few", runs / "others")
+    # Nor have the seeds of one row a mean, if they have no recording in common.
+    write(runs / "odd_s0", {"a": 1.0})
+    write(runs / "odd_s1", {"c": 1.0})
+    with pytest.raises(InputError, match=r"^odd: shares no recording with few"):
+        compare(runs / "few", runs / "odd")
+
+
 def test_a_comparison_knows_which_value_is_best(runs, monkeypatch):
     column = tabulate.COLUMNS["ate"]._replace(best=4.0)
     monkeypatch.setitem(tabulate.COLUMNS, "ate", column)
