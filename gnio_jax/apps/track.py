@@ -237,7 +237,12 @@ def summarise(
 def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
     """What makes the track worth less than its figures."""
     accepted = 1.0 if summary.accepted is None else summary.accepted
-    covered = summary.errors.get("nees_coverage_2d")
+    covered = {
+        "place": summary.errors.get("nees_coverage_2d"),
+        "place and height": summary.errors.get("nees_coverage"),
+    }
+    shares = {of: share for of, share in covered.items() if share is not None}
+    worst = min(shares, key=shares.__getitem__, default="")
     speed = summary.path_length / max(summary.seconds, 1e-9)
     found = {
         f"rate: recorded at {own_rate:.4g} Hz, the network was trained at {rate:g} Hz: the "
@@ -254,8 +259,8 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
         f"speed: {speed:.1f} m/s in the mean is faster than people walk: the track is wrong": (
             speed > FASTEST
         ),
-        f"errors: larger than the filter says: its 95 % region holds the reference in "
-        f"{covered or 0.0:.0f} % of the rows": covered is not None and covered < COVERED,
+        f"errors: larger than the filter says: its 95 % region of {worst} holds the reference in "
+        f"{shares.get(worst, 0.0):.0f} % of the rows": shares.get(worst, 100.0) < COVERED,
     }
     return [text for text, applies in found.items() if applies]
 
@@ -315,6 +320,8 @@ def _draw(
     title = f"{shown_name(summary.recording)}: {length}, expected error at the end {expected}"
     plots.save(folder / "track.png", plots.sequence(seen, title))
     aligned = "start position and yaw" if found.waypoints is None else tabulate.TO_WAYPOINTS
+    known = np.isfinite(found.reference.position).all(axis=1).mean()
+    partly = f"known for {known:.0%} of the time: errors and ratios are of this part"
     about = {
         "command": command,
         "walked": f"{length}, ends {summary.from_start:.1f} m from the start",
@@ -322,13 +329,12 @@ def _draw(
         "weights": f"{summary.weights}, trained on {summary.trained_on}",
         "window orientation": "filter",
         "alignment": aligned if summary.errors else "",
+        "reference": partly if 0 < known < 1 else "",
         "windows": tabulate.windows(dataclasses.asdict(config.data)),
     }
-    figures = summary.errors or {
-        "duration": summary.seconds,
-        "path_length": summary.path_length,
-        "accepted": None if summary.accepted is None else 100.0 * summary.accepted,
-    }
+    figures = {"accepted": None if summary.accepted is None else 100.0 * summary.accepted}
+    # Of the whole track, also where a reference knows only a part of it.
+    figures |= summary.errors | {"duration": summary.seconds, "path_length": summary.path_length}
     warnings = (f"warning: {each}" for each in summary.warnings)
     run = page.Run(
         "track",

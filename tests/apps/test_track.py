@@ -218,6 +218,24 @@ def test_a_recording_with_waypoints_is_compared_with_them(gnio, runs, tmp_path):
     assert "at waypoints" in page and "one turn and one shift" in page
 
 
+def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, monkeypatch):
+    """The page has the length of the track, and says of how much the errors are."""
+    shown = []
+    monkeypatch.setattr("gnio_jax.evaluation.page.write", lambda *given: shown.extend(given[2]))
+    time = np.delete(np.arange(620), np.s_[560:580]) / 100
+    known = (time >= 2.0) & (time < 3.5)
+    place, level = known_walk.position(time), np.tile([1.0, 0, 0, 0], (len(time), 1))
+    poses = {"position": place, "velocity": known_walk.velocity(time), "orientation": level}
+    poses = {name: np.where(known[:, None], values, np.nan) for name, values in poses.items()}
+    write_hdf5(tmp_path / "part.h5", without_poses("part", time)._replace(valid=known, **poses))
+    gnio("track", tmp_path / "part.h5", "--weights", runs / "walker", "--out", tmp_path / "t")
+    summary = summary_of(tmp_path / "t")
+    figures = shown[0].figures["part"]
+    assert figures["ate"] == summary["errors"]["ate"]
+    assert figures["path_length"] == summary["path_length"] != summary["errors"]["path_length"]
+    assert shown[0].about["reference"].startswith("known for 24% of the time")
+
+
 def test_a_raw_gyro_and_a_run_are_warned_of(gnio, undrawn, runs, tmp_path):
     """The recording shakes as a runner's after its first second, and does not begin at rest. What
     was not measured is no part of the share."""
@@ -260,7 +278,14 @@ SUMMARY = Summary(
         ({"climb": 4.26}, "height: it changes by 4.3 m: that is drift unless"),
         ({"path_length": 400.0}, "speed: 4.0 m/s in the mean"),
         ({"errors": {"nees_coverage_2d": 88.0}}, None),
-        ({"errors": {"nees_coverage_2d": 7.0}}, "errors: larger than the filter says: its 95 %"),
+        (
+            {"errors": {"nees_coverage_2d": 7.0, "nees_coverage": 8.0}},
+            "errors: larger than the filter says: its 95 % region of place holds the reference in",
+        ),
+        (
+            {"errors": {"nees_coverage_2d": 100.0, "nees_coverage": 5.3}},
+            "errors: larger than the filter says: its 95 % region of place and height holds the",
+        ),
     ],
 )
 def test_what_is_worth_a_warning(changes, words):
