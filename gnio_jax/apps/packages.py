@@ -80,9 +80,7 @@ class Weights(NamedTuple):
     name: str
     run: Run
     about: str
-    """What it was trained on, and the error that was measured of it."""
-    measured: str
-    """That error alone; empty where there is none."""
+    """What it was trained on, and the error that was measured of it, where one was."""
 
 
 # --- where packages are found
@@ -144,7 +142,7 @@ def choose(which: str | Path | None = None) -> Weights:
         except InputError:
             measured = ""  # a damaged evaluation keeps nobody from tracking
     about = f"{trained_on}, whose {measured}" if measured else trained_on
-    return Weights(name, run, about, measured)
+    return Weights(name, run, about)
 
 
 # --- reading

@@ -190,7 +190,6 @@ def summarise(
     if ekf.considered is None:
         counted = "without consider covariance (gnio calibrate fits it), "
         counted += "so the real error is probably larger"
-    measured = f", whose {weights.measured}" if weights.measured else ""
     summary = Summary(
         recording=sequence.name,
         weights=weights.name,
@@ -208,8 +207,8 @@ def summarise(
         warnings=(),
         notes=(*recording.notes, *ready.notes),
         limits=f"limits: {length:.1f} m in {seconds:.0f} s; expected error at the end "
-        f"{error:.1f} m{share} by the filter, {counted}; weights {weights.name}{measured}; place "
-        "and heading are relative to the start",
+        f"{error:.1f} m{share} by the filter, {counted}; weights {weights.name}; place and heading "
+        "are relative to the start",
     )
     if np.isfinite(found.reference.position).any() or found.waypoints is not None:
         summary = summary._replace(errors=metrics.score([found])[found.name].values)
@@ -335,13 +334,13 @@ def _draw(
     figures = {"accepted": None if summary.accepted is None else 100.0 * summary.accepted}
     # Of the whole track, also where a reference knows only a part of it.
     figures |= summary.errors | {"duration": summary.seconds, "path_length": summary.path_length}
-    warnings = (f"warning: {each}" for each in summary.warnings)
     run = page.Run(
         "track",
         {name: text for name, text in about.items() if text},
         [seen],
         {seen.name: figures},
-        remarks=(*warnings, summary.limits, *summary.notes),
+        warnings=summary.warnings,
+        remarks=(summary.limits, *summary.notes),
         settings=configuration.text(config),
     )
     page.write(folder / "report.html", summary.recording, [run])

@@ -72,6 +72,7 @@ def track(asked: TrackOptions, call: options.Call) -> None:
     console.say(_table(found.summary))
     for warning in found.summary.warnings:
         console.say(f"warning: {warning}")
+    console.say(f"weights: {weights.name}, trained on {weights.about}")
     console.say(found.summary.limits)
     console.say(f"results: {found.folder} (look at track.png, report.html)")
 

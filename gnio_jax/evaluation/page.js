@@ -1,5 +1,5 @@
 // Runs when the figures are drawn. `columns[run][sequence]` holds the data of the page; `paths`,
-// `marks`, `starts` and `corners` are what the figures draw.
+// `marks`, `starts` and `corners` are what the figures draw, `along` the strip over distance.
 const sequence = document.getElementById("sequence");
 const slider = document.getElementById("time");
 const readout = document.getElementById("readout");
@@ -33,6 +33,28 @@ function move() {
   readout.textContent = parts.join("  ·  ");
 }
 
+// A legend names what the chosen sequence has: a renderer is called like its decisive column.
+function explain() {
+  const drawn = (renderer) => {
+    const data = renderer.data_source === marks ? shown(0) : renderer.data_source.data;
+    return !(renderer.name in data) || data[renderer.name].some(Number.isFinite);
+  };
+  for (const legend of legends) {
+    for (const item of legend.items) item.visible = item.renderers.some(drawn);
+  }
+  if (along) along.visible = shown(0).error.some(Number.isFinite);
+}
+
+// A legend stands in one line where that is wide enough.
+function fit() {
+  const width = document.querySelector(".figures > div").clientWidth - 70;  // of the axis
+  for (const legend of legends) {
+    const wide = legend.items.filter((item) => item.visible)
+      .reduce((sum, item) => sum + 32 + 6.5 * item.label.value.length, 0);
+    legend.orientation = wide > width ? "vertical" : "horizontal";
+  }
+}
+
 // The curves of the chosen sequence, at its end.
 function choose() {
   paths.forEach((path, run) => { path.data = shown(run); });
@@ -51,9 +73,12 @@ function choose() {
   distances.setv({start: 0, end: Math.max(first.distance[last], 1e-3)});
   rows.forEach((row) => row.classList.toggle("chosen", row.dataset.sequence === sequence.value));
   move();
+  explain();
+  fit();
 }
 
 slider.addEventListener("input", move);
+window.addEventListener("resize", fit);
 sequence.addEventListener("change", () => { choose(); plan.reset.emit(); });
 rows.forEach((row) => row.addEventListener("click", () => {
   sequence.value = row.dataset.sequence;

@@ -7,6 +7,8 @@ this module only where a page is written.
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -21,6 +23,7 @@ from bokeh.plotting import figure as new_figure
 from bokeh.resources import Resources
 from jaxtyping import Float
 from jinja2 import Environment
+from markupsafe import Markup
 
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import colours, metrics, plots, tabulate
@@ -34,12 +37,16 @@ ROWS, FEWEST_ROWS = 9000, 150
 Fifteen minutes at ten rows a second are whole; what is longer is thinned."""
 SAME = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "step")
 """Settings in which evaluations are alike that stand side by side."""
+LATER = ("command", "weights")
+"""What is told of the first run elsewhere than under the title."""
 STRIPS = {"gate": "gate γ (–)", "scale": "scale (–)", "std": "σ of network (m)"}
 """Curves with a value for each axis of the window's yaw frame, and their labels."""
 LEVELS = (("mean", 3.0, colours.GREEN), ("refused above", 11.345, colours.VERMILION))
 """Of the NIS of three axes: the mean of χ², and what the filter refuses by default."""
 MAP_HEIGHT, STRIP_HEIGHT, LABEL_HEIGHT, LEFT = 560, 158, 30, 62
 WAYPOINT = {"marker": "x", "color": colours.REFERENCE, "line_width": 2.0}
+LONGEST_LABEL = 45
+"""Letters in a line of a legend: a phone has room for them."""
 LONG = 1e6
 """Longer than a recording, s."""
 GO_THERE = """
@@ -66,8 +73,10 @@ class Run(NamedTuple):
     """By sequence."""
     summary: dict[str, Figures] = {}
     """Row below the sequences (mean, median, ...) → its metrics."""
+    warnings: tuple[str, ...] = ()
+    """What makes it worth less than it looks: it stands above the figures."""
     remarks: tuple[str, ...] = ()
-    """What a reader should know."""
+    """What else a reader should know."""
     settings: str = ""
     """Everything that was configured, as text of several lines."""
 
@@ -90,8 +99,8 @@ def of_report(
         views,
         {sequence: measures.values for sequence, measures in report.scores.items()},
         rows,
-        tuple(tabulate.remarks(report)),
-        settings,
+        remarks=tuple(tabulate.remarks(report)),
+        settings=settings,
     )
 
 
@@ -138,11 +147,13 @@ def render(title: str, runs: list[Run]) -> str:
     document, names = _document(runs, [_held(run, sequences, rows) for run in runs])
     script, figures = components(document.roots)
     shown = [x for x in COLUMNS if any(x in own for run in runs for own in run.figures.values())]
-    page = Environment(autoescape=True).from_string(_file("page.html"))
+    environment = Environment(autoescape=True)
+    environment.filters["breakable"] = _breakable
+    page = environment.from_string(_file("page.html"))
     about = runs[0].about
     return page.render(
         title=title,
-        subtitle="; ".join(f"{name}: {text}" for name, text in about.items() if name != "command"),
+        subtitle="; ".join(f"{name}: {text}" for name, text in about.items() if name not in LATER),
         command=about.get("command"),
         sequences=sequences,
         runs=[run._asdict() | {"colour": colours.COLOURS[place]} for place, run in enumerate(runs)],
@@ -153,6 +164,11 @@ def render(title: str, runs: list[Run]) -> str:
         library=Resources(mode="inline", components=["bokeh"]).render_js(),
         script=script,
     )
+
+
+def _breakable(name: str) -> Markup:
+    """A name that a browser breaks after its own marks, and not inside its words."""
+    return Markup("<wbr>").join(re.findall(tabulate.PARTS, name))
 
 
 def _file(name: str) -> str:
@@ -220,23 +236,20 @@ def walked(
 
 def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
     """Corners of what the map shows of a sequence: the paths of all runs, and the ellipses of the
-    first, which may reach over the paths by the size of these."""
+    first."""
     views = [seen for run in runs for seen in run.views if seen.name == sequence]
+    variance = np.diagonal(views[0].covariance, axis1=1, axis2=2)[:, :2]
+    reach = np.nan_to_num(colours.SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
+    own = views[0].position[:, :2]
     parts = [
         part[:, :2]
         for seen in views
         for part in (seen.position, seen.reference, seen.taps.position)
     ]
-    points = np.concatenate(parts)
+    points = np.concatenate([own - reach, own + reach, *parts])
     points = points[np.isfinite(points).all(1)] if np.isfinite(points).any() else np.zeros((1, 2))
-    low, high = points.min(0), points.max(0)
-    size = max(float((high - low).max()), 1.0)
-    variance = np.diagonal(views[0].covariance, axis1=1, axis2=2)[:, :2]
-    reach = np.nan_to_num(colours.SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
-    ends = [np.nan_to_num(views[0].position[:, :2] + side * reach) for side in (-1.0, 1.0)]
-    low = np.maximum(np.minimum(ends[0].min(0), low), low - size)
-    high = np.minimum(np.maximum(ends[1].max(0), high), high + size)
-    return {"x": [float(low[0]), float(high[0])], "y": [float(low[1]), float(high[1])]}
+    (low_x, low_y), (high_x, high_y) = points.min(0).tolist(), points.max(0).tolist()
+    return {"x": [low_x, high_x], "y": [low_y, high_y]}
 
 
 # --- the figures
@@ -274,7 +287,8 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
         (path, run.name, own) for path, run, own in zip(sources.paths, runs, palette, strict=True)
     ]
     figures: dict[str, Any] = {"map": _draw_map(drawn, sources, known, tapped)}
-    errors = [(path, "error", name, colour) for path, name, colour in drawn if known]
+    label_of_error = "error" if len(runs) == 1 else ""  # of several the map names the colours
+    errors = [(path, "error", label_of_error, colour) for path, _, colour in drawn if known]
     label = "error (m)" if known or tapped else "3σ (m)"
     if known:
         figures["distance"] = _draw_strip(sources, distances, label, errors, "distance", band=True)
@@ -298,11 +312,20 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     document = Document()
     for root in figures.values():
         document.add_root(root)
+    drawings = [figures["map"], *([figures["distance"]] if known else []), *strips]
+    for place, line in enumerate(figures["map"].select(name="x")):
+        # What the legend of the map hides is hidden everywhere.
+        for drawing in drawings[1:]:
+            for other in drawing.select(name="error"):
+                if other.data_source is sources.paths[place]:
+                    line.js_link("visible", other, "visible")
     arguments = {
         **sources._asdict(),
         "columns": [[ColumnDataSource(own) for own in of_run] for of_run in held],
         "frames": [frame(runs, seen.name) for seen in runs[0].views],
         "plan": figures["map"],
+        "legends": [drawing.legend[0] for drawing in drawings if drawing.legend],
+        "along": figures.get("distance"),
         "times": times,
         "distances": distances,
     }
@@ -329,17 +352,20 @@ def _draw_map(
     plan.x_range, plan.y_range = DataRange1d(renderers=[corners]), DataRange1d(renderers=[corners])
     if known:
         black = {"color": colours.REFERENCE, "line_width": 2.0, "legend_label": "reference"}
-        plan.line("reference_x", "reference_y", source=sources.paths[0], **black)
+        path = {"source": sources.paths[0], "name": "reference_x"}
+        plan.line("reference_x", "reference_y", **path, **black)
     if tapped:
         ends = {"x0": "x", "y0": "y", "x1": "waypoint_x", "y1": "waypoint_y"}
         label = {"source": sources.paths[0], "legend_label": "waypoint, error"}
+        label |= {"name": "waypoint_x"}
         plan.segment(**ends, color=colours.VERMILION, line_width=1.2, **label)
         plan.scatter("waypoint_x", "waypoint_y", size=9, **WAYPOINT, **label)
     for path, name, colour in drawn:
-        plan.line("x", "y", source=path, color=colour, line_width=1.8, legend_label=name)
+        label = textwrap.fill(name, LONGEST_LABEL)
+        plan.line("x", "y", source=path, color=colour, line_width=1.8, legend_label=label, name="x")
     contour = {"line_color": "colour", "fill_color": "colour", "fill_alpha": 0.12}
     size = ("width", "height", "angle")
-    plan.ellipse("x", "y", *size, source=sources.marks, legend_label="3σ", **contour)
+    plan.ellipse("x", "y", *size, source=sources.marks, name="major", legend_label="3σ", **contour)
     begin = {"line_color": "colour", "line_width": 2.0, "fill_color": "white", "size": 9}
     plan.scatter("x", "y", source=sources.starts, legend_label="start", **begin)
     now = {"source": sources.marks, "line_color": "white", "line_width": 2.0}
@@ -359,7 +385,7 @@ def _draw_strip(
     tapped: bool = False,
     levels: tuple[tuple[str, float, str], ...] = (),
 ) -> new_figure:
-    """Curves over time or distance: of each its source, column, name and colour. A `band` is the
+    """Curves over time or distance: of each its source, column, label and colour. A `band` is the
     filter's 3σ behind errors, to which those at waypoints (`tapped`) belong; `levels` are marked on
     an axis of powers."""
     strip = new_figure(
@@ -371,14 +397,17 @@ def _draw_strip(
         tools="xpan,xwheel_zoom,reset,save",
     )
     if band:
-        grey = {"color": "#BBBBBB", "alpha": 0.35, "legend_label": "3σ"}
+        grey = {"color": "#BBBBBB", "alpha": 0.35, "legend_label": "3σ", "name": "major"}
         strip.varea(along, 0.0, "major", source=sources.paths[0], **grey)
     for source, name, text, colour in curves:
-        style = {"color": colour, "line_width": 1.3, "legend_label": text}
+        style: dict[str, Any] = {"color": colour, "line_width": 1.3, "name": name}
+        style |= {"legend_label": text} if text else {}
         strip.line(along, name, source=source, **style)
     if tapped:
-        marks = {"source": sources.paths[0], "legend_label": "at waypoints"}
-        strip.scatter(along, "waypoint_error", size=8, **WAYPOINT, **marks)
+        marks = {"source": sources.paths[0], "name": "waypoint_error"}
+        strip.scatter(
+            along, "waypoint_error", size=8, legend_label="at waypoints", **WAYPOINT, **marks
+        )
     for text, level, colour in levels:
         style = {"color": colour, "legend_label": f"{text} {level:.3g}"}
         strip.line([0.0, LONG], [level, level], **style)
@@ -401,6 +430,8 @@ def _finish(figure: new_figure, grid_x: bool = False) -> new_figure:
     figure.axis.minor_tick_line_color = None
     figure.grid.grid_line_color = plots.GRID
     figure.xgrid.visible = grid_x
+    if not figure.legend:
+        return figure
     legend = figure.legend[0]
     legend.click_policy = "hide"
     legend.orientation = "horizontal"

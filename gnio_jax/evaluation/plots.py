@@ -38,8 +38,8 @@ END: dict[str, Any] = {"marker": "s", "ls": "", "ms": 7}
 TAP: dict[str, Any] = {"marker": "x", "ls": "", "ms": 7, "mew": 1.8}
 MARKERS = "os^Dv"
 """Where there are more rows than colours, the next marker."""
-ELLIPSES = 12
-"""On a map, at even times."""
+ELLIPSES = 4
+"""Outlines on a map, at even times, the last at the end."""
 TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
 """Errors in the title of a sequence."""
 NO_WAYPOINTS = Waypoints(np.zeros(0), np.zeros((0, 2)))
@@ -212,12 +212,13 @@ def _draw_map(axes: Axes, seen: View) -> None:
     shapes = ellipses(seen.covariance)
     there = np.flatnonzero(np.isfinite(shapes.major) & finite_rows(seen.position))
     if len(there):
-        for row in there[np.linspace(0, len(there) - 1, ELLIPSES).astype(int)]:
+        outline: dict[str, Any] = {"color": colours.BLUE, "lw": 0.9, "alpha": 0.55}
+        for row in there[np.linspace(0, len(there) - 1, ELLIPSES + 1).astype(int)[1:]]:
             size, angle = (2 * shapes.major[row], 2 * shapes.minor[row]), shapes.angle[row]
             shape = Ellipse(tuple(seen.position[row, :2]), *size, angle=float(np.degrees(angle)))
-            shape.set(facecolor=colours.BLUE, edgecolor=colours.BLUE, alpha=0.13)
+            shape.set(fill=False, **outline)
             axes.add_patch(shape)
-        axes.plot([], [], color=colours.BLUE, lw=6, alpha=0.2, label="3σ")
+        axes.plot([], [], label="3σ", **outline)
     for path, colour in ((seen.reference, colours.REFERENCE), (seen.position, colours.BLUE)):
         good = path[finite_rows(path)]
         if len(good):

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from rich import box
-from rich.console import Group
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, Group
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -70,6 +73,8 @@ WAYPOINT_SCREEN = (
 MIXED_SCREEN = (*SCREEN[:3], *WAYPOINT_SCREEN[-3:])
 """The same where a split has both."""
 TO_WAYPOINTS = "one turn and one shift to the waypoints"
+PARTS = r"[^-_/.: ]*[-_/.: ]+|[^-_/.: ]+"
+"""Of a name, which is broken between them and not inside its words."""
 LONGEST_HEADING = 9
 """Letters; a longer one is broken on the screen."""
 DIVERGED = (
@@ -280,7 +285,7 @@ def render(report: Report) -> Group:
     shown = [name for name in screen if name in summary]
     title = f"{report.settings['dataset']} {report.settings['split']}: {way(report.settings)}"
     grid = Table(title=title, title_style="bold", title_justify="left", box=box.SIMPLE_HEAD)
-    grid.add_column("sequence", overflow="fold", min_width=12)  # a name is never cut
+    grid.add_column("sequence", overflow="fold")  # a name is never cut
     for name in shown:
         # Short lines. Not as markup, which the console of results does not read.
         heading, unit, *_ = COLUMNS[name]
@@ -291,7 +296,7 @@ def render(report: Report) -> Group:
         grid.add_column(Text("\n".join(lines)), justify="right", no_wrap=True)
 
     def add(label: str, cells: Iterable[str], style: str = "", last: bool = False) -> None:
-        grid.add_row(Text(label), *cells, style=style, end_section=last)
+        grid.add_row(_Name(label), *cells, style=style, end_section=last)
 
     def numbers(values: Mapping[str, float | None]) -> list[str]:
         return [number(values.get(name), COLUMNS[name].digits) for name in shown]
@@ -319,6 +324,24 @@ def render(report: Report) -> Group:
         *(Text(line, style="dim") for line in (how, signs)),
         *(Text(line, style="yellow") for line in (*warnings, *remarks(report))),
     )
+
+
+class _Name(NamedTuple):
+    """A name in a cell: it is broken between its `PARTS`, as far as these are not too long."""
+
+    text: str
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        longest = max(map(cell_len, re.findall(PARTS, self.text)), default=0)
+        return Measurement(longest, cell_len(self.text)).with_maximum(options.max_width)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterable[Text]:
+        lines = [""]
+        for part in re.findall(PARTS, self.text):
+            if lines[-1] and cell_len(lines[-1] + part.rstrip()) > options.max_width:
+                lines.append("")
+            lines[-1] += part
+        yield Text("\n".join(line.rstrip() for line in lines), overflow="fold")
 
 
 def _mean_of(lost: Sequence[str]) -> str:

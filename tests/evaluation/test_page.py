@@ -8,6 +8,7 @@ import pytest
 
 from gnio_jax.config import TrainConfig
 from gnio_jax.evaluation import Estimate, Trajectory, page, plots, report
+from gnio_jax.types import Waypoints
 from tests.support import browser
 from tests.support.estimates import SETTINGS, estimate, reported, with_covariance
 
@@ -68,18 +69,14 @@ def test_the_distance_walked_is_not_of_noise():
     assert found[-1] == pytest.approx(1.5 * (9.9 - 2.0), abs=0.01)
 
 
-def test_the_map_has_room_for_the_ellipses_and_no_more_than_the_walk_again(walks):
+def test_the_map_has_room_for_the_ellipses(walks):
+    """However large they are."""
     walk = walks[0]
-    small, seen = (run_of([with_covariance(walk, p * walk.filtered.covariance)]) for p in (0, 1))
-    bare, room = (page.frame([run], "walk") for run in (small, seen))
-    half = 3 * np.sqrt(walk.filtered.covariance[:, 0, 0])
-    wide = seen.views[0].position[:, 0]
-    assert room["x"] == pytest.approx([(wide - half).min(), (wide + half).max()])
-    assert bare["x"][0] > room["x"][0] and bare["x"][1] < room["x"][1]
-    huge = run_of([with_covariance(walk, 1e6 * walk.filtered.covariance)])
-    size = max(np.ptp(bare["x"]), np.ptp(bare["y"]))
-    found = page.frame([huge], "walk")["x"]
-    assert found == pytest.approx([bare["x"][0] - size, bare["x"][1] + size])
+    for size in (1.0, 1e6):
+        seen = run_of([with_covariance(walk, size * walk.filtered.covariance)])
+        wide, half = seen.views[0].position[:, 0], 3 * np.sqrt(seen.views[0].covariance[:, 0, 0])
+        room = page.frame([seen], "walk")["x"]
+        assert room == pytest.approx([(wide - half).min(), (wide + half).max()])
     nowhere = Trajectory(walk.reference.time, *(part * np.nan for part in walk.reference[1:]))
     lost = walk._replace(trajectory=nowhere, reference=nowhere)
     assert np.isfinite([*page.frame([run_of([lost])], "walk").values()]).all()
@@ -113,7 +110,7 @@ def test_the_page_is_one_file_that_loads_nothing(written, runs):
     assert "default-src 'none'" in text and len(text) < 3e6
     assert "gnio evaluate --workdir &#39;a b&#39;" in text and "seed: 3" in text
     assert "walk: start: rough" in text
-    shown = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "|", text))
+    shown = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "|", text.replace("<wbr>", "")))
     for run in runs:  # the table
         ate, seconds = (run.figures["walk"][name] for name in ("ate", "duration"))
         line = re.search(rf"walk\|+ ?\|+{run.name}\|[^a-z]*", shown).group()
@@ -125,9 +122,21 @@ def test_without_a_reference_nothing_is_called_an_error(estimates):
     text = page.render("blind", [run_of([estimates[2]])])
     assert "error (m)" not in text and "distance walked" not in text
     assert r"3\\u03c3 (m)" in text  # as JSON in a script has it
+    assert '"value":"start"' in text
     assert re.search(r"<label hidden>sequence", text)  # of a single one none is chosen
     # χ² does not go by the name of the network's gate.
     assert "refused above 11.3" in text and '"gate (11' not in text
+
+
+def test_warnings_stand_before_the_figures_and_the_weights_once(estimates):
+    run = run_of(estimates[:1])._replace(warnings=("it <moves>",), about={"weights": "of walks"})
+    text = page.render("walk", [run])
+    assert text.count("of walks") == 1 and "warning: it &lt;moves&gt;" in text
+    assert text.index("it &lt;moves&gt;") < text.index('class="figures"') < text.index("of walks")
+
+
+def test_names_break_between_their_words():
+    assert str(page._breakable("a<b_c-d e")) == "a&lt;b_<wbr>c-<wbr>d <wbr>e"
 
 
 def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
@@ -164,6 +173,10 @@ def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
 
 # --- in a browser
 
+needs_browser = pytest.mark.skipif(
+    browser.NAME is None, reason="no Chromium here (apt-get install chromium)"
+)
+
 SLIDE = """(() => {
   const slider = document.getElementById("time");
   slider.value = %s;
@@ -176,8 +189,50 @@ CHOOSE = """(() => {
 })()"""
 
 
+LEGENDS = """(() => {
+  const found = {};
+  const visit = (view) => {
+    const model = view.model;
+    if (model.type === "Legend") {
+      const box = view.bbox, whole = view.parent.bbox;
+      const names = model.items.filter((item) => item.visible).map((item) => item.label.value);
+      if (names.length) found[model.id] = [names, box.x0 >= whole.x0 - 1, box.x1 <= whole.x1 + 1];
+    }
+    for (const child of view.children()) visit(child);
+  };
+  for (const view of Bokeh.index.roots) visit(view);
+  return Object.values(found);
+})()"""
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(browser.NAME is None, reason="no Chromium here (apt-get install chromium)")
+@needs_browser
+def test_legends_can_be_read_and_name_what_is_there(tmp_path, estimates):
+    """On a phone too, with long names; of a walk without poses nothing is called a reference."""
+    tapped = estimates[1]._replace(
+        reference=estimates[2].reference,
+        waypoints=Waypoints(
+            estimates[1].trajectory.time[[5, 200, 390]], estimates[1].trajectory.position[:3, :2]
+        ),
+    )
+    posed, path = estimates[0], tmp_path / "page.html"
+    mixed = run_of([posed, tapped])
+    summed = [Estimate(posed.name, posed.trajectory, posed.reference)]
+    page.write(path, "two", [mixed, run_of(summed, name="integrate, " + "orientation " * 6)])
+    with browser.browser() as tab:
+        for width in (1500, 390):
+            tab.open(path, width=width)
+            seen = tab.evaluate(LEGENDS)
+            names = {name for legend in seen for name in legend[0]}
+            assert {"reference", "3σ", "start"} <= names and "waypoint, error" not in names
+            assert all(left and right for _, left, right in seen)
+        tab.evaluate('document.querySelectorAll("tr[data-sequence]")[2].click()')
+        names = {name for legend in tab.evaluate(LEGENDS) for name in legend[0]}
+        assert "waypoint, error" in names and not {"reference", "error"} & names
+
+
+@pytest.mark.slow
+@needs_browser
 def test_in_a_browser(written, walks):
     """It opens from the disk, asks for nothing, has equal axes and says where the walk is; on a
     phone it is one column."""

@@ -57,6 +57,18 @@ def test_the_table_fits_into_80_columns_and_shortens_no_name(made, name, tapped)
     assert name in column
 
 
+def test_a_name_is_broken_between_its_words(made):
+    name, measured = "2023-11-25T12-30_person-17_pocket_left_down", made.scores["room 1/walk"]
+    scores = {name: measured._replace(values=dict.fromkeys(measured.values, 123.4))}
+    rows_below = {"perfect_displacements": scores}
+    report = made._replace(
+        scores=scores, reference_rows=rows_below, groups={name: "x"}, notes={}, left_out={}
+    )
+    lines = [line[2:].split("  ")[0] for line in text(report).splitlines()]
+    assert "2023-11-25T12-30_" in lines and "left_down" in lines
+    assert "perfect_displacements" in lines or "perfect_" in lines
+
+
 def test_divergence_is_in_the_table(made, with_divergence):
     table = rows(with_divergence[1], 120)
     assert "mean without 1 diverged" in table and "mean" not in table
