@@ -5,7 +5,9 @@ import importlib.util
 import signal
 import socket
 import sys
+import threading
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -24,6 +26,20 @@ from tests.support.rerun_files import columns_of
 
 CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
 RATE = 50.0
+PATIENCE = 120
+"""s, after which a test waits for what never comes."""
+
+
+@pytest.fixture(autouse=True)
+def patience():
+    def give_up(*_):
+        pytest.fail(f"nothing has come for {PATIENCE} s")
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(PATIENCE)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture(scope="module")
@@ -447,8 +463,17 @@ def test_what_came_before_counts_where_it_rests(run, port, turns):
     assert said == ["100 datagrams came before the device was still and are left out"] * bool(turns)
 
 
+def test_the_silence_counts_from_the_first_datagram_on(port, monkeypatch):
+    """However late that comes."""
+    monkeypatch.setattr(live, "QUIET_SECONDS", 0.1)
+    late = threading.Timer(0.6, send, (port, [b"0.0,0,0,0,0,0,9.81"]))
+    listening = datagrams(port)
+    late.start()
+    assert len(list(listening.source(silence=0.2, say=len).samples)) == 1
+    late.join()
+
+
 def test_it_is_said_where_nothing_comes(port, monkeypatch):
-    """The silence counts from the first datagram on."""
     monkeypatch.setattr(live, "QUIET_SECONDS", 0.3)
     said = []
 
@@ -475,6 +500,15 @@ def test_what_is_sent_while_it_compiles_is_not_lost(follow, port, monkeypatch, t
     told = follow([], f"udp:{port}", *given)
     assert "ready: hold still now, for 1 s" in told
     assert read_tum(tmp_path / "live.txt").time[0] == pytest.approx(1.0, abs=1.5 / RATE)
+
+
+def test_of_the_poses_the_path_alone_is_kept():
+    """Or a day would fill the memory with covariances."""
+    found, poses = live.Followed(), [pose_at(k, [0.0, 0.0, 0.0]) for k in (0.0, 0.1)]
+    covariance = weakref.ref(poses[0].covariance)
+    while poses:
+        live._add(found, poses.pop(0))
+    assert covariance() is None and len(found.trajectory.time) == 2
 
 
 def test_the_way_is_that_of_a_track():

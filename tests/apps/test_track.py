@@ -3,6 +3,7 @@
 All recordings last six seconds and lack some samples, so that they share one compiled filter.
 """
 
+import dataclasses
 import importlib.util
 import json
 
@@ -10,13 +11,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.apps.track import Summary, _warnings
+from gnio_jax.apps import packages
+from gnio_jax.apps.importing import Imported
+from gnio_jax.apps.track import Summary, _warnings, track
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation.trajectory import read_tum
 from gnio_jax.types import Sequence, Waypoints
 from tests.support import bag_files, known_walk, logger_files, tiny_run
+from tests.support.filter_settings import changed
 
 CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
 
@@ -134,6 +138,7 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_
     rate = "rate: recorded at 20 Hz, the network was trained at 50 Hz: the content above 10 Hz"
     assert f"warning: {rate}" in told
     assert "warning: start: it moves in its first second" in told
+    assert "gyro bias: no rest at the start (quieter than a hand)" in told
     gnio("data", "import", slow, "--out", tmp_path / "slow.h5")
     again = gnio("track", tmp_path / "slow.h5", "--out", tmp_path / "again")
     of_gaps = [line for line in told.splitlines() if "lacks samples" in line or "gaps" in line]
@@ -260,6 +265,28 @@ def test_what_cannot_be_written_is_found_before_the_work(mistake, runs, tmp_path
     for start, words in ((-5.0, "stamps begin at -5 s"), (3e9, "ROS counts seconds in 32 bits")):
         odd = csv(tmp_path / "odd.csv", time, start=start)
         assert words in mistake("track", odd, *weights, "--format", "mcap", "--time-unit", "s")
+
+
+class Reached(Exception):
+    """The stage that a test looks at."""
+
+
+def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monkeypatch):
+    given = {}
+
+    def prepare(_, windows, std, **how):
+        given.update(how, std=std)
+        raise Reached
+
+    monkeypatch.setattr("gnio_jax.apps.track.prepare", prepare)
+    weights = packages.choose(runs / "walker")
+    own = dataclasses.replace(changed(start={"velocity": 0.7}), raw_gyro_bias=0.02)
+    config = dataclasses.replace(weights.run.config, filter=own)
+    weights = weights._replace(run=weights.run._replace(config=config))
+    walk = Imported(without_poses("walk", np.arange(620) / 100), (), ())
+    with pytest.raises(Reached):
+        track(walk, weights, tmp_path / "t")
+    assert given["std"].velocity == 0.7 and given["raw_gyro_bias"] == 0.02
 
 
 SUMMARY = Summary(

@@ -152,6 +152,35 @@ def test_walks_with_waypoints_beside_those_with_poses_and_alone(
             asked(workdir, **refused)
 
 
+class Reached(Exception):
+    """The stage that a test looks at."""
+
+
+@pytest.mark.parametrize("asked, least", [({"coupling": "loose"}, np.exp(-4.0)), ({}, 0.0)])
+def test_what_the_filter_is_sure_of_reaches_the_stages(workdir, walks, monkeypatch, asked, least):
+    """The start, a raw gyro, and the smallest standard deviation of a displacement, which has none
+    where displacements are summed."""
+    module, given = sys.modules[evaluate.__module__], {}
+    original = module.prepare
+
+    def prepare(sequences, windows, std, **how):
+        given.update(how, std=std)
+        return original(sequences, windows, std, **how)
+
+    def infer(*_, **how):
+        given.update(how)
+        raise Reached
+
+    monkeypatch.setattr(module, "prepare", prepare)
+    monkeypatch.setattr(module, "infer", infer)
+    monkeypatch.setattr(data, "load", lambda *_: walks[:1])
+    options = {"set": ("filter.raw_gyro_bias=0.02",), **(asked or {"estimator": "integrate"})}
+    with pytest.raises(Reached):
+        evaluate(EvaluateConfig(str(workdir), **options))
+    assert given["std"].velocity == 0.7 and given["raw_gyro_bias"] == 0.02
+    assert given["least_std"] == pytest.approx(least)
+
+
 def name_of(run=TRAINED, **options):
     return folder_name(resolve(EvaluateConfig("w", **options), run), run)
 

@@ -101,6 +101,7 @@ def test_seeds_are_averaged_over_the_sequences_that_all_have():
     """Or ± would be of the walk that one seed lacks."""
     found = summarise(seeds_of([[1.0, 2.0, 9.0], [3.0, 4.0]]), "ate", ALONE)
     assert found.seeds == [1.5, 3.5] and found.mean == 2.5 and found.std == pytest.approx(2**0.5)
+    assert found.estimates == 4  # † is of these
     whole = seeds_of([[1.0, 2.0], [3.0, 4.0]])
     whole[1]["a"] = measures(ate=None)
     assert summarise(whole, "ate", ALONE).seeds == [2.0, 4.0]

@@ -31,6 +31,7 @@ def test_the_table_says_what_matters(made):
     table, summary = rows(made), made.summary()
     assert f"{summary['ate'].mean:.2f}" in table["mean"]
     assert table["blind"][1:4] == ["–"] * 3
+    assert table["groups"][1:] == [str(summary[name].groups) for name in tabulate.SCREEN]
     low, _ = summary["nees_coverage"].interval or (None, None)
     assert table["95 % from"][-1] == tabulate.number(low, 0)
 
