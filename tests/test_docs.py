@@ -105,8 +105,7 @@ def test_weights_that_are_loaded(tmp_path, monkeypatch):
     names = {"gnio_jax": gnio_jax, "windows": np.zeros((2, 50, 6), np.float32)}
     with tiny_run.known():
         folder = tiny_run.save(tmp_path / "run", config)
-        about = packages.Description("mine", "nobody's walks", "CC0")
-        packages.publish(folder, tmp_path / "mine", about)
+        packages.publish(folder, tmp_path / "mine", "mine", "nobody's walks", "CC0")
         run("docs/weights.md", code_of("docs/weights.md"), names)
     assert names["prediction"].displacement.shape == (2, 3)
 

@@ -286,51 +286,52 @@ def _named(tree: Any) -> dict[str, Any]:
 # --- publishing
 
 
-class Description(NamedTuple):
-    """What only the publisher knows."""
-
-    name: str
-    data: str
-    """What the network was trained on: recordings, devices, people, carrying positions."""
-    license: str
-    """Under which the data may be used and the weights passed on."""
-    fails: tuple[str, ...] = ()
-    """Where it is known to fail, a sentence each."""
-
-
-def publish(workdir: Path, out: Path, said: Description, which: Which = "best") -> About:
+def publish(
+    workdir: Path,
+    out: Path,
+    name: str,
+    data: str,
+    license: str,
+    fails: tuple[str, ...] = (),
+    which: Which = "best",
+) -> About:
     """Make a package of a run at `out`: a zip if its name ends so, else a folder, which takes the
     place of an older package. It is written whole or not at all, and folders of this machine are
     left out of its settings.
 
+    Only the publisher knows on which `data` the network was trained (recordings, devices, people,
+    carrying positions), under which `license` the data may be used and the weights passed on, and
+    where it `fails`, a sentence each.
+
     Raises `InputError` for a run that cannot be loaded, a name that is none of a file, empty texts,
     or something at `out` that is no package.
     """
-    if said.name != file_stem(said.name):
+    if name != file_stem(name):
         remedy = "use letters, digits, '.', '_', '+' and '-'"
-        raise InputError("--name", f"'{said.name}' is no name of a folder", remedy)
-    for option in ("data", "license"):
-        if not getattr(said, option).strip():
+        raise InputError("--name", f"'{name}' is no name of a folder", remedy)
+    for option, text in (("--data", data), ("--license", license)):
+        if not text.strip():
             remedy = "describe it in a sentence, because other people rely on it"
-            raise InputError(f"--{option}", "is empty", remedy)
+            raise InputError(option, "is empty", remedy)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())) and not _has_manifest(out):
         raise InputError(out, "is there already and is no package", "name another --out")
     run = checkpoint.load_run(workdir, which)
-    figures, made_by = _figures(workdir), f"gnio-jax {version('gnio-jax')}"
+    figures = _figures(workdir)
     content = to_bytes(run.variables)
     about = About(
-        said.name,
+        name,
         run.config.model.name,
-        said.data,
-        said.license,
+        data,
+        license,
         run.epoch,
         run.step,
         _measured(figures, run.config.datasets),
-        made_by,
-        _card(said, run, made_by, figures, workdir).split("\n"),
+        f"gnio-jax {version('gnio-jax')}",
+        [],
         configuration.plain(configuration.without_places(run.config)),
         fingerprint(content),
     )
+    about = about._replace(card=_card(about, fails, run, figures, workdir).split("\n"))
     manifest = {"format": FORMAT, "version": VERSION, **about._asdict()}
     manifest["sha256"] = _digest(manifest)
     text = json.dumps(manifest, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
@@ -409,10 +410,10 @@ def _named_run(which: str) -> str:
 
 
 def _card(
-    said: Description, run: Run, made_by: str, figures: dict[str, Report], workdir: Path
+    about: About, fails: tuple[str, ...], run: Run, figures: dict[str, Report], workdir: Path
 ) -> str:
     """The model card, Markdown."""
-    config, windows, name = run.config, run.config.data, said.name
+    config, windows, name = run.config, run.config.data, about.name
     begun = f" --init-from {_named_run(config.init_from)}" if config.init_from else ""
     if windows.poses_by:
         begun += f" --set data.poses_by={_named_run(windows.poses_by)}"
@@ -441,10 +442,10 @@ def _card(
     ]
     means = "Means over sequences, with 95 % intervals over groups (people, sessions)."
     table = f"{tabulate.markdown(header, rows)}\n{means}"
-    fails = said.fails or ("Its publisher has not said. Try it on recordings like yours.",)
+    fails = fails or ("Its publisher has not said. Try it on recordings like yours.",)
     return f"""# {name}
 
-Network `{config.model.name}` for neural inertial odometry by {made_by}: windows of \
+Network `{config.model.name}` for neural inertial odometry by {about.made_by}: windows of \
 {windows.window_seconds:g} s at {windows.rate:g} Hz, a displacement every \
 {windows.stride_seconds:g} s. Epoch {run.epoch}, step {run.step}.
 
@@ -454,9 +455,9 @@ gnio track RECORDING --weights {name}
 
 ## Data and licence
 
-Trained on: {said.data}
+Trained on: {about.data}
 
-Licence: {said.license}
+Licence: {about.license}
 
 ## Recipe
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -29,15 +29,6 @@ LONGEST_PIECE = 600
 """Poses. A piece is sent anew when it grows: with the whole path that would be ever more."""
 
 
-class Logged(NamedTuple):
-    """One sequence of a file."""
-
-    estimate: Estimate
-    """In the frame in which it is looked at, and so its reference."""
-    recording: Recording
-    """Its IMU is shown."""
-
-
 def check(target: str | Path) -> None:
     """Refuse, before the work, what cannot be shown or written. Raises `InputError`."""
     require_packages(OPTION, "rerun", "rerun")
@@ -50,19 +41,20 @@ def check(target: str | Path) -> None:
         raise InputError(OPTION, f"'{path}' is a folder", "name a file in it, NAME.rrd")
 
 
-def write(path: Path, logged: list[Logged]) -> None:
-    """Write the sequences as one recording of Rerun, whole or not at all.
+def write(path: Path, sequences: list[tuple[Estimate, Recording]]) -> None:
+    """Write sequences as one recording of Rerun, whole or not at all: of each its estimate, in the
+    frame in which it is looked at with its reference, and the recording, whose IMU is shown.
 
     Each has a folder of its own, named as its files. Times are those from its start, s.
     """
     import rerun
 
-    stems = file_names([each.estimate.name for each in logged])
+    stems = file_names([estimate.name for estimate, _ in sequences])
     with replacing(path) as temporary:
         log = rerun.RecordingStream("gnio-jax", recording_id="gnio")
         log.save(temporary)
         log.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for stem, (estimate, recording) in zip(stems, logged, strict=True):
+        for stem, (estimate, recording) in zip(stems, sequences, strict=True):
             _log_paths(log, stem, estimate)
             time = estimate.trajectory.time - estimate.trajectory.time[0]
             found, filtered = estimate.displacements, estimate.filtered

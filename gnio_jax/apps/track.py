@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +22,7 @@ from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate, Recording, estimate, metrics, prepare
+from gnio_jax.evaluation import Estimate, Recording, estimate, metrics, prepare, report
 from gnio_jax.evaluation.estimate import in_one_frame
 from gnio_jax.evaluation.prepare import ROUGH_START, measured_rows
 from gnio_jax.evaluation.trajectory import write_tum
@@ -158,7 +157,7 @@ def track(
         _write_figures(folder, found, summary, formats)
         _draw(folder, found, summary, config, command)
     if rerun_file is not None:
-        rerun.write(rerun_file, [rerun.Logged(in_one_frame(found, alignment=None), ready[0])])
+        rerun.write(rerun_file, [(in_one_frame(found, alignment=None), ready[0])])
     return Tracked(found, summary, out)
 
 
@@ -288,11 +287,7 @@ def _write_figures(
     folder: Path, found: Estimate, summary: Summary, formats: tuple[str, ...]
 ) -> None:
     """Summary and trajectories, which have the stamps of the recording's own clock."""
-    finite = {
-        name: value if value is not None and math.isfinite(value) else None
-        for name, value in summary.errors.items()
-    }
-    plain = summary._asdict() | {"errors": finite}
+    plain = summary._asdict() | {"errors": report.finite(summary.errors)}
     text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False)
     (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     path, reference = (

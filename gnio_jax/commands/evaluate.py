@@ -40,11 +40,8 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
     console.say(tabulate.render(found.report))
     console.say(f"results: {found.folder}")
     if asked.rerun:
-        logged = [
-            rerun.Logged(in_one_frame(estimate, asked.alignment), recording)
-            for estimate, recording in zip(found.estimates, found.recordings, strict=True)
-        ]
-        rerun.write(Path(asked.rerun), logged)
+        seen = [in_one_frame(each, asked.alignment) for each in found.estimates]
+        rerun.write(Path(asked.rerun), [*zip(seen, found.recordings, strict=True)])
         console.say(f"for Rerun: {asked.rerun}")
     if asked.plots:
         console.say(f"page: {found.folder / 'report.html'} (open it in a browser)")

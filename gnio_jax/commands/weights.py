@@ -110,8 +110,8 @@ def publish(asked: PublishOptions, _call: options.Call) -> None:
     from gnio_jax.apps import packages  # late: mistakes do not wait for JAX
 
     name = asked.name or asked.out.name.removesuffix(".zip")
-    said = packages.Description(name, asked.data, asked.license, asked.fails)
-    about = packages.publish(asked.run, asked.out, said)
+    said = (name, asked.data, asked.license, asked.fails)
+    about = packages.publish(asked.run, asked.out, *said)
     size = f"{about.weights['bytes'] / 1e6:.2f} MB"
     console.say(f"{asked.out}: {about.name}, network {about.network}, {size}")
     if not about.measured:

@@ -162,7 +162,7 @@ def _of_estimates(report: Report) -> dict[str, dict[str, Any]]:
 def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
     return {
         name: {
-            **_finite(own.values),
+            **finite(own.values),
             "infinite": [metric for metric, value in own.values.items() if value == math.inf],
             "reasons": own.reasons,
             "diverged": own.diverged,
@@ -176,12 +176,13 @@ def _summaries(found: Mapping[str, Summary]) -> dict[str, dict[str, Any]]:
     names = {"mean": "mean", "median": "median", "interval": "interval", "n": "sequences"}
     names |= {"groups": "groups", "diverged": "diverged"}
     return {
-        key: _finite({metric: getattr(of, field) for metric, of in found.items()})
+        key: finite({metric: getattr(of, field) for metric, of in found.items()})
         for key, field in names.items()
     }
 
 
-def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
+def finite(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Metrics for JSON, which has no infinity."""
     return {name: None if value == math.inf else value for name, value in values.items()}
 
 

@@ -30,9 +30,8 @@ class PredictedWindows(NamedTuple):
     displacement: Float[np.ndarray, "m 3"]
     """The network's, m."""
     std: Float[np.ndarray, "m 3"]
-    """Standard deviation of one window, with the factors that `gnio calibrate` fitted to windows, m.
-    The `measurement_scale` is not in it: that is fitted to the filter, which takes many windows that
-    overlap."""
+    """Standard deviation of one window, with the factors that `gnio calibrate` fitted to windows,
+    m. The filter's `measurement_scale` is not in it: it is of many windows that overlap."""
     diagnostics: dict[str, np.ndarray]
     """`gate`, `scale` (m, 3) and `attention` (m, heads, prototypes), where the network has them."""
     activity: Int[np.ndarray, "m"]

@@ -15,7 +15,7 @@ import pytest
 import gnio_jax
 from gnio_jax import config as configuration
 from gnio_jax.apps import packages
-from gnio_jax.apps.packages import SHIPPED, Description
+from gnio_jax.apps.packages import SHIPPED
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import report
@@ -43,7 +43,7 @@ SCORES = {
 }
 MEASURED = "ATE 2-D is 1.25 (0.61 to 1.89) m on synthetic_test_ekf (in a pocket 1.2; in a hand 1.3)"
 """12.706 (Student's t, one degree of freedom) times 0.05 m around the mean."""
-SAID = Description("walk", "simulated walks", "CC0", ("Running | jumping.",))
+SAID = ("simulated walks", "CC0", ("Running | jumping.",))
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +63,8 @@ def run(tmp_path_factory):
 def published(run, tmp_path_factory):
     """A folder of packages: `walk`, and `small.zip`."""
     folder = tmp_path_factory.mktemp("packages")
-    packages.publish(run, folder / "walk", SAID)
-    packages.publish(run, folder / "small.zip", SAID._replace(name="small"))
+    packages.publish(run, folder / "walk", "walk", *SAID)
+    packages.publish(run, folder / "small.zip", "small", *SAID)
     return folder
 
 
@@ -147,7 +147,7 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run,
     write_report(own / "eval" / "mall_test_ekf", figures)
     for calibrated, shown in (("runs/half", "half"), ("walk", "walk"), ("other/run", "run")):
         (own / "calibration.json").write_text(json.dumps({"run": calibrated, "split": "val"}))
-        packages.publish(own, tmp_path / "package", SAID)
+        packages.publish(own, tmp_path / "package", "walk", *SAID)
         card = packages.card_of(tmp_path / "package")
         assert f"gnio calibrate --workdir runs/{shown}\n" in card
         assert f"The filter is fitted to split `val` of run `{shown}`." in card

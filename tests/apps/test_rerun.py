@@ -32,7 +32,7 @@ def test_the_file_is_read_back(tmp_path):
     covariance = np.array([[4.0, 1.5, 0.2], [1.5, 1.0, 0.1], [0.2, 0.1, 0.5]])
     walk = with_covariance(walk, np.tile(covariance, (400, 1, 1)))
     path = tmp_path / "walks.rrd"
-    logged = [rerun.Logged(each, recording_of(each)) for each in (walk, blind)]
+    logged = [(each, recording_of(each)) for each in (walk, blind)]
     rerun.write(path, logged)
     assert [each.name for each in tmp_path.iterdir()] == ["walks.rrd"]
     found = columns_of(path)
