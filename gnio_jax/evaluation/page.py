@@ -201,11 +201,11 @@ def columns(seen: View, rows: int) -> Columns:
         "reference_y": reference[:, 1],
         "error": np.linalg.norm((path - reference)[:, :2], axis=1),
         "distance": walked(reference if seen.known else path, seen.time, seen.step),
-        **plots.ellipses(seen.covariance)._asdict(),
+        **plots.ellipses(seen.filtered.covariance)._asdict(),
     }
+    curves = {**seen.network.diagnostics, "std": seen.network.std}
     for name in STRIPS:
-        values = getattr(seen, name)
-        if np.isfinite(values).any():
+        if name in curves and np.isfinite(values := curves[name]).any():
             found |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(colours.AXES)}
     found = {name: values[::step] for name, values in found.items()}
     if len(seen.taps.time):
@@ -215,10 +215,10 @@ def columns(seen: View, rows: int) -> Columns:
         for name, values in (passed | {"waypoint_error": seen.taps.error}).items():
             found[name] = np.full(len(found["time"]), np.nan)
             found[name][rows] = values
-    if np.isfinite(seen.nis).any():
+    if np.isfinite(nis := seen.filtered.nis).any():
         # The largest of each `step` rows: a thinned curve keeps its peaks.
-        peaks = np.full(-(-len(seen.nis) // step) * step, -np.inf)
-        peaks[: len(seen.nis)] = np.where(np.isnan(seen.nis), -np.inf, seen.nis)
+        peaks = np.full(-(-len(nis) // step) * step, -np.inf)
+        peaks[: len(nis)] = np.where(np.isnan(nis), -np.inf, nis)
         largest = peaks.reshape(-1, step).max(axis=1)
         found["nis"] = np.where(np.isneginf(largest), np.nan, largest)
     return {name: values.astype(np.float32) for name, values in found.items()}
@@ -238,7 +238,7 @@ def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
     """Corners of what the map shows of a sequence: the paths of all runs, and the ellipses of the
     first."""
     views = [seen for run in runs for seen in run.views if seen.name == sequence]
-    variance = np.diagonal(views[0].covariance, axis1=1, axis2=2)[:, :2]
+    variance = np.diagonal(views[0].filtered.covariance, axis1=1, axis2=2)[:, :2]
     reach = np.nan_to_num(colours.SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
     own = views[0].position[:, :2]
     parts = [

@@ -77,18 +77,8 @@ class View(NamedTuple):
     """Of the estimate, m."""
     reference: Float[np.ndarray, "n 3"]
     """Position, m."""
-    covariance: Float[np.ndarray, "n 3 3"]
-    """Of the estimate's position, m²."""
-    gate: Float[np.ndarray, "n 3"]
-    """Of the network, along the axes of the window's yaw frame."""
-    scale: Float[np.ndarray, "n 3"]
-    """Of the network."""
-    std: Float[np.ndarray, "n 3"]
-    """Standard deviation of the displacement, m."""
-    nis: Float[np.ndarray, "n"]
-    """Normalised innovation squared."""
-    accepted: Float[np.ndarray, "n"]
-    """1 where the filter used the displacement, 0 where it refused it."""
+    network: Displacements
+    filtered: Filtered
     taps: Taps
 
     @property
@@ -116,20 +106,14 @@ def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
     seen = in_one_frame(estimate, alignment)
     rows = len(seen.trajectory.time)
     none, blank = np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan)
-    found = seen.displacements or Displacements(none, blank)
-    filtered = seen.filtered or Filtered(blank, none[:, 0], none[:, 0])
     begin, (stamps, waypoints) = seen.trajectory.time[0], seen.waypoints or NO_WAYPOINTS
     return View(
         seen.name,
         seen.trajectory.time - begin,
         seen.trajectory.position,
         seen.reference.position,
-        filtered.covariance,
-        found.diagnostics.get("gate", none),
-        found.diagnostics.get("scale", none),
-        found.std,
-        filtered.nis,
-        filtered.accepted,
+        seen.displacements or Displacements(none, blank),
+        seen.filtered or Filtered(blank, none[:, 0], none[:, 0]),
         Taps(stamps - begin, waypoints, positions_at(seen.trajectory, stamps)),
     )
 
@@ -173,13 +157,13 @@ def sequence(seen: View, title: str = "") -> Figure:
     """Map on the left; on the right, over time, the errors with the filter's 3σ, the speed, and the
     gate of the network or else which displacements the filter used."""
     strips: list[Callable[[Axes, View], None]] = [_draw_speed]
-    if seen.known or np.isfinite(seen.covariance).any():
+    if seen.known or np.isfinite(seen.filtered.covariance).any():
         strips = [_draw_error, functools.partial(_draw_error, vertical=True), *strips]
     elif len(seen.taps.time):
         strips = [_draw_error, *strips]
-    if np.isfinite(seen.gate).any():
+    if np.isfinite(seen.network.diagnostics.get("gate", np.nan)).any():
         strips.append(_draw_gate)
-    elif np.isfinite(seen.accepted).any():
+    elif np.isfinite(seen.filtered.accepted).any():
         strips.append(_draw_accepted)
     figure = Figure(figsize=(12.6, 6.8), layout="constrained")
     grid = figure.add_gridspec(len(strips), 2, width_ratios=(1.1, 1.0))
@@ -209,7 +193,7 @@ def _draw_map(axes: Axes, seen: View) -> None:
         for ends in np.stack([seen.taps.position, seen.taps.passed], 1):
             axes.plot(*ends.T, color=colours.VERMILION, lw=1.0, zorder=3)
         axes.plot([], [], color=colours.VERMILION, lw=1.0, label="error at its time")
-    shapes = ellipses(seen.covariance)
+    shapes = ellipses(seen.filtered.covariance)
     there = np.flatnonzero(np.isfinite(shapes.major) & finite_rows(seen.position))
     if len(there):
         outline: dict[str, Any] = {"color": colours.BLUE, "lw": 0.9, "alpha": 0.55}
@@ -236,10 +220,10 @@ def _draw_map(axes: Axes, seen: View) -> None:
 
 def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
     """Of the position, with the filter's 3σ behind it; without a reference the 3σ alone."""
-    bound, colour, name = ellipses(seen.covariance).major, colours.BLUE, "horizontal"
+    bound, colour, name = ellipses(seen.filtered.covariance).major, colours.BLUE, "horizontal"
     error = np.linalg.norm((seen.position - seen.reference)[:, :2], axis=1)
     if vertical:
-        bound = colours.SIGMAS * np.sqrt(np.maximum(seen.covariance[:, 2, 2], 0.0))
+        bound = colours.SIGMAS * np.sqrt(np.maximum(seen.filtered.covariance[:, 2, 2], 0.0))
         error, colour, name = (seen.position - seen.reference)[:, 2], colours.GREEN, "vertical"
     if np.isfinite(bound).any():
         low = -bound if vertical else np.zeros_like(bound)
@@ -269,15 +253,16 @@ def _draw_speed(axes: Axes, seen: View) -> None:
 
 
 def _draw_gate(axes: Axes, seen: View) -> None:
+    gate = seen.network.diagnostics["gate"]
     for k, (name, colour) in enumerate(colours.AXES.items()):
-        axes.plot(seen.time, seen.gate[:, k], color=colour, lw=1.1, label=name)
+        axes.plot(seen.time, gate[:, k], color=colour, lw=1.1, label=name)
     axes.axhline(0, color=colours.REFERENCE, lw=0.6)
-    axes.set_ylim(-1.05 if np.nanmin(seen.gate) < 0 else -0.05, 1.05)
+    axes.set_ylim(-1.05 if np.nanmin(gate) < 0 else -0.05, 1.05)
     axes.set_ylabel("gate γ (–)")
 
 
 def _draw_accepted(axes: Axes, seen: View) -> None:
-    axes.plot(seen.time, seen.accepted, color=colours.BLUE, lw=1.0, label="used")
+    axes.plot(seen.time, seen.filtered.accepted, color=colours.BLUE, lw=1.0, label="used")
     axes.set_ylim(-0.05, 1.05)
     axes.set_ylabel("displacement")
 

@@ -74,7 +74,8 @@ def test_the_map_has_room_for_the_ellipses(walks):
     walk = walks[0]
     for size in (1.0, 1e6):
         seen = run_of([with_covariance(walk, size * walk.filtered.covariance)])
-        wide, half = seen.views[0].position[:, 0], 3 * np.sqrt(seen.views[0].covariance[:, 0, 0])
+        view = seen.views[0]
+        wide, half = view.position[:, 0], 3 * np.sqrt(view.filtered.covariance[:, 0, 0])
         room = page.frame([seen], "walk")["x"]
         assert room == pytest.approx([(wide - half).min(), (wide + half).max()])
     nowhere = Trajectory(walk.reference.time, *(part * np.nan for part in walk.reference[1:]))
@@ -238,7 +239,7 @@ def test_in_a_browser(written, walks):
     phone it is one column."""
     whole = plots.view(walks[0])
     error = np.linalg.norm((whole.position - whole.reference)[:, :2], axis=1)
-    shapes = plots.ellipses(whole.covariance)
+    shapes = plots.ellipses(whole.filtered.covariance)
     with browser.browser() as tab:
         tab.open(written, width=1500)  # the map is wider than high, unlike the walk
         per_metre = tab.evaluate("""(() => {

@@ -1,5 +1,6 @@
 """Pictures are drawn and show what they say."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -41,7 +42,7 @@ def test_an_estimate_is_seen_in_the_frame_of_the_reference(estimates):
     moved = moved._replace(trajectory=Trajectory(path.time, turned + 5.0, attitude))
     whole, found = plots.view(walk), plots.view(moved)
     np.testing.assert_allclose(found.position, whole.position, atol=1e-9)
-    angles = [plots.ellipses(seen.covariance).angle for seen in (whole, found)]
+    angles = [plots.ellipses(seen.filtered.covariance).angle for seen in (whole, found)]
     np.testing.assert_allclose(np.abs(np.sin(angles)), 1.0, atol=1e-6)
     # By hand: the starts are one, and so are the yaws.
     shift = path.position[0] - walk.reference.position[0]
@@ -132,7 +133,8 @@ def test_one_picture_for_each_sequence(tmp_path, estimates, made):
     assert pictures.keys() == {"error_cdf.png", "room_1_walk.png", "room_1_walk_.png"}
     assert all(each.startswith(b"\x89PNG") for each in pictures.values())
     seen = plots.view(estimates[0])._replace(name="a$x^$\udcff")  # of any bytes, and short
-    parts = {x: getattr(seen, x)[:3] for x in seen._fields if x not in ("name", "taps")}
+    kept = (x for x in seen._fields if x not in ("name", "taps"))
+    parts = {x: jax.tree.map(lambda rows: rows[:3], getattr(seen, x)) for x in kept}
     assert np.isnan(plots.speed(parts["position"], 0.1)).all()
     plots.save(tmp_path / "p.png", plots.sequence(seen._replace(**parts)))
 
