@@ -109,10 +109,7 @@ def rpe(
     ψ is the yaw error at the start (`relative_yaw`), so a wrong heading of the whole trajectory
     costs nothing. With `dims` 2 it is of the horizontal part.
     """
-
-    def turn(ours: Quaternions, true: Quaternions) -> Float[np.ndarray, "m 3 3"]:
-        return rotation_z(-relative_yaw(ours, true))
-
+    turn = rotation_z(-relative_yaw(estimate.orientation, reference.orientation))
     return _rms_of_moves(turn, estimate, reference, step, seconds, dims)
 
 
@@ -121,32 +118,28 @@ def rpe_se3(
 ) -> float:
     """The translation part of the relative pose error with the full attitude at the start aligned,
     over all pairs, m (TUM, evo): RMS of R_i R̂_iᵀ (p̂_j − p̂_i) − (p_j − p_i)."""
-
-    def turn(ours: Quaternions, true: Quaternions) -> Float[np.ndarray, "m 3 3"]:
-        return matrix_from_quaternion(true) @ np.swapaxes(matrix_from_quaternion(ours), 1, 2)
-
+    ours, true = (matrix_from_quaternion(each.orientation) for each in (estimate, reference))
+    turn = true @ np.swapaxes(ours, 1, 2)
     return _rms_of_moves(turn, estimate, reference, step, seconds, dims)
 
 
 def _rms_of_moves(
-    turn: Callable[[Quaternions, Quaternions], Float[np.ndarray, "m 3 3"]],
+    turn: Float[np.ndarray, "n 3 3"],
     estimate: Trajectory,
     reference: Trajectory,
     step: float,
     seconds: float,
     dims: int,
 ) -> float:
-    """RMS of the estimated displacements, turned by what the orientations at their starts say,
-    minus the true ones; over the pairs whose start has a trusted orientation too."""
+    """RMS of the estimated displacements, turned by the `turn` at their starts, minus the true
+    ones; over the pairs whose start has a trusted orientation too."""
     apart = round(seconds / step)
     if apart >= len(estimate.time):
         raise Undefined(f"no two trusted rows {seconds:g} s apart")
     moved, true = (x.position[apart:] - x.position[:-apart] for x in (estimate, reference))
-    ours, theirs = (x.orientation[:-apart] for x in (estimate, reference))
-    error = (np.einsum("nij,nj->ni", turn(ours, theirs), moved) - true)[:, :dims]
-    return _rms_of_pairs(
-        error, finite_rows(reference.position), apart, seconds, finite_rows(theirs)
-    )
+    error = (np.einsum("nij,nj->ni", turn[:-apart], moved) - true)[:, :dims]
+    known = finite_rows(reference.orientation[:-apart])
+    return _rms_of_pairs(error, finite_rows(reference.position), apart, seconds, known)
 
 
 def _rms_of_pairs(
