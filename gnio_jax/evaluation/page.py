@@ -23,7 +23,6 @@ from bokeh.plotting import figure as new_figure
 from bokeh.resources import Resources
 from jaxtyping import Float
 from jinja2 import Environment
-from markupsafe import Markup
 
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import colours, metrics, plots, tabulate
@@ -148,7 +147,7 @@ def render(title: str, runs: list[Run]) -> str:
     script, figures = components(document.roots)
     shown = [x for x in COLUMNS if any(x in own for run in runs for own in run.figures.values())]
     environment = Environment(autoescape=True)
-    environment.filters["breakable"] = _breakable
+    environment.filters["parts"] = re.compile(tabulate.PARTS).findall
     page = environment.from_string(_file("page.html"))
     about = runs[0].about
     return page.render(
@@ -164,11 +163,6 @@ def render(title: str, runs: list[Run]) -> str:
         library=Resources(mode="inline", components=["bokeh"]).render_js(),
         script=script,
     )
-
-
-def _breakable(name: str) -> Markup:
-    """A name that a browser breaks after its own marks, and not inside its words."""
-    return Markup("<wbr>").join(re.findall(tabulate.PARTS, name))
 
 
 def _file(name: str) -> str:

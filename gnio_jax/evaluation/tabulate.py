@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich import box
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, Group
+from rich.console import ConsoleOptions, Group
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
@@ -331,11 +331,11 @@ class _Name(NamedTuple):
 
     text: str
 
-    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+    def __rich_measure__(self, console: Any, options: ConsoleOptions) -> Measurement:
         longest = max(map(cell_len, re.findall(PARTS, self.text)), default=0)
         return Measurement(longest, cell_len(self.text)).with_maximum(options.max_width)
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterable[Text]:
+    def __rich_console__(self, console: Any, options: ConsoleOptions) -> Iterable[Text]:
         lines = [""]
         for part in re.findall(PARTS, self.text):
             if lines[-1] and cell_len(lines[-1] + part.rstrip()) > options.max_width:

@@ -136,8 +136,9 @@ def test_warnings_stand_before_the_figures_and_the_weights_once(estimates):
     assert text.index("it &lt;moves&gt;") < text.index('class="figures"') < text.index("of walks")
 
 
-def test_names_break_between_their_words():
-    assert str(page._breakable("a<b_c-d e")) == "a&lt;b_<wbr>c-<wbr>d <wbr>e"
+def test_names_break_between_their_words(estimates):
+    text = page.render("walk", [run_of([estimates[0]._replace(name="a<b_c-d e")])])
+    assert "<td>a&lt;b_<wbr>c-<wbr>d <wbr>e</td>" in text
 
 
 def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
