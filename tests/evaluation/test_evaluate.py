@@ -110,7 +110,10 @@ def test_a_void_filter_is_in_the_files(workdir, walks, monkeypatch):
     """Accelerations in the wrong unit: the sequence says so, and no figure is of it."""
     loaded = [walks[0]._replace(accel=1e3 * walks[0].accel), walks[1]]
     monkeypatch.setattr(data, "load", lambda *_: loaded)
+    module = sys.modules[evaluate.__module__]
+    monkeypatch.setattr(module, "folder_of", lambda workdir, *_: workdir / "eval" / "its own")
     done, found = asked(workdir, estimator="imu_only")
+    assert done.folder.name == "its own"
     void, whole = found["sequences"].values()
     assert void["notes"] == ["filter: diverged at 0.1 s; the poses from then on are invalid"]
     assert void["ate"] is None and "not finite from 0.1 s on" in void["reasons"]["ate"]

@@ -89,6 +89,7 @@ def test_recordings_of_another_folder_are_never_taken(run, tmp_path):
     (tmp_path / "other").mkdir()
     found = look(run, data_root=str(tmp_path / "other"))
     assert found.report is None and found.config.data_root == str(tmp_path / "other")
+    assert found.folder.name.startswith("tlio_test_ekf_other-")  # those of A stay where they are
     (tmp_path / "link").symlink_to(tmp_path / "data")
     assert look(run, data_root=str(tmp_path / "link")).problem == ""
     evaluation(run, estimator="integrate", filter={"gravity": 9.0})
