@@ -202,12 +202,14 @@ def read_about(place: Path) -> About:
         raise InputError(place, f"'{MANIFEST}' is no JSON ({error})", _DAMAGED) from None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise InputError(place, f"'{MANIFEST}' is not that of a package", _DAMAGED)
-    if found.get("version") != VERSION:
+    if found.get("version") == 1:
+        found = _of_version_1(place, found)
+    elif found.get("version") != VERSION:
         problem = f"has format version {found.get('version')!r}; this program reads {VERSION}"
         raise InputError(
             place, problem, "publish its run again, or install the gnio-jax that made it"
         )
-    if _digest(found) != found.get("sha256"):
+    elif _digest(found) != found.get("sha256"):
         raise InputError(place, f"'{MANIFEST}' was changed (SHA-256 differs)", _DAMAGED)
     for name, kind in get_type_hints(About).items():
         value = found.get(name)
@@ -216,6 +218,26 @@ def read_about(place: Path) -> About:
     if found["weights"].keys() != {"bytes", "sha256"}:
         raise InputError(place, f"'{MANIFEST}' does not describe '{WEIGHTS}'", _DAMAGED)
     return About(*(found[name] for name in About._fields))
+
+
+def _of_version_1(place: Path, found: dict[str, Any]) -> dict[str, Any]:
+    """The manifest of an earlier version, whose settings and card were files beside it."""
+    files = found.get("files")
+    described = files if isinstance(files, dict) else {}
+    texts = {}
+    for name in ("config.yaml", "README.md"):
+        content = _content(place, name, LARGEST_MANIFEST)
+        if fingerprint(content) != described.get(name):
+            problem = f"'{name}' is not the file that the manifest describes (SHA-256 differs)"
+            raise InputError(place, problem, _DAMAGED)
+        texts[name] = content.decode("utf-8", "replace")
+    config = configuration.parse(texts["config.yaml"], str(place / "config.yaml"))
+    return found | {
+        "measured": "",
+        "card": texts["README.md"].splitlines(),
+        "config": configuration.plain(config),
+        "weights": described.get(WEIGHTS),
+    }
 
 
 def _digest(manifest: dict[str, Any]) -> str:

@@ -185,7 +185,7 @@ def test_what_else_is_damaged(package, tmp_path, monkeypatch):
     """Weights that are too large are not read: a zip of megabytes may unpack to any size."""
     good = json.loads((package / "manifest.json").read_text())
     for changes, words in (
-        ({"version": 1}, ("format version 1", "publish its run again")),
+        ({"version": 3}, ("format version 3", "publish its run again")),
         ({"format": "other"}, ("not that of a package",)),
         ({"license": None}, ("no 'license'",)),
         ({"weights": {}}, ("does not describe",)),
@@ -211,6 +211,29 @@ def test_what_else_is_damaged(package, tmp_path, monkeypatch):
     refused(package, "'weights.safetensors' is missing")
     (tmp_path / "broken.zip").write_bytes(b"PK no zip")
     refused(tmp_path / "broken.zip", "cannot be read")
+
+
+def test_a_package_of_the_first_version(run, package):
+    """Its settings and its card are files, whose SHA-256 the manifest has."""
+    manifest = json.loads((package / "manifest.json").read_text())
+    wanted, card = packages.load_pretrained(package), manifest.pop("card")
+    (package / "config.yaml").write_text(configuration.text(wanted.config))
+    (package / "README.md").write_text("\n".join(card))
+    about = {name: manifest[name] for name in ("format", "name", "network", "data", "license")}
+    about |= {name: manifest[name] for name in ("epoch", "step", "made_by")} | {"version": 1}
+    contents = {path.name: path.read_bytes() for path in package.iterdir()}
+    about["files"] = {
+        name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+        for name, content in contents.items()
+        if name != "manifest.json"
+    }
+    (package / "manifest.json").write_text(json.dumps(about))
+    found = packages.load_pretrained(package)
+    assert found.config == wanted.config and found.step == wanted.step
+    jax.tree.map(np.testing.assert_array_equal, found.variables, wanted.variables)
+    assert packages.card_of(package).splitlines() == card
+    (package / "config.yaml").write_text("seed: 1")
+    refused(package, "'config.yaml' is not the file", "SHA-256")
 
 
 def test_names_are_found_and_listed(published, run, monkeypatch, tmp_path, gnio):
