@@ -34,7 +34,6 @@ from gnio_jax.evaluation.statistics import summarise
 from gnio_jax.files import file_stem, fingerprint, replacing, replacing_folder
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run, Which
-from gnio_jax.training.optimizer import filter_numbers
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """The packages that come with gnio-jax."""
@@ -272,7 +271,7 @@ def _run_of(place: Path, about: About, content: bytes) -> Run:
     shapes = models.variable_shapes(model, config.data.seen)
     template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
     variables = from_bytes(content, template, place / WEIGHTS)
-    return Run(config, model, variables, about.epoch, about.step, filter_numbers(config))
+    return Run(config, model, variables, about.epoch, about.step)
 
 
 def to_bytes(variables: Any) -> bytes:

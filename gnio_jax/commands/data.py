@@ -34,8 +34,6 @@ class _Dataset:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckOptions(_Dataset):
-    """What `gnio data check` is asked for."""
-
     plots: Folder | None = None
     """Folder for a picture of each recording: trajectory, speed, |accel|, gyro against reference,
     and where it is not valid."""
@@ -45,8 +43,6 @@ class CheckOptions(_Dataset):
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertOptions(_Dataset):
-    """What `gnio data convert` is asked for."""
-
     out: Annotated[Path, UNNAMED]
     """Folder for the result."""
     rate: Rate | None = None

@@ -17,8 +17,6 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scip
 
 @dataclass(frozen=True)
 class DoctorOptions:
-    """What `gnio doctor` is asked for."""
-
     json: bool = False
     """Print it as JSON."""
 

@@ -13,8 +13,6 @@ from gnio_jax.config.schema import UNNAMED, Positive
 
 @dataclass(frozen=True)
 class InteropOptions:
-    """What `gnio interop` is asked for."""
-
     checkpoint: Annotated[Path, UNNAMED]
     """File of the weights."""
     workdir: Annotated[Path, UNNAMED]

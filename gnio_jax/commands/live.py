@@ -30,8 +30,6 @@ DRAWN_EVERY = 0.125
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """What `gnio live` is asked for."""
-
     source: Annotated[str, UNNAMED] = "-"
     """- for standard input; udp:PORT from this machine, udp:0.0.0.0:PORT from any; a recording."""
     weights: str | None = None

@@ -16,8 +16,6 @@ HDF5 = (".h5", ".hdf5")
 
 @dataclass(frozen=True)
 class ImportFile:
-    """What `gnio data import` is asked for."""
-
     file: Annotated[Path, UNNAMED]
     """The recording, a file or a folder. If each sensor has its own CSV, give the gyro's."""
     out: NewFile
@@ -31,8 +29,6 @@ class ImportFile:
 
 @dataclass(frozen=True)
 class ExportFile:
-    """What `gnio data export` is asked for."""
-
     trajectory: Annotated[Path, UNNAMED]
     """File in TUM format."""
     out: Annotated[NewFile, UNNAMED]

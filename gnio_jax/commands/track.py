@@ -22,8 +22,6 @@ all."""
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """What `gnio track` is asked for."""
-
     file: Annotated[Path, UNNAMED]
     """The recording, a file or a folder. If each sensor has its own CSV, give the gyro's."""
     weights: str | None = None

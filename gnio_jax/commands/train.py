@@ -16,8 +16,6 @@ from gnio_jax.cores import usable_cores
 
 @dataclass(frozen=True)
 class TrainOptions(TrainConfig):
-    """What `gnio train` is asked for: an experiment, and where its settings come from."""
-
     config: Annotated[str | None, Words("FILE")] = None
     """YAML file of settings, or the name of one that comes with the package."""
     set: Annotated[tuple[str, ...], Words("SECTION.FIELD=VALUE", repeated=True)] = ()

@@ -15,8 +15,6 @@ from gnio_jax.errors import InputError
 
 @dataclass(frozen=True)
 class WeightsOptions:
-    """What `gnio weights` is asked for."""
-
     name: Annotated[str | None, UNNAMED] = None
     """Name, folder or zip of a package; by default all are listed."""
     out: Path | None = None
@@ -25,8 +23,6 @@ class WeightsOptions:
 
 @dataclass(frozen=True)
 class PublishOptions:
-    """What `gnio publish` is asked for."""
-
     run: Annotated[Path, UNNAMED]
     """Folder of the run; its best checkpoint is taken."""
     out: Path
@@ -43,8 +39,6 @@ class PublishOptions:
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What `gnio export` is asked for."""
-
     run: Annotated[str, UNNAMED]
     """Folder of the run, a package or its name."""
     out: Path | None = None

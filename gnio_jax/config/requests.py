@@ -24,8 +24,6 @@ CalibratedGroup = Literal["measurement", "noise", "start", "window"]
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """What `gnio evaluate` is asked for."""
-
     workdir: str | None = None
     """Folder of the run, with its config.yaml and checkpoints; by default the newest below runs/.
     Results go to its folder eval/."""
@@ -72,8 +70,6 @@ class EvaluateConfig:
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """What `gnio calibrate` is asked for."""
-
     workdir: str | None = None
     """Folder of the run; by default the newest below runs/."""
     out: str | None = None
@@ -101,8 +97,6 @@ class CalibrateConfig:
 
 @dataclass(frozen=True)
 class TablesConfig:
-    """What `gnio tables` is asked for."""
-
     table: Annotated[Table, Words("TABLE", named=False)]
     """complexity, comparison, components, gates, bank-size, trajectories or standing."""
     base: str = "quickstart"
@@ -130,8 +124,6 @@ class TablesConfig:
 
 @dataclass(frozen=True)
 class CompareConfig:
-    """What `gnio compare` is asked for."""
-
     rows: Annotated[tuple[str, ...], Words("RUNS", named=False)]
     """Runs, the one to compare with first. A name without its seed stands for all seeds: runs/gnio
     for runs/gnio_s0, runs/gnio_s1, ... The folder of an evaluation stands for itself."""

@@ -66,8 +66,6 @@ class Run(NamedTuple):
     variables: Any
     epoch: int
     step: int
-    filter: dict[str, Any] = {}
-    """Numbers of the filter (`optimizer.filter_numbers`), where they were trained."""
 
 
 def exists(workdir: Path, which: Which = "latest") -> bool:
@@ -158,9 +156,9 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
         where = _folder(workdir, which)
         raise InputError(where, "holds parameters that are not finite", remedy) from None
     variables = jax.tree.map(parallel.fresh_copy, variables)
-    numbers = variables.pop("filter", {})
-    config = dataclasses.replace(config, filter=trained_settings(config.filter, numbers))
-    return Run(config, model, variables, position.epoch, position.step, numbers)
+    settings = trained_settings(config.filter, variables.pop("filter", {}))
+    config = dataclasses.replace(config, filter=settings)
+    return Run(config, model, variables, position.epoch, position.step)
 
 
 def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:

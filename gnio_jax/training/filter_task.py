@@ -16,6 +16,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Int, PRNGKeyArray
 
 from gnio_jax import models, parallel
@@ -35,7 +36,7 @@ from gnio_jax.training.segments import (
     segment_source,
     turned_segment,
 )
-from gnio_jax.training.task import BatchLosses, Progress, Row, Task, TrainState, size_of
+from gnio_jax.training.task import BatchLosses, Progress, Row, Task, TrainState
 from gnio_jax.types import Sequence
 
 CHECKPOINT_EVERY = 20
@@ -72,7 +73,7 @@ class FilterTask(Task):
         optim, learn = self.config.optim, self.config.through_filter.learn
         yield (
             f"{self.config.model.name} in the filter's loop: {' and '.join(learn)} learn, "
-            f"{size_of(self.trainable(state.variables)):,} numbers, on "
+            f"{optax.tree.size(self.trainable(state.variables)):,} numbers, on "
             f"{jax.devices()[0].platform}, {self.steps_per_epoch} steps of {optim.batch_size} "
             f"segments an epoch, {optim.epochs} epochs → {workdir}"
         )

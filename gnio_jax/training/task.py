@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import linen as nn
+from flax import traverse_util
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from gnio_jax import models, parallel
@@ -294,14 +295,5 @@ def visits(count: int, weight: float) -> int:
 
 def overlaid(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     """`tree` with the leaves that `other` has in the same places."""
-    return {
-        name: overlaid(leaf, other.get(name, {}))
-        if isinstance(leaf, dict)
-        else other.get(name, leaf)
-        for name, leaf in tree.items()
-    }
-
-
-def size_of(parameters: Any) -> int:
-    """Numbers in a tree of arrays."""
-    return sum(leaf.size for leaf in jax.tree.leaves(parameters))
+    own, given = (traverse_util.flatten_dict(each, keep_empty_nodes=True) for each in (tree, other))
+    return traverse_util.unflatten_dict({path: given.get(path, own[path]) for path in own})

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import optax
 from flax import linen as nn
 from jaxtyping import Float, Int, PRNGKeyArray
 
@@ -32,7 +33,7 @@ from gnio_jax.data.windows import (
 )
 from gnio_jax.models.layers import MOMENTUM
 from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
-from gnio_jax.training.task import BatchLosses, Row, Task, TrainState, size_of
+from gnio_jax.training.task import BatchLosses, Row, Task, TrainState
 from gnio_jax.types import Prediction, Sequence, Windows
 
 
@@ -57,8 +58,9 @@ class WindowTask(Task):
 
     def description(self, state: TrainState, workdir: Path) -> Iterator[str]:
         optim, steps = self.config.optim, self.steps_per_epoch
+        count = optax.tree.size(state.variables["params"])
         yield (
-            f"{self.config.model.name}: {size_of(state.variables['params']):,} parameters on "
+            f"{self.config.model.name}: {count:,} parameters on "
             f"{parallel.described()}, {steps} steps of {optim.batch_size} windows an epoch, "
             f"{optim.epochs} epochs → {workdir}"
         )
