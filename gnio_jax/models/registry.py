@@ -66,8 +66,8 @@ def register(name: str, network: type[nn.Module]) -> None:
 def options(name: str) -> dict[str, Any]:
     """The options of the network `name` and their types. Raises `InputError` for an unknown
     name."""
-    title = "models (the program that registers one of your own knows that one, too)"
-    network = _MODELS[_known(name, names(), f"model '{name}'", "unknown", title)]
+    own = "; the program that registers one of your own knows that one, too"
+    network = _MODELS[_known(name, names(), f"model '{name}'", "unknown", "models", own)]
     types = get_type_hints(network, include_extras=True)
     own = {field.name: types[field.name] for field in dataclasses.fields(network)}
     own |= {"equivariance": Literal["none", *_EQUIVARIANT]}
@@ -104,11 +104,13 @@ def create(name: str, **given: Any) -> nn.Module:
     return network if equivariance == "none" else _EQUIVARIANT[equivariance](network)
 
 
-def _known(word: str, known: Iterable[str], place: str, problem: str, title: str) -> str:
+def _known(
+    word: str, known: Iterable[str], place: str, problem: str, title: str, more: str = ""
+) -> str:
     """The word, if it is one of the known ones. Raises `InputError` that names them, the closest
     first."""
     if word not in known:
-        remedy = f"{did_you_mean(word, known)}known {title}: {', '.join(known)}"
+        remedy = f"{did_you_mean(word, known)}known {title}: {', '.join(known)}{more}"
         raise InputError(place, problem, remedy)
     return word
 
