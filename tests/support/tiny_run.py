@@ -89,7 +89,8 @@ def rows(workdir):
 def arrays(workdir, which="latest"):
     """What a run has learnt: its network's variables and its filter's numbers."""
     run = checkpoint.load_run(Path(workdir), which)
-    return jax.tree.map(np.asarray, (run.variables, run.filter))
+    numbers = run.config.filter.noise, run.config.filter.start
+    return jax.tree.map(np.asarray, (run.variables, numbers))
 
 
 def same(a, b):
