@@ -44,7 +44,7 @@ def recordings(samples: int, batch: int) -> WindowSource:
         displacement=rng.standard_normal((count, 3), np.float32),
         step=np.zeros((rows, 3), np.float32),
         unyaw=np.tile(np.float32([1, 0]), (count, 1)),
-        recording=np.tile(np.int32([0, rows - 1]), (count, 1)),
+        stretch=np.tile(np.int32([0, rows - 1]), (count, 1)),
         visited=np.arange(count, dtype=np.int32),
     )
     return jax.device_put(source)
