@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from gnio_jax.config import CompareConfig, EvaluateConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept, tabulate
+from gnio_jax.evaluation import kept, statistics, tabulate
 from gnio_jax.evaluation.kept import IDENTITY
 from gnio_jax.evaluation.metrics import NAMES
 from gnio_jax.evaluation.report import REMEDY, Report, read
@@ -60,15 +60,10 @@ class Row(NamedTuple):
 
     def recordings(self, metric: str | None = None) -> set[str]:
         """Those that all seeds have, also with a value of a metric."""
-        found = [
-            {
-                n
-                for n, own in each.scores.items()
-                if not metric or own.values.get(metric) is not None
-            }
-            for each in self.reports
-        ]
-        return set.intersection(*found)
+        seeds = [each.scores for each in self.reports]
+        if metric is not None:
+            return set(statistics.values(seeds, metric))
+        return set.intersection(*map(set, seeds))
 
 
 class Comparison(NamedTuple):
