@@ -167,7 +167,8 @@ def _check_compression(path: Path) -> None:
     with (path / "metadata.yaml").open(encoding="utf-8") as file:
         content = yaml.safe_load(file)
     about = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
-    if isinstance(about, dict) and str(about.get("compression_mode")).lower() == "file":
+    mode = about.get("compression_mode") if isinstance(about, dict) else None
+    if isinstance(mode, str) and mode.lower() == "file":
         remedy = "unpack its file (zstd -d FILE.zstd) and import that"
         raise InputError(path, "is compressed as a whole (compression_mode FILE)", remedy)
 
