@@ -25,7 +25,6 @@ Tree = TypeVar("Tree")
 
 BATCH = "batch"
 """Name of the mesh's axis along which devices share a batch."""
-HIGHEST_PORT = 65535
 
 
 def initialise(distributed: str | None = None, devices: int | None = None) -> None:
@@ -45,7 +44,7 @@ def initialise(distributed: str | None = None, devices: int | None = None) -> No
         host_port, *numbers = distributed.split(",")
         host, _, port = host_port.rpartition(":")
         whole = all(re.fullmatch("[0-9]{1,5}", each) for each in (port, *numbers))
-        if not (host and len(numbers) == 2 and whole and 0 < int(port) <= HIGHEST_PORT):
+        if not (host and len(numbers) == 2 and whole and 0 < int(port) < 2**16):
             problem = f"must be HOST:PORT,PROCESSES,ID, found '{distributed}'"
             raise InputError("--distributed", problem, "such as 10.0.0.1:4321,2,0")
         given = host_port, int(numbers[0]), int(numbers[1])

@@ -66,8 +66,8 @@ def register(name: str, network: type[nn.Module]) -> None:
 def options(name: str) -> dict[str, Any]:
     """The options of the network `name` and their types. Raises `InputError` for an unknown
     name."""
-    own = "; the program that registers one of your own knows that one, too"
-    network = _MODELS[_known(name, names(), f"model '{name}'", "unknown", "models", own)]
+    more = "; the program that registers one of your own knows that one, too"
+    network = _MODELS[_known(name, names(), f"model '{name}'", "unknown", "models", more)]
     types = get_type_hints(network, include_extras=True)
     own = {field.name: types[field.name] for field in dataclasses.fields(network)}
     own |= {"equivariance": Literal["none", *_EQUIVARIANT]}

@@ -303,6 +303,6 @@ def learnt_from(workdir: Path, config: TrainConfig, dataset: str) -> set[str]:
 
 def recordings_by_name(recordings: Any) -> dict[str, int | None]:
     """Recordings and their lengths in samples; None where names alone are known."""
-    if isinstance(recordings, list):
-        return dict.fromkeys(map(str, recordings))
-    return recordings if isinstance(recordings, dict) else {}
+    if isinstance(recordings, dict):
+        return {str(name): length for name, length in recordings.items()}
+    return dict.fromkeys(map(str, recordings)) if isinstance(recordings, list) else {}
