@@ -20,6 +20,9 @@ import tests.support.type_checks  # noqa: F401  (found by its name, below)
 
 # Each worker has one core: a module in many parts, to be compiled at once, is only more work.
 COMPILER = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
+# What the passes over loops find saves nothing in loops of a few rounds: a seventh of the time.
+LOOPS = "simplify-while-loops", "while-loop-constant-sinking", "while-loop-invariant-code-motion"
+COMPILER.append(f"--xla_disable_hlo_passes={','.join(LOOPS)}")
 if version("jax").startswith("0.10."):  # removed later, and XLA stops at a flag it does not know
     # Fusions as LLVM's loops instead of MLIR's: a third of the time to compile a filter.
     COMPILER.append("--xla_cpu_use_fusion_emitters=false")

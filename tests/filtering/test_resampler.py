@@ -68,7 +68,7 @@ def amplitudes(columns):
 )
 def test_pure_tones(rate, dt, jitter, highest):
     """The pass band within 1 %, without delay against the stamps; the stop band 40 dB down."""
-    stamps = stamps_of(rate, 1.2, jitter)
+    stamps = stamps_of(rate, 0.8, jitter)
     delay = create_grid(dt, imu_rate=float(rate)).delay
     assert 21 * dt < delay < 22.01 * dt
     inside = slice(round(0.3 / dt), None)  # at the start the FIR's reach is filled by reflection
@@ -231,7 +231,7 @@ def test_a_lost_sample_of_a_slower_imu_is_no_hole(share, most):
         """140 Hz and 10 Hz, each in three phases."""
         return np.concatenate([tones(140.0, time)[:, ::2], tones(10.0, time)[:, ::2]], axis=1)
 
-    stamps = stamps_of(250, 5.0)
+    stamps = stamps_of(250, 3.0)
     lost = np.random.default_rng(0).uniform(size=len(stamps)) < share
     lost[[0, -1]] = False
     alone = lost & ~np.roll(lost, 1) & ~np.roll(lost, -1)
