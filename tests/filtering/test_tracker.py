@@ -486,9 +486,22 @@ def workdir(tmp_path_factory):
         yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", config)
 
 
+@pytest.fixture(scope="module")
+def compiled_once():
+    """`compile_programs` for the one network that is replayed."""
+    compile_programs, made = online.compile_programs, []
+
+    def programs(*given):
+        made[:] = made or [compile_programs(*given)]
+        return made[0]
+
+    return programs
+
+
 @pytest.fixture
-def replay(monkeypatch, tmp_path):
+def replay(monkeypatch, tmp_path, compiled_once):
     """examples/replay_csv.py's own main: (arguments) -> None, in an empty folder."""
+    monkeypatch.setattr(online, "compile_programs", compiled_once)
     spec = importlib.util.spec_from_file_location("replay_csv", ROOT / "examples" / "replay_csv.py")
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "replay_csv", module)
