@@ -7,6 +7,7 @@ compiler optimises nothing, here and in the processes that tests start.
 import atexit
 import ctypes
 import gc
+import importlib
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -34,6 +35,11 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # programs too.
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
+# Python compiles what is imported for the first time. Workers that begin at two ends share this.
+if os.environ.get("PYTEST_XDIST_WORKER", "gw0")[-1] in "13579":
+    for name in ("bokeh.plotting", "matplotlib.figure", "pandas", "scipy.signal", "scipy.stats"):
+        importlib.import_module(name)
+
 # Every annotated shape and type is checked, in the tests alone.
 install_import_hook("gnio_jax", "tests.support.type_checks.when_called")
 
@@ -53,15 +59,21 @@ LONGEST = (
     "test_parallel.py",
     "test_installed.py",
     "tables/test_make.py",
-    "training/test_through_filter.py",
     "calibration/test_calibrate.py",
-    "data/readers/test_oxiod.py",
+    "training/test_through_filter.py",
     "filtering/test_derivatives.py",
     "filtering/test_tracker.py",
-    "filtering/test_considered.py",
-    "filtering/test_smoother.py",
+    "evaluation/test_estimate.py",
     "filtering/test_consistency.py",
+    "filtering/test_smoother.py",
+    "filtering/test_considered.py",
+    "filtering/test_scan.py",
     "training/test_loop.py",
+    "filtering/test_run_odometry.py",
+    "models/test_contract.py",
+    "evaluation/test_evaluate.py",
+    "apps/test_live.py",
+    "data/readers/test_oxiod.py",
     "test_docs.py",
     "data/test_fuzz.py",
 )

@@ -239,24 +239,35 @@ def cut_by_hand(every):
     return scan
 
 
+RANDOM = np.random.default_rng(2)
+ARGUMENTS = (
+    np.array([0.3, -0.2]),
+    {
+        "turn": 0.3 * RANDOM.standard_normal((13, 2, 2)),
+        "push": 0.3 * RANDOM.standard_normal((13, 2)),
+    },
+)
+
+
+def derivatives(scan):
+    return quick(jax.value_and_grad(functools.partial(scanned, scan), (0, 1)))(*ARGUMENTS)
+
+
+@functools.cache
+def derivatives_by_hand(cut):
+    return derivatives(cut_by_hand(cut) if cut else jax.lax.scan)
+
+
 @pytest.mark.parametrize("every, cut", [(4, 0), (13, 0), (50, 0), (0, 5), (2, 5), (5, 5), (3, 20)])
 def test_checkpoints_and_cuts_of_any_scan(every, cut):
     """Whole blocks or not: checkpoints change no number, and cuts none but the gradient."""
-    rng = np.random.default_rng(2)
-    inputs = {
-        "turn": 0.3 * rng.standard_normal((13, 2, 2)),
-        "push": 0.3 * rng.standard_normal((13, 2)),
-    }
-    arguments = np.array([0.3, -0.2]), inputs
     blocked = functools.partial(blocked_scan, checkpoint_every=every, truncate_every=cut)
-    found, wanted = (
-        quick(jax.value_and_grad(functools.partial(scanned, scan), (0, 1)))(*arguments)
-        for scan in (blocked, cut_by_hand(cut) if cut else jax.lax.scan)
-    )
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, wanted
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12),
+        derivatives(blocked),
+        derivatives_by_hand(cut),
     )
-    text = str(jax.make_jaxpr(jax.grad(functools.partial(scanned, blocked)))(*arguments))
+    text = str(jax.make_jaxpr(jax.grad(functools.partial(scanned, blocked)))(*ARGUMENTS))
     assert ("remat" in text or "checkpoint" in text) == (0 < every < (min(cut, 13) or 13))
 
 

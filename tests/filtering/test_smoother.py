@@ -30,13 +30,13 @@ def displaced(past, now):
     return np.einsum("...ji,...j->...i", yaw_matrix(past[0]), now[2] - past[2])
 
 
-def walk(seed, still=0, intervals=INTERVALS):
+def walk(seed, still=0):
     """The truth (start and the end of every interval), the filter's start, gyro, accel,
     displacements and their covariances.
 
     The first `still` intervals are at rest."""
     rng = np.random.default_rng(seed)
-    samples = N * intervals
+    samples = N * INTERVALS
     moving = (np.arange(samples) >= still * N)[:, None]
     rate, force = (moving * rng.normal(0, size, (samples, 3)) for size in (1.0, 2.0))
     x = (
@@ -55,8 +55,8 @@ def walk(seed, still=0, intervals=INTERVALS):
             truth.append(x)
     gyro = gyro + WHITE[0] * rng.normal(size=gyro.shape)
     accel = accel + WHITE[1] * rng.normal(size=gyro.shape)
-    displacement, covariance = np.full((intervals, 3), np.nan), np.full((intervals, 3, 3), np.nan)
-    for k in range(CLONES, intervals):
+    displacement, covariance = np.full((INTERVALS, 3), np.nan), np.full((INTERVALS, 3, 3), np.nan)
+    for k in range(CLONES, INTERVALS):
         root = SMALL * (np.eye(3) + 0.3 * rng.normal(size=(3, 3)))
         past, now = truth[k + 1 - CLONES], truth[k + 1]
         displacement[k] = displaced(past, now) + root @ rng.normal(size=3)
@@ -163,11 +163,11 @@ def drawn_fixes(truth):
     return fixes
 
 
-def laid(fixes, intervals=INTERVALS):
+def laid(fixes):
     """As the filter takes them."""
     rows, position, covariance, before = (np.stack(column) for column in zip(*fixes, strict=True))
     time = (rows + 1) * GATED.clone_seconds - before
-    return (filtering.fixes_on_intervals(time, position, covariance, intervals, GATED),)
+    return (filtering.fixes_on_intervals(time, position, covariance, INTERVALS, GATED),)
 
 
 def assert_most_probable(filtered, smoothed, wanted, spread):
@@ -219,25 +219,27 @@ def test_equals_least_squares_over_all_states():
 
 def test_goes_on_from_a_state_with_clones():
     """What is known of the second half of a run does not depend on where the filter was stopped
-    before it."""
-    _, start, *signals = walk(5, intervals=2 * INTERVALS)
-    nothing = [(0, np.full(2, np.nan), np.eye(2), 0.0)]
-    whole, half = laid(nothing, 2 * INTERVALS), laid(nothing)  # the programs of the test above
-    samples, rows = N * INTERVALS, INTERVALS
-    early = [x[:count] for x, count in zip(signals, (samples, samples, rows, rows), strict=True)]
-    late = [x[count:] for x, count in zip(signals, (samples, samples, rows, rows), strict=True)]
+    before it, nor on what comes after it without a measurement."""
+    _, start, *signals = walk(5)
+    measurements = laid([(0, np.full(2, np.nan), np.eye(2), 0.0)])  # the programs of the test above
+    half = INTERVALS // 2
     state = filtering.initial_state(GATED, *start, STD)
-    wanted = filtering.smooth(state, *signals, GATED, NOISE, measurements=whole)
-    state, _ = filtering.run_filter(state, *early, GATED, NOISE, measurements=half)
-    found = filtering.smooth(state, *late, GATED, NOISE, measurements=half)
-    sigma = np.sqrt(np.asarray(wanted.covariance_diagonal)[INTERVALS:])
+    wanted = filtering.smooth(state, *signals, GATED, NOISE, measurements=measurements)
+    counts = N * half, N * half, half, half
+    early = [x[:count] for x, count in zip(signals, counts, strict=True)]
+    state, _ = filtering.run_filter(state, *early, GATED, NOISE)
+    # Filled up to the length of the first run.
+    late = [np.roll(x, -count, axis=0) for x, count in zip(signals, counts, strict=True)]
+    late[2][half:] = np.nan
+    found = filtering.smooth(state, *late, GATED, NOISE, measurements=measurements)
+    sigma = np.sqrt(np.asarray(wanted.covariance_diagonal)[half:])
     for name in wanted._fields[:5]:
         np.testing.assert_allclose(
-            getattr(found, name), getattr(wanted, name)[INTERVALS:], atol=1e-7 * SMALL
+            getattr(found, name)[:half], getattr(wanted, name)[half:], atol=1e-7 * SMALL
         )
     scale = sigma[:, :, None] * sigma[:, None, :]
     np.testing.assert_allclose(
-        found.covariance / scale, wanted.covariance[INTERVALS:] / scale, atol=1e-8
+        found.covariance[:half] / scale, wanted.covariance[half:] / scale, atol=1e-8
     )
 
 

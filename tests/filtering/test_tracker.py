@@ -486,22 +486,9 @@ def workdir(tmp_path_factory):
         yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", config)
 
 
-@pytest.fixture(scope="module")
-def compiled_once():
-    """`compile_programs` for the one network that is replayed."""
-    compile_programs, made = online.compile_programs, []
-
-    def programs(*given):
-        made[:] = made or [compile_programs(*given)]
-        return made[0]
-
-    return programs
-
-
 @pytest.fixture
-def replay(monkeypatch, tmp_path, compiled_once):
+def replay(monkeypatch, tmp_path):
     """examples/replay_csv.py's own main: (arguments) -> None, in an empty folder."""
-    monkeypatch.setattr(online, "compile_programs", compiled_once)
     spec = importlib.util.spec_from_file_location("replay_csv", ROOT / "examples" / "replay_csv.py")
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "replay_csv", module)
@@ -531,6 +518,7 @@ def write_walk(path, seconds=6.0, rate=120):
     return time
 
 
+@pytest.mark.slow
 def test_a_recording_is_replayed(workdir, replay, tmp_path, monkeypatch, capsys):
     """Through the low-pass of a faster IMU; with the network of gnio-jax, else the newest run, as
     by every command."""
@@ -561,7 +549,10 @@ def test_a_recording_is_replayed(workdir, replay, tmp_path, monkeypatch, capsys)
         (["--csv", "walk.csv", "--rest-seconds", "0"], "--rest-seconds: rest_seconds: must be a n"),
     ],
 )
-def test_mistakes_of_a_replay_are_one_line(workdir, replay, tmp_path, capsys, arguments, words):
+def test_mistakes_of_a_replay_are_one_line(
+    workdir, replay, tmp_path, monkeypatch, capsys, arguments, words
+):
+    monkeypatch.setattr(online, "compile_programs", lambda *_: (None, None))  # no pose is made
     write_walk(tmp_path / "walk.csv")
     lines = (tmp_path / "walk.csv").read_text().splitlines()
     (tmp_path / "short.csv").write_text("\n".join(lines[:30]))

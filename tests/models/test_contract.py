@@ -43,7 +43,16 @@ FIRST = {("value", "bias"), ("output", "bias"), ("output", "kernel")}
 attends to makes no difference."""
 
 
-@pytest.mark.parametrize("name", sorted({*models.names()} - {"imot_text"}))
+SLOW = {"ctin", "deepils", "imot"}
+"""To compile; each is compared with NumPy in a test of its own."""
+NETWORKS = [
+    pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
+    for name in models.names()
+    if name != "imot_text"
+]
+
+
+@pytest.mark.parametrize("name", NETWORKS)
 def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(name, monkeypatch):
     """Whatever the windows come in; of networks with fewer layers. `imot_text` is `imot` with other
     numbers of them."""
