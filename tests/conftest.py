@@ -59,6 +59,8 @@ LONGEST = (
     "test_parallel.py",
     "test_installed.py",
     "tables/test_make.py",
+    "training/test_recordings.py",
+    "training/test_window_task.py",
     "calibration/test_calibrate.py",
     "training/test_through_filter.py",
     "filtering/test_derivatives.py",

@@ -225,9 +225,7 @@ TRAIN = lightly_optimised(task.train_steps.__wrapped__, static_argnames="task")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "width, seeds, count", [(16, range(4), 200), (32, [0], 200), (64, [0], 60)]
-)
+@pytest.mark.parametrize("width, seeds, count", [(16, [0, 1], 100), (32, [0], 100), (64, [0], 60)])
 def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds, count):
     """In the first steps the largest norm of the gradient of the head stays within 100 times the
     median.
