@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.apps.importing import units
 from gnio_jax.apps.track import tracking_filter
-from gnio_jax.data.parsing import units
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory

@@ -34,7 +34,7 @@ class Recording(NamedTuple):
     uniform clock, but not self-checked. Raises `InputError` where a file is damaged, `Refusal`
     where the recording is of no use."""
     files: tuple[Path, ...] = ()
-    """The files that its sequences are made of."""
+    """The files that its sequences are made of; some may be absent."""
     slow: bool = False
     """Whether `read` is slow. Then the cache keeps its result, and processes share the work."""
     attributes: dict[str, Any] = {}

@@ -25,6 +25,8 @@ from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
 from gnio_jax.types import Sequence, Waypoints
 
+HDF5 = (".h5", ".hdf5")
+"""Endings of the package's own files."""
 _FORMAT = "gnio-jax sequence 1"
 _OPTIONAL_FIELDS = ("device_orientation", "imu_valid")
 _FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")
@@ -148,19 +150,15 @@ def cache_folder() -> Path:
 def cache_entry(name: str, files: Iterable[str | os.PathLike[str]]) -> Path:
     """The file that keeps the reading of the recording `name` (with its form) from these files.
 
-    It has another name as soon as a file has another path, size or modification time, or a source
-    file of the package that takes part in reading is another. What stands before the "-" is that of
-    the recording, told by its name and its first file. Raises `InputError` for a file that is
-    missing.
+    It has another name as soon as a file has another path, size or modification time, comes or
+    goes, or a source file of the package that takes part in reading is another. What stands before
+    the "-" is that of the recording, told by its name and its first file.
     """
     states = []
-    for file in files:
-        path = Path(file).absolute()
-        try:
-            status = path.stat()
-        except OSError as error:
-            raise InputError(path, f"cannot be read ({error.strerror})") from None
-        states.append([str(path), status.st_size, status.st_mtime_ns])
+    for path in (Path(file).absolute() for file in files):
+        states.append([str(path)])
+        with contextlib.suppress(OSError):  # a file that is absent
+            states[-1] += [path.stat().st_size, path.stat().st_mtime_ns]
     recording, state = (
         hashlib.sha256(json.dumps(each).encode()).hexdigest()[:32]
         for each in ([name, [path for path, *_ in states[:1]]], [_sources(), states])

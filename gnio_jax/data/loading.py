@@ -4,13 +4,12 @@ several processes), check them, and write them in the package's own form."""
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from pathlib import Path
@@ -146,7 +145,7 @@ def _read_all(recordings: list[Recording], workers: int, progress: Progress) -> 
     """The reading of each of them, in their order: by processes of what is slow to read and not in
     the cache. What is quick is not worth a process, and the pipe that its sequences come through.
     """
-    slow = [each for each in recordings if workers > 1 and _must_be_made(each)]
+    slow = [e for e in recordings if workers > 1 and e.slow and not _entry(e).is_file()]
     readings = in_processes(read_recording, [(each,) for each in slow], workers, progress)
     sent, died = {id(each) for each in slow}, False
     for recording in recordings:
@@ -187,7 +186,7 @@ def _read_form(form: Recording) -> Reading:
         warnings.simplefilter("always")
         try:
             if form.slow:
-                entry = cache_entry(f"{form.name} {form.form}", form.files)
+                entry = _entry(form)
                 if (kept := read_reading(entry)) is not None:
                     return kept
             reading = Reading(form.read())
@@ -201,13 +200,9 @@ def _read_form(form: Recording) -> Reading:
     return reading
 
 
-def _must_be_made(recording: Recording) -> bool:
-    """Whether reading is slow: its sequences are not in the cache."""
-    try:
-        name = f"{recording.name} {recording.form}"
-        return recording.slow and not cache_entry(name, recording.files).is_file()
-    except InputError:  # a file is gone: reading will say so
-        return False
+def _entry(form: Recording) -> Path:
+    """Where the cache keeps this form of a recording."""
+    return cache_entry(f"{form.name} {form.form}", form.files)
 
 
 # --- processes
@@ -239,32 +234,25 @@ def in_processes(
             progress(number / len(items))
             yield result
         return
-    # Processes are spawned: a fork after JAX has started its threads can hang. Ctrl-C is this
-    # process's to answer.
-    spawn, ignore = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)
-    pool = ProcessPoolExecutor(workers, spawn, initializer=signal.signal, initargs=ignore)
+    from loky import ProcessPoolExecutor  # it takes a fifth of a second to import
 
-    def submit(item: tuple) -> Future[Result]:
-        try:
-            return pool.submit(function, *item)
-        except OSError as error:
-            # A process that dies while the next one is started closes the pipes between them, and
-            # Python meets a closed pipe.
-            raise BrokenProcessPool(str(error)) from error
-
-    with pool:
-        try:
-            left, waiting = iter(items), deque[Future[Result]]()
-            for number in range(1, len(items) + 1):
-                waiting.extend(map(submit, islice(left, workers + 2 - len(waiting))))
-                result = waiting.popleft().result()
-                progress(number / len(items))
-                yield result
-        except BrokenProcessPool:
-            problem = "a process died, perhaps because memory ran out"
-            raise ProcessDied("--workers", problem, "try --workers 1") from None
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    # Python's own pool can wait for ever for a process that died while another one started. Ctrl-C
+    # is this process's to answer.
+    ignore = (signal.SIGINT, signal.SIG_IGN)
+    pool = ProcessPoolExecutor(workers, initializer=signal.signal, initargs=ignore)
+    try:
+        left, waiting = iter(items), deque[Future[Result]]()
+        for number in range(1, len(items) + 1):
+            new = islice(left, workers + 2 - len(waiting))
+            waiting.extend(pool.submit(function, *item) for item in new)
+            result = waiting.popleft().result()
+            progress(number / len(items))
+            yield result
+    except BrokenProcessPool:
+        problem = "a process died, perhaps because memory ran out"
+        raise ProcessDied("--workers", problem, "try --workers 1") from None
+    finally:
+        pool.shutdown(wait=False, kill_workers=True)
 
 
 # --- the recordings of a whole dataset: finding, checking, writing

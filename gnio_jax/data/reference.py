@@ -164,7 +164,7 @@ def _fused(
     poses = poses.rows(np.concatenate(sure)) if sure else poses
     stamps, nothing = poses.time, np.full((len(clock), 4), np.nan)
     unknown = Reference(nothing, nothing[:, :3], nothing[:, :3], np.zeros(len(clock), dtype=bool))
-    measured = known_at(stamps, np.ones(len(stamps), dtype=bool), clock, usual)
+    measured = known_at(stamps, clock, usual)
     if measured.sum() < SHORTEST_RUN:
         return unknown
     turned = slerp(clock, stamps, poses.attitude)
@@ -183,8 +183,7 @@ def _fused(
         return unknown
     close = np.linalg.norm(smoothed - interpolate(clock, clock[sure], place[sure]), axis=1)
     gap = bridge + 2.0 * step  # between rows of the clock that lie beside the poses
-    bridged = known_at(clock[sure], np.ones(len(sure), dtype=bool), clock, gap)
-    bridged &= known_at(stamps, np.ones(len(stamps), dtype=bool), clock, bridge)
+    bridged = known_at(clock[sure], clock, gap) & known_at(stamps, clock, bridge)
     return Reference(quaternions(fused), smoothed, velocity, bridged & (close < LARGEST_JUMP))
 
 

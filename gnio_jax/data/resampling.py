@@ -58,7 +58,7 @@ def resampled(
     """
     step = float(np.median(np.diff(time)))
     factor, broken = decimation_factor(1.0 / step, rate), np.diff(time) > SPLINE_INTERVALS * step
-    measured = known_at(time, np.ones(len(time), dtype=bool), clock, longest_bridge(1.0 / step))
+    measured = known_at(time, clock, longest_bridge(1.0 / step))
     if factor == 1:
         return splined(time, values, clock, broken), measured
     fine = clock[0] + np.arange((len(clock) - 1) * factor + 1) / (rate * factor)
@@ -87,7 +87,7 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
     imu = np.concatenate([sequence.gyro, sequence.accel], axis=1)
     imu, measured = resampled(time, imu, clock, rate)
     if sequence.imu_valid is not None:
-        measured = known_at(time, sequence.imu_valid, clock, bridge)
+        measured = known_at(time, clock, bridge, sequence.imu_valid)
     device = sequence.device_orientation
     return sequence._replace(
         time=clock,
@@ -96,7 +96,7 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
         orientation=slerped(time, sequence.orientation, clock),
         position=splined(time, sequence.position, clock, broken),
         velocity=splined(time, sequence.velocity, clock, broken),
-        valid=known_at(time, valid, clock, bridge),
+        valid=known_at(time, clock, bridge, valid),
         device_orientation=None if device is None else slerped(time, device, clock),
         imu_valid=None if measured.all() else measured,
     )
@@ -120,13 +120,15 @@ def between(
 
 def known_at(
     time: Float[np.ndarray, " n"],
-    known: Bool[np.ndarray, " n"],
     clock: Float[np.ndarray, " m"],
     longest: float,
+    known: Bool[np.ndarray, " n"] | bool = True,
 ) -> Bool[np.ndarray, " m"]:
-    """Where a clock lies between known samples that are no more than `longest` (s) apart."""
+    """Where a clock lies between samples, both `known`, that are no more than `longest` (s)
+    apart."""
     left, right, _ = between(time, clock)
     covered = (clock >= time[0] - SAME_STAMP) & (clock <= time[-1] + SAME_STAMP)
+    known = np.broadcast_to(known, time.shape)
     return known[left] & known[right] & (time[right] - time[left] <= longest) & covered
 
 

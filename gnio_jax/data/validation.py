@@ -204,7 +204,7 @@ def _check_range(
 
 
 def check_unit_norm(
-    wxyz: Float[np.ndarray, "n 4"], where: Bool[np.ndarray, "n"], field: str, source: object
+    wxyz: Float[np.ndarray, "n 4"], where: Bool[np.ndarray, "n"] | bool, field: str, source: object
 ) -> Float[np.ndarray, "n 4"]:
     """Quaternions, normalized where `where` holds.
 

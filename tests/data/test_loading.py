@@ -8,7 +8,6 @@ import multiprocessing
 import operator
 import os
 import warnings
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -31,17 +30,10 @@ from tests.support.circle import circle
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_import_for_all(tmp_path_factory):
-    """The processes come from one that has imported the package, in place of importing it each.
-
-    They share its environment, and so one cache: every test has files of its own. Processes as the
-    package starts them are those of the tests of OxIOD.
-    """
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
+def one_cache_for_all(tmp_path_factory):
+    """Every test has files of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GNIO_CACHE", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(multiprocessing, "get_context", lambda _: context)
         yield
 
 
@@ -245,24 +237,13 @@ def test_work_by_processes_comes_back_in_order_and_few_results_are_held():
     results.close()
 
 
-def test_a_process_that_dies_is_told_in_one_line(monkeypatch, tmp_path):
+def test_a_process_that_dies_is_told_in_one_line(tmp_path):
     items = [(partial(os._exit, 3),), (partial(int, 1),)]
     # What is called needs no import of the package in a process.
     with pytest.raises(InputError, match=r"--workers: a process died, .*memory"):
         list(in_processes(operator.call, items, 2))
     with pytest.raises(FileNotFoundError, match="nowhere"):  # the function's own error
         list(in_processes(os.stat, [(tmp_path / "nowhere",), (tmp_path,)], 2))
-    submit, started = ProcessPoolExecutor.submit, []
-
-    def once(pool, *item):
-        if started:  # it dies while the next one starts
-            raise OSError("handle is closed")
-        started.append(item)
-        return submit(pool, *item)
-
-    monkeypatch.setattr(ProcessPoolExecutor, "submit", once)
-    with pytest.raises(InputError, match="--workers: a process died"):
-        list(in_processes(pow, [(2, 2), (3, 2)], 2))
 
 
 def die_in_a_child(name):
@@ -385,8 +366,13 @@ def test_an_entry_that_is_damaged_or_cannot_be_written_is_made_anew(source, cach
     assert call(reader, source) == 2 and reader.calls == 2
     monkeypatch.setenv("GNIO_CACHE", str(source / "below a file"))
     assert call(reader, source) == 3 and call(reader, source) == 4
-    reading = read_recording(Recording("walk", reader, (cache / "nowhere.csv",), slow=True))
-    assert "nowhere.csv: cannot be read" in str(reading.damage)
+
+
+def test_a_file_that_comes_or_goes_is_a_change(source, tmp_path):
+    reader, other = Reader(), tmp_path / "sensor.yaml"
+    assert call(reader, source, other) == call(reader, source, other) == 1
+    other.write_text("T_BS:")
+    assert call(reader, source, other) == 2
 
 
 def test_a_refusal_is_remembered_and_damage_is_not(source, cache):

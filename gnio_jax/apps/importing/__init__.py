@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gnio_jax.apps.importing import loggers, ros
+from gnio_jax.apps.importing import loggers, ros, units
 from gnio_jax.apps.importing.recording import GAPS as GAPS
 from gnio_jax.apps.importing.recording import Imported as Imported
 from gnio_jax.apps.importing.recording import (
@@ -29,8 +29,7 @@ from gnio_jax.apps.importing.recording import (
     table_layout,
 )
 from gnio_jax.config import ImportOptions
-from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
-from gnio_jax.data.parsing import units
+from gnio_jax.data.hdf5 import HDF5, read_hdf5, write_hdf5
 from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, seconds, time_unit
 from gnio_jax.data.parsing.tables import Table
 from gnio_jax.data.readers import euroc
@@ -39,8 +38,6 @@ from gnio_jax.data.reference import SHORTEST_RUN
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
-HDF5 = (".h5", ".hdf5")
-"""Endings of the package's own files."""
 NOTHING_STATED = ImportOptions()
 _CHOICES = {
     "time_unit": PER_SECOND,

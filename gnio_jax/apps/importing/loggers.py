@@ -61,8 +61,8 @@ from gnio_jax.apps.importing.recording import (
     sensor_of,
     table_layout,
 )
+from gnio_jax.apps.importing.units import named_unit
 from gnio_jax.data.parsing.tables import Table, parsed_as, shortened
-from gnio_jax.data.parsing.units import named_unit
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import interpolate
 

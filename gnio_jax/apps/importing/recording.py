@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
+from gnio_jax.apps.importing import units
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.parsing import units
 from gnio_jax.data.parsing.stamps import (
     PER_SECOND,
     RATES,
     first_stamp,
     in_order,
+    is_rate,
     rounded_rate,
     seconds,
     time_unit,
@@ -269,7 +270,7 @@ def _clocked(sensor: Sensor, unit: str | None, notes: list[str]) -> _Clocked:
             f"by which it runs at {rate * PER_SECOND[unit]:.4g} Hz"
         )
     rate *= PER_SECOND[unit]
-    if not RATES[0] * 0.99 <= rate <= RATES[1] * 1.01:
+    if not is_rate(rate):
         raise InputError(
             file,
             f"field 'time' makes {name} run at {rate:.3g} Hz with the unit {unit}",

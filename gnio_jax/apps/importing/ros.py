@@ -432,7 +432,7 @@ def _track(
     if rate < SLOWEST:
         remedy = f"a reference needs {SLOWEST:g} Hz"
         raise InputError(source, f"its poses come at {rate:.3g} Hz", remedy)
-    wxyz = check_unit_norm(values[:, 3:], np.ones(len(time), dtype=bool), "orientation", source)
+    wxyz = check_unit_norm(values[:, 3:], True, "orientation", source)
     noisy = rate >= FAST_TRACKER
     given = Poses(time, rotations(wxyz), values[:, :3], noisy=noisy, source=source)
     body, frame = rows[0].child, imu.first.header.frame_id

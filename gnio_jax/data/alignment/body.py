@@ -140,6 +140,48 @@ class BodyFit(NamedTuple):
     """The tracker's poses as those of the IMU, noisy still: its attitude in a level world on its
     own clock, with the lever to it. Poses that contradict its acceleration grossly are left out."""
 
+    def figures(self) -> dict[str, float]:
+        """What the attributes of a sequence keep of the fit."""
+        vectors = {"lever": self.lever, "gyro_bias": self.gyro_bias, "accel_bias": self.accel_bias}
+        return {
+            "lag": float(np.mean(self.lag)),
+            "lag_drift": float(np.ptp(self.lag)),
+            "accel_delay_removed": self.accel_delay,
+            "gyro_unexplained": self.gyro_unexplained,
+            "accel_unexplained": self.accel_unexplained,
+            "runner_up": self.runner_up,
+            "extrinsic_uncertainty_degrees": float(np.degrees(self.turn_std)),
+            "extrinsic_yaw_degrees": float(self.extrinsic.as_euler("ZXY", degrees=True)[0]),
+            "extrinsic_tilt_degrees": _degrees_off(self.extrinsic.as_matrix()[2, 2]),
+            "tilt_x": float(self.up[0] / self.up[2]),
+            "tilt_y": float(self.up[1] / self.up[2]),
+            "gyro_residual": self.gyro_residual,
+            "accel_residual": self.accel_residual,
+            **{f"{name}_{'xyz'[i]}": float(v[i]) for name, v in vectors.items() for i in range(3)},
+        }
+
+
+def laid_on(
+    phone: Streams,
+    track: Poses,
+    limits: Mapping[str, tuple[float, str]],
+    knot_seconds: float,
+    search_seconds: float = 5.0,
+    closest_runner_up: float = 1.0,
+) -> Streams:
+    """A phone with a tracker's poses as its own, without the accelerometer's delay, and with the
+    fit's figures among its attributes. Raises `Refusal` where they do not fit together."""
+    try:
+        fit = align(phone, track, knot_seconds, search_seconds)
+    except TooLittle as error:
+        raise Refusal(track.source, f"cannot be aligned with the phone ({error})") from None
+    check_fit(fit, track.source, limits, closest_runner_up)
+    return phone._replace(
+        accel=phone.accel._replace(time=phone.accel.time - fit.accel_delay),
+        poses=fit.poses,
+        attributes=phone.attributes | fit.figures(),
+    )
+
 
 def align(
     imu: Streams,
@@ -151,8 +193,8 @@ def align(
 
     `knot_seconds` is the spacing of the lag's knots; first guesses of the lag lie within
     ± `search_seconds`. Raises `TooLittle` where too little of the track is usable,
-    and `InputError` for stamps that are damaged. Whether the best fit is a good one is the caller's
-    to judge, by `gyro_unexplained`, `accel_unexplained`, `runner_up` and `turn_std`.
+    and `InputError` for stamps that are damaged. Whether the best fit is a good one is for
+    `check_fit` to judge.
     """
     imu = ordered(imu._replace(poses=track))
     assert imu.poses is not None
@@ -197,9 +239,15 @@ def align(
     )
 
 
-def check_fit(fit: BodyFit, source: object, limits: Mapping[str, tuple[float, str]]) -> None:
+def check_fit(
+    fit: BodyFit,
+    source: object,
+    limits: Mapping[str, tuple[float, str]],
+    closest_runner_up: float = 1.0,
+) -> None:
     """Raise `Refusal` naming the tracker's file `source` where a fit does not explain the motion
-    (`MOST_UNEXPLAINED`), or finds more than `limits` (most, unit) allow: no phone on its body."""
+    (`MOST_UNEXPLAINED`), finds more than `limits` (most, unit) allow (no phone on its body), or is
+    hardly better than one with another lag."""
     remedy = "check that both files are of one walk"
     shares = {"turning": fit.gyro_unexplained, "acceleration": fit.accel_unexplained}
     for what, share in shares.items():
@@ -214,7 +262,7 @@ def check_fit(fit: BodyFit, source: object, limits: Mapping[str, tuple[float, st
         "lever arm": np.linalg.norm(fit.lever),
         "mounting's turn": np.degrees(fit.extrinsic.magnitude()),
         "mounting's uncertainty": np.degrees(fit.turn_std),
-        "world's tilt": degrees_off(fit.up[2]),
+        "world's tilt": _degrees_off(fit.up[2]),
         "gyro's bias": np.linalg.norm(fit.gyro_bias),
         "accel's bias": np.linalg.norm(fit.accel_bias),
     }
@@ -223,9 +271,13 @@ def check_fit(fit: BodyFit, source: object, limits: Mapping[str, tuple[float, st
             value = f"the {what} would be {found[what]:.3g} {unit}, at most {most:g} {unit}"
             problem = f"fits the phone only with impossible values: {value} is plausible"
             raise Refusal(source, problem, remedy)
+    if not fit.runner_up <= closest_runner_up:
+        problem = "fits the phone about as well at a second lag, because the walk repeats itself"
+        share = f"the best lag leaves {fit.runner_up:.0%} of what the second leaves unexplained"
+        raise Refusal(source, f"{problem} ({share})")
 
 
-def degrees_off(cosine: float) -> float:
+def _degrees_off(cosine: float) -> float:
     """Angle of this cosine, degrees."""
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
@@ -296,7 +348,7 @@ class _Felt(NamedTuple):
 def _seen(track: Poses) -> _Seen:
     clock, steps = np.arange(track.time[0], track.time[-1], 1.0 / RATE), np.diff(track.time)
     longest, sigma = LOST_POSES * float(np.median(steps)), FILTER_SECONDS * RATE
-    known = known_at(track.time, np.ones(len(track.time), dtype=bool), clock, longest)
+    known = known_at(track.time, clock, longest)
     rows = np.flatnonzero(~within(~known, int(np.ceil(3 * sigma))))[:: round(ROW_SECONDS * RATE)]
     if len(rows) * ROW_SECONDS < SHORTEST_OVERLAP:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track hold poses in a row")

@@ -140,7 +140,7 @@ def align_positions(imu: Streams, track: Samples) -> PositionsFit:
 
     grid = np.arange(stamps[0], stamps[-1], 1.0 / RATE)
     position = splined(stamps, values, grid, gaps(stamps))
-    seen = known_at(stamps, np.ones(len(stamps), dtype=bool), grid, longest_trusted(stamps))
+    seen = known_at(stamps, grid, longest_trusted(stamps))
     tracked = second_difference(position, 1.0 / RATE)
     # Accelerations that no pedestrian makes are jumps.
     strength = np.linalg.norm(smooth(tracked, STEP_FILTER_SECONDS * RATE), axis=1)

@@ -1,1 +1,1 @@
-"""What files say, as numbers: tables of every format, stamps, and units."""
+"""What files say, as numbers: tables of every format, and stamps."""

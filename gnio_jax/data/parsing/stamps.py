@@ -29,10 +29,14 @@ def time_unit(stamps: Real[np.ndarray, " n"]) -> tuple[str | None, float]:
     steps = np.diff(np.sort(stamps))
     steps = steps[steps > 0]
     step = float(np.median(steps)) if steps.size else np.inf
-    # A rate at the very edge is inside, whatever the last digit of its stamps.
-    lowest, highest = RATES[0] * (1 - 1e-6), RATES[1] * (1 + 1e-6)
-    units = [unit for unit, count in PER_SECOND.items() if lowest <= count / step <= highest]
+    units = [unit for unit, count in PER_SECOND.items() if is_rate(count / step)]
     return units[0] if units else None, 1.0 / step
+
+
+def is_rate(rate: float) -> bool:
+    """Whether an IMU runs at so many Hz. A rate at the edge is inside, whatever the last digits of
+    its stamps."""
+    return RATES[0] * 0.99 <= rate <= RATES[1] * 1.01
 
 
 def check_seconds(time: Float[np.ndarray, " n"], source: object) -> None:
@@ -40,11 +44,11 @@ def check_seconds(time: Float[np.ndarray, " n"], source: object) -> None:
     unit, rate = time_unit(time)
     if unit == "s":
         return
-    hint = f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz"
+    remedy = "check the unit of the stamps"
     if unit is not None:
-        hint = f"it looks like {unit}: divide it by {PER_SECOND[unit]:g}"
-    problem = f"field 'time' is not in seconds (as such its rate would be {rate:.3g} Hz)"
-    raise InputError(source, problem, hint)
+        remedy = f"they look like {unit}: divide them by {PER_SECOND[unit]:g}"
+    problem = f"field 'time' runs at {rate:.4g} Hz, expected {RATES[0]:g} to {RATES[1]:g} Hz"
+    raise InputError(source, problem, remedy)
 
 
 def rounded_rate(time: Float[np.ndarray, " n"]) -> float:

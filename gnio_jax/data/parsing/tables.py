@@ -13,14 +13,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Int, Num
+from jaxtyping import Bool, Float, Int, Num
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.validation import UNIT_NORM_TOLERANCE
+from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
+from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, check_increasing
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
 
@@ -112,6 +113,29 @@ class Table(NamedTuple):
         column = self._column(name)
         whole = column.ndim == 1 and column.dtype.kind in "iu"
         return np.asarray(column) if whole else self.take(name)
+
+    def clock(
+        self,
+        name: Any,
+        unit: str,
+        start: float | int | None = None,
+        repeats: Literal["refused", "dropped", "kept"] = "refused",
+    ) -> tuple[Float[np.ndarray, " m"], float | int, slice | Int[np.ndarray, " m"]]:
+        """(s since `start`, `start`, rows) of a column of stamps in `unit`; `start` is the earliest
+        stamp where none is given.
+
+        Of rows that repeat a stamp or come late `repeats` says whether they are an error, whether
+        the first of each stamp is taken, in their order, or whether they stay for `assemble`.
+        Raises `InputError` for that, and where the stamps span too much (`first_stamp`).
+        """
+        stamps, field = self.stamps(name), name if isinstance(name, str) else "time"
+        first = first_stamp(stamps, unit, self.path, field)
+        start = first if start is None else start
+        rows = distinct(stamps, self.path, field) if repeats == "dropped" else slice(None)
+        time = seconds(stamps[rows], start, unit)
+        if repeats == "refused":
+            check_increasing(time, self.path, self.row)
+        return time, start, rows
 
     def rotations(
         self,
@@ -328,14 +352,15 @@ def read_npz(path: Path) -> Table:
 
 
 def read_npy(path: Path, names: Mapping[str, slice], width: int) -> Table:
-    """The table (N, `width`) of floats of an npy, its fields by name."""
+    """The table (N, `width`) of floats of an npy, its fields by name; one column is (N,)."""
     with parsed_as(path, "a NumPy array"):
         # Mapped, since a damaged header may name more rows than there is memory.
         table = np.load(path, mmap_mode="r", allow_pickle=False)
     if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
         problem = f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})"
         raise damaged(path, problem)
-    fields = {name: np.asarray(table[:, place]) for name, place in names.items()}
+    columns = {name: np.asarray(table[:, place]) for name, place in names.items()}
+    fields = {name: each[:, 0] if each.shape[1] == 1 else each for name, each in columns.items()}
     return Table(path, fields, "field")
 
 

@@ -25,7 +25,7 @@ from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.tables import damaged, read_hdf5_fields, read_text
 from gnio_jax.data.splits import listed
-from gnio_jax.data.validation import FASTEST, check_increasing, check_unit_norm
+from gnio_jax.data.validation import FASTEST, check_unit_norm
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
 from gnio_jax.types import Sequence
 
@@ -54,15 +54,11 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
     """One sequence of its folder, in a z-up world. Raises `InputError` naming file and field."""
     path = folder / _TABLE
     table = read_hdf5_fields(path, ("ts", "gyro_calib", "accel_calib", "traj_target"))
-    stamps = table.take("ts")
-    check_increasing(stamps, path)
-    time = stamps - stamps[0]
+    time, start, _ = table.clock("ts", "s")
     gyro, accel = table.take("gyro_calib", width=3), table.take("accel_calib", width=3)
     pose = table.take("traj_target", width=7)
-    wxyz = check_unit_norm(
-        wxyz_from_xyzw(pose[:, 3:]), np.ones(len(pose), dtype=bool), "traj_target", path
-    )
-    attitude, velocity = rotations(wxyz), _velocity(folder / _TRUTH, stamps)
+    wxyz = check_unit_norm(wxyz_from_xyzw(pose[:, 3:]), True, "traj_target", path)
+    attitude, velocity = rotations(wxyz), _velocity(folder / _TRUTH, time, start)
 
     upside_down = attitude.apply(accel).mean(axis=0)[2] < 0
     turn = Rotation.from_rotvec([np.pi if upside_down else 0.0, 0.0, 0.0])
@@ -78,12 +74,15 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
     velocity = velocity if velocity is None else turn.apply(velocity)
     poses = Poses(time, turn * attitude, turn.apply(pose[:, :3]), velocity, source=str(path))
     streams = Streams.of_imu(name or folder.name, path, time, gyro, accel)
-    streams = streams._replace(attributes=about, start=float(stamps[0]), poses=poses)
+    streams = streams._replace(attributes=about, start=start, poses=poses)
     return assemble(streams, RATE)
 
 
-def _velocity(path: Path, stamps: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"] | None:
-    """The velocities of the text beside the table; None where there is no text or it has none."""
+def _velocity(
+    path: Path, time: Float[np.ndarray, " n"], start: float
+) -> Float[np.ndarray, "n 3"] | None:
+    """The velocities of the text beside the table, whose stamps are `time` (s) since `start`; None
+    where there is no text or it has none."""
     if not path.is_file():
         return None
     # Stamp, position, quaternion and, in some, velocity.
@@ -91,8 +90,8 @@ def _velocity(path: Path, stamps: Float[np.ndarray, " n"]) -> Float[np.ndarray, 
     if table.width() == 8:
         return None
     own, velocity = table.take(0), table.take(8, 9, 10)
-    if len(own) != len(stamps) or np.abs(own - stamps).max() > 1e-3:
-        rows = f"{len(own)} and {len(stamps)} rows"
+    if len(own) != len(time) or np.abs(own - start - time).max() > 1e-3:
+        rows = f"{len(own)} and {len(time)} rows"
         raise damaged(path, f"field 'ts' is not that of {_TABLE} beside it ({rows})")
     if np.abs(velocity).max() > FASTEST:
         raise damaged(path, f"field 'velocity' is beyond {FASTEST:g} m/s")

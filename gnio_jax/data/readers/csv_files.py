@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
-from gnio_jax.data.hdf5 import read_hdf5
+from gnio_jax.data.hdf5 import HDF5, read_hdf5
 from gnio_jax.data.parsing.stamps import check_seconds, rounded_rate
 from gnio_jax.data.parsing.tables import Table, read_text, shortened
 from gnio_jax.data.resampling import resample
@@ -39,8 +39,7 @@ REFERENCE = {
     "position": ("px", "py", "pz"),
     "velocity": ("vx", "vy", "vz"),
 }
-_HDF5 = (".h5", ".hdf5")
-_FILES = (".csv", *_HDF5)
+_FILES = (".csv", *HDF5)
 
 
 # --- which recordings there are
@@ -107,7 +106,7 @@ def _find(root: Path, entry: str) -> Path | None:
 def read(path: Path) -> list[Sequence]:
     """One recording, on a uniform clock of its own rate, named after its file. Raises `InputError`
     naming file and field."""
-    if path.suffix.lower() not in _HDF5:
+    if path.suffix.lower() not in HDF5:
         return assemble(_streams(read_text(path)), whole=True)
     sequence = read_hdf5(path)._replace(name=path.stem)
     check_seconds(sequence.time, path)
@@ -121,9 +120,7 @@ def _streams(table: Table) -> Streams:
     remedy = f"name them: gnio data import {path.name} --out own/{path.stem}.h5 --columns"
     check_columns(path, table.columns, wanted, remedy)
     time = table.take("time")
-    streams = Streams.of_imu(path.stem, path, time, table.take(*GYRO), table.take(*ACCEL))
     check_increasing(time, path, table.row)
-    check_seconds(time, path)
     poses, device = reference(table, time), None
     if poses is None and attitude[0] in table.columns:
         known = finite_rows(table.take(*attitude, gaps=True))
@@ -131,7 +128,8 @@ def _streams(table: Table) -> Streams:
             own = quaternions(table.rotations(*attitude, rows=known))
             device = Samples(time[known], own, str(path))
     about = {"group": path.stem, "truth": "given" if poses else "none"}
-    return streams._replace(poses=poses, device=device, attributes=about)
+    streams = Streams.of_imu(path.stem, path, time, table.take(*GYRO), table.take(*ACCEL))
+    return streams._replace(attributes=about, poses=poses, device=device)
 
 
 def reference(table: Table, time: Float[np.ndarray, " n"]) -> Poses | None:

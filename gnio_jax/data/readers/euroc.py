@@ -38,7 +38,6 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
-from gnio_jax.data.parsing.stamps import first_stamp, seconds
 from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text
 from gnio_jax.data.reference import LONGEST_BRIDGE, SHORTEST_RUN
 from gnio_jax.errors import InputError
@@ -97,14 +96,9 @@ def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording
 
 def _recording(folder: Path, dataset: str) -> Recording:
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *REFERENCES)]
-    files = [sensor / name for sensor in sensors for name in ("data.csv", "sensor.yaml")]
-    return Recording(
-        short_name(folder.name),
-        partial(read, folder, dataset),
-        files=tuple(path for path in files if path.is_file()),
-        slow=True,
-        form=dataset,
-    )
+    files = tuple(each / name for each in sensors for name in ("data.csv", "sensor.yaml"))
+    read_it = partial(read, folder, dataset)
+    return Recording(short_name(folder.name), read_it, files, slow=True, form=dataset)
 
 
 def find_sequences(root: Path) -> dict[str, Path]:
@@ -139,9 +133,8 @@ def read(folder: Path, dataset: str = "euroc") -> list[Sequence]:
     mav, name = folder / "mav0", short_name(folder.name)
     path = mav / "imu0" / "data.csv"
     table = read_table(path)
-    stamps = table.stamps(STAMP)
-    start = first_stamp(stamps, "ns", path)
-    time, poses = seconds(stamps, start), read_reference(mav, start)
+    time, start, _ = table.clock(STAMP, "ns", repeats="kept")
+    poses = read_reference(mav, start)
     if poses is None:
         problem = f"has no reference ({' or '.join(REFERENCES)})/data.csv"
         raise InputError(mav, problem, "bring a recording without one into the dataset 'csv'")
@@ -174,8 +167,7 @@ def read_reference(mav: Path, start: float | int) -> Poses | None:
         return None
     path = sensor / "data.csv"
     table = read_table(path)
-    stamps = table.stamps(STAMP)
-    first_stamp(stamps, "ns", path)
+    time, *_ = table.clock(STAMP, "ns", start, "kept")
     position, quaternion = table.take(*_POSITION, gaps=True), table.take(*_QUATERNION, gaps=True)
     velocity = table.take(*_VELOCITY, gaps=True) if _VELOCITY[0] in table.columns else None
     seen = finite_rows(position) & finite_rows(quaternion)
@@ -183,7 +175,7 @@ def read_reference(mav: Path, start: float | int) -> Poses | None:
         seen &= finite_rows(velocity)
     if seen.sum() < SHORTEST_RUN:
         raise damaged(path, f"holds {seen.sum()} poses")
-    time = seconds(stamps[seen], start)
+    time = time[seen]
     if (usual := float(np.median(np.abs(np.diff(time))))) > LONGEST_BRIDGE:
         problem = f"field 'time' runs at {1 / usual:.3g} Hz, too slow for a reference"
         raise InputError(path, problem, f"give at least {1 / LONGEST_BRIDGE:g} Hz")

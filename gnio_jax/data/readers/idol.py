@@ -27,8 +27,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.alignment import pose_lag
-from gnio_jax.data.alignment.body import LONGEST_POSE_LAG
+from gnio_jax.data.alignment.body import LONGEST_POSE_LAG, pose_lag
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.parsing.stamps import distinct

@@ -26,8 +26,7 @@ import numpy as np
 
 from gnio_jax.data.assembly import Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
-from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
-from gnio_jax.data.parsing.tables import damaged, shortened, text_of
+from gnio_jax.data.parsing.tables import Table, damaged, shortened, text_of
 from gnio_jax.data.validation import FARTHEST, FEWEST_WAYPOINTS
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
@@ -76,20 +75,19 @@ def read(path: Path) -> list[Sequence]:
     Raises `InputError` naming file and field, and `Refusal` for a walk of fewer waypoints than can
     be used.
     """
-    header, rows = read_lines(path)
-    sensors = {}
-    for kind in (_GYRO, _ACCEL):
-        stamps, _ = rows[kind]
-        if len(stamps) < 2:
-            raise damaged(path, f"holds {len(stamps)} lines of {kind}")
-        sensors[kind] = distinct(stamps, path, kind)
-    start = first_stamp(rows[_GYRO][0], "ms", path, _GYRO)
-    first_stamp(rows[_ACCEL][0], "ms", path, _ACCEL)
-    gyro, accel = (
-        Samples(seconds(stamps[sensors[kind]], start, "ms"), values[sensors[kind]], str(path))
-        for kind, (stamps, values) in rows.items()
-        if kind != _WAYPOINT
-    )
+    header, found = read_lines(path)
+    for kind, table in found.items():
+        fewest = FEWEST_WAYPOINTS if kind == _WAYPOINT else 2
+        if (count := len(table.stamps(kind))) < fewest:
+            problem = f"field '{kind}' holds {count}, at least {fewest} are needed"
+            raise Refusal(path, problem) if kind == _WAYPOINT else damaged(path, problem)
+    start = found[_GYRO].clock(_GYRO, "ms", repeats="kept")[1]
+
+    def samples(kind: str) -> Samples:
+        time, _, rows = found[kind].clock(kind, "ms", start, "dropped")
+        return Samples(time, found[kind].take("values", width=_VALUES[kind])[rows], str(path))
+
+    gyro, accel = samples(_GYRO), samples(_ACCEL)
     device = re.search(r"Brand:(\S+)\s+Model:(\S+)", header)
     about = {
         "group": f"{path.parent.parent.parent.name}_{_floor(path)}",
@@ -106,20 +104,14 @@ def read(path: Path) -> list[Sequence]:
         accel,
         about,
         start * 1e-3,
-        waypoints=_taps(path, rows[_WAYPOINT], start, gyro, accel),
+        waypoints=_taps(samples(_WAYPOINT), gyro, accel),
     )
     return assemble(streams, RATE)
 
 
-def _taps(
-    path: Path, rows: tuple[np.ndarray, np.ndarray], start: int, gyro: Samples, accel: Samples
-) -> Samples:
-    """The waypoints, s since `start`, on the IMU's clock."""
-    stamps, place = rows
-    if len(stamps):
-        own = distinct(stamps, path, _WAYPOINT)
-        stamps, place = stamps[own], place[own]
-    time = seconds(stamps, start, "ms")
+def _taps(taps: Samples, gyro: Samples, accel: Samples) -> Samples:
+    """The waypoints on the IMU's clock."""
+    time, place, path = taps
     first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
     off = np.maximum(first - time, time - last)
     if (off > TAP_SECONDS).any():
@@ -130,11 +122,12 @@ def _taps(
     if len(time) < FEWEST_WAYPOINTS:
         problem = f"field '{_WAYPOINT}' holds {len(time)}, at least {FEWEST_WAYPOINTS} are needed"
         raise Refusal(path, problem)
-    return Samples(time, place[own], str(path))
+    return Samples(time, place[own], path)
 
 
-def read_lines(path: Path) -> tuple[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """(lines that begin with '#', kind of line -> stamps (unix ms, integers) and values).
+def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
+    """(lines that begin with '#', kind of line -> table of its stamps (unix ms), under the name of
+    the kind, and its `values`).
 
     Raises `InputError` where a line is cut short, or the file holds two recordings.
     """
@@ -166,14 +159,14 @@ def read_lines(path: Path) -> tuple[str, dict[str, tuple[np.ndarray, np.ndarray]
             raise damaged(path, f"{problem} ('{shortened(line, 60)}')") from None
         stamps.append(stamp)
         values.append(row)
-    rows = {
-        kind: (np.array(stamps, dtype=np.int64), np.array(values).reshape(-1, _VALUES[kind]))
-        for kind, (stamps, values) in found.items()
-    }
-    for kind, (_, values) in rows.items():
+    tables = {}
+    for kind, (stamps, rows) in found.items():
+        values = np.array(rows).reshape(-1, _VALUES[kind])
         if not (np.abs(values) < FARTHEST).all():
             raise damaged(path, f"field '{kind}' holds NaN, Inf or what nothing measures")
-    return header, rows
+        fields = {kind: np.array(stamps, dtype=np.int64), "values": values}
+        tables[kind] = Table(path, fields, "field")
+    return header, tables
 
 
 def _lines(text: str) -> Iterator[tuple[int, str]]:

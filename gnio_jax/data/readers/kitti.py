@@ -43,7 +43,7 @@ from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.stamps import in_order
 from gnio_jax.data.parsing.tables import damaged, read_npz, shortened, text_of
 from gnio_jax.data.splits import drawn
-from gnio_jax.data.validation import FASTEST, check_increasing
+from gnio_jax.data.validation import FASTEST
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import stretches
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
@@ -157,15 +157,16 @@ def read_packets(oxts: Path) -> list[Sequence]:
     position, velocity = project(*values("lat", "lon", "alt").T), values("ve", "vn", "vu")
     poses = Poses(time, attitude, position, velocity, source=str(oxts))
     gyro, accel = values("wx", "wy", "wz"), values("ax", "ay", "az")
+    epoch = float(start.astype(np.int64) * 1e-9)
     sequences, short = [], 0
     for number, own in enumerate(stretches(np.diff(time) > LONGEST_GAP)):
         if time[own.stop - 1] - time[own.start] < SHORTEST_PIECE:
             short += 1
             continue
-        streams = Streams.of_imu(
-            f"{drive}_extract{number}", oxts, time[own], gyro[own], accel[own]
-        )._replace(start=float(start.astype(np.int64) * 1e-9), poses=poses.rows(own))
-        sequences += _assembled(streams, drive, repairs)
+        name = f"{drive}_extract{number}"
+        streams = Streams.of_imu(name, oxts, time[own], gyro[own], accel[own])
+        streams = streams._replace(attributes=repairs, start=epoch, poses=poses.rows(own))
+        sequences += _assembled(streams, drive)
     if short:
         problem = f"{short} pieces between missing packets are shorter than {SHORTEST_PIECE:g} s"
         warnings.warn(f"{oxts}: {problem}; left out", stacklevel=2)
@@ -175,14 +176,13 @@ def read_packets(oxts: Path) -> list[Sequence]:
 def read_piece(path: Path) -> list[Sequence]:
     """The sequence of one npz. Raises `InputError` naming file and field."""
     table = read_npz(path)
-    time, imu = table.take("t"), table.take("u", width=6)
-    check_increasing(time, path)
+    (time, start, _), imu = table.clock("t", "s"), table.take("u", width=6)
     _check_rate(time, path)
     position, velocity, angles = (table.take(n, width=3) for n in ("p_gt", "v_gt", "ang_gt"))
     attitude = Rotation.from_euler("ZYX", angles[:, ::-1])
-    streams = Streams.of_imu(_piece_name(path), path, time, imu[:, :3], imu[:, 3:])
     poses = Poses(time, attitude, position, velocity, source=str(path))
-    return _assembled(streams._replace(poses=poses), _drive_of(path.stem), {})
+    streams = Streams.of_imu(_piece_name(path), path, time, imu[:, :3], imu[:, 3:])
+    return _assembled(streams._replace(start=start, poses=poses), _drive_of(path.stem))
 
 
 def _check_rate(time: Float[np.ndarray, " n"], path: Path) -> None:
@@ -191,7 +191,7 @@ def _check_rate(time: Float[np.ndarray, " n"], path: Path) -> None:
         raise InputError(path, problem, "get the _extract archive")
 
 
-def _assembled(streams: Streams, drive: str, repairs: dict[str, float]) -> list[Sequence]:
+def _assembled(streams: Streams, drive: str) -> list[Sequence]:
     about = {
         "group": drive,
         "session": drive[:10],
@@ -199,7 +199,7 @@ def _assembled(streams: Streams, drive: str, repairs: dict[str, float]) -> list[
         "truth": "INS with RTK-GPS (OXTS RT3003)",
         "imu_compensated": "reference",
     }
-    streams = streams._replace(attributes=about | repairs)
+    streams = streams._replace(attributes=about | streams.attributes)
     return assemble(streams, RATE, max_drift=LARGEST_JUMP)
 
 

@@ -28,20 +28,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.alignment import (
-    BodyFit,
-    PositionsFit,
+from gnio_jax.data.alignment.body import (
     TooLittle,
-    align,
-    align_positions,
-    check_fit,
+    hat_functions,
+    laid_on,
+    near_any,
+    uniform_knots,
     without_jumps,
 )
-from gnio_jax.data.alignment.body import degrees_off, hat_functions, near_any, uniform_knots
+from gnio_jax.data.alignment.positions import align_positions
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.parsing.tables import Table, damaged, read_text, shortened
-from gnio_jax.data.validation import check_accel, check_gyro
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import quaternions
 from gnio_jax.types import STANDARD_G, Sequence
@@ -287,12 +285,18 @@ def build(walk: Walk, kind: str) -> list[Sequence]:
     try:
         # The phone's stamps survive in the syn files of the large scale.
         phone = read_phone(imu_path, "raw" if walk.scene == LARGE_SCALE else kind)
-        check_accel(phone.accel.values, imu_path, phone.accel.time)
-        check_gyro(phone.gyro.values, imu_path, phone.gyro.time)
-        laid = _on_tango if truth_path.name.startswith("tango") else _on_vicon
-        streams = laid(phone, truth_path, kind)
-        about = walk.attributes(kind) | streams.attributes
-        (sequence,) = assemble(streams._replace(name=walk.name, attributes=about), RATE)
+        on_tango = truth_path.name.startswith("tango")
+        about = walk.attributes(kind) | {"truth": "tango" if on_tango else "vicon"}
+        phone = phone._replace(name=walk.name, attributes=about | phone.attributes)
+        if on_tango:
+            phone = _on_tango(phone, truth_path, kind)
+        else:
+            limits = {"lag": (LONGEST_LAG[kind], "s")} | LIMITS
+            track = read_vicon(truth_path, kind, phone.start)
+            phone = laid_on(
+                phone, track, limits, LAG_KNOTS[kind], closest_runner_up=CLOSEST_RUNNER_UP
+            )
+        (sequence,) = assemble(phone, RATE)
     except TooLittle as error:
         raise Refusal(truth_path, f"cannot be aligned with the phone ({error})") from None
     except InputError as error:
@@ -302,47 +306,11 @@ def build(walk: Walk, kind: str) -> list[Sequence]:
     return [sequence]
 
 
-def _on_vicon(phone: Streams, path: Path, kind: str) -> Streams:
-    """The phone with Vicon's poses as its own, and without the accelerometer's delay. Raises
-    `Refusal` where the best fit does not explain the motion, or finds what cannot be of a phone on
-    a marker body."""
-    fit = align(phone, read_vicon(path, kind, phone.start), knot_seconds=LAG_KNOTS[kind])
-    check_fit(fit, path, {"lag": (LONGEST_LAG[kind], "s")} | LIMITS)
-    if not fit.runner_up <= CLOSEST_RUNNER_UP:
-        problem = "fits the phone about as well at a second lag, because the walk repeats itself"
-        share = f"the best lag leaves {fit.runner_up:.0%} of what the second leaves unexplained"
-        raise Refusal(path, f"{problem} ({share})")
-    accel = phone.accel._replace(time=phone.accel.time - fit.accel_delay)
-    return phone._replace(accel=accel, poses=fit.poses, attributes=phone.attributes | _figures(fit))
-
-
-def _figures(fit: BodyFit) -> dict[str, str | float]:
-    """What the attributes keep of a fit."""
-    vectors = {"lever": fit.lever, "gyro_bias": fit.gyro_bias, "accel_bias": fit.accel_bias}
-    return {
-        "truth": "vicon",
-        "lag": float(np.mean(fit.lag)),
-        "lag_drift": float(np.ptp(fit.lag)),
-        "accel_delay_removed": fit.accel_delay,
-        "gyro_unexplained": fit.gyro_unexplained,
-        "accel_unexplained": fit.accel_unexplained,
-        "runner_up": fit.runner_up,
-        "extrinsic_uncertainty_degrees": float(np.degrees(fit.turn_std)),
-        "extrinsic_yaw_degrees": float(fit.extrinsic.as_euler("ZXY", degrees=True)[0]),
-        "extrinsic_tilt_degrees": degrees_off(fit.extrinsic.as_matrix()[2, 2]),
-        "tilt_x": float(fit.up[0] / fit.up[2]),
-        "tilt_y": float(fit.up[1] / fit.up[2]),
-        "gyro_residual": fit.gyro_residual,
-        "accel_residual": fit.accel_residual,
-        **{f"{name}_{'xyz'[i]}": float(v[i]) for name, v in vectors.items() for i in range(3)},
-    }
-
-
 def _on_tango(phone: Streams, path: Path, kind: str) -> Streams:
     """The phone with Tango's positions as its own."""
     if phone.device is None:
         raise Refusal(path, "belongs to a phone that recorded no attitude")
-    fit: PositionsFit = align_positions(phone, read_tango(path))
+    fit = align_positions(phone, read_tango(path))
     lag, problem = float(np.abs(fit.lag).max()), ""
     if not fit.correlation >= MIN_CORRELATION:
         problem = f"vertical accelerations correlate by {fit.correlation:.2f}"
@@ -351,7 +319,6 @@ def _on_tango(phone: Streams, path: Path, kind: str) -> Streams:
     if problem:
         raise Refusal(path, f"Tango is out of step with the phone ({problem})")
     about = {
-        "truth": "tango",
         "lag": float(np.mean(fit.lag)),
         "lag_drift": float(np.ptp(fit.lag)),
         "yaw_drift_degrees": float(np.degrees(fit.yaw_drift)),

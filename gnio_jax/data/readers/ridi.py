@@ -27,7 +27,6 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
-from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
 from gnio_jax.data.parsing.tables import Table, read_text
 from gnio_jax.data.splits import find_folders, find_list, held_out, listed
 from gnio_jax.data.validation import FASTEST_WALKER
@@ -73,15 +72,8 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
 
 def _recording(folder: Path, attributes: dict[str, str]) -> Recording:
-    table = folder / _TABLE
-    files = [table] if table.is_file() else [folder / name for name in _TEXT_FILES]
-    return Recording(
-        folder.name,
-        partial(read, folder),
-        files=tuple(path for path in files if path.is_file()),
-        slow=True,
-        attributes=attributes,
-    )
+    files = tuple(folder / name for name in (_TABLE, *_TEXT_FILES))
+    return Recording(folder.name, partial(read, folder), files, True, attributes)
 
 
 def held_out_of_train(path: Path) -> set[str]:
@@ -140,9 +132,7 @@ def read(folder: Path) -> list[Sequence]:
 def _from_table(folder: Path) -> Streams:
     path = folder / _TABLE
     table = read_text(path)
-    stamps = table.stamps("time")
-    start, rows = first_stamp(stamps, "ns", path), distinct(stamps, path)
-    time = seconds(stamps[rows], start)
+    time, start, rows = table.clock("time", "ns", repeats="dropped")
     gyro, accel, position = (table.axes(name)[rows] for name in ("gyro_", "acce_", "pos_"))
     attitude, device = (
         table.rotations(*(name + axis for axis in "wxyz"))[rows] for name in ("ori_", "rv_")
@@ -162,21 +152,14 @@ def _from_text_files(folder: Path, arcore: bool) -> Streams:
 
     gyro, accel = text("gyro.txt"), text("acce.txt")
     pose = text(_ARCORE if arcore else "pose.txt")
-    start = first_stamp(gyro.stamps(0), "ns", gyro.path)
-    first_stamp(accel.stamps(0), "ns", accel.path)
-
-    def rows(table: Table) -> tuple[np.ndarray, np.ndarray]:
-        """(s, rows of the file in order)."""
-        stamps = table.stamps(0)
-        own = distinct(stamps, table.path)
-        return seconds(stamps[own], start), own
+    start = gyro.clock(0, "ns", repeats="kept")[1]
 
     def samples(table: Table) -> Samples:
-        time, own = rows(table)
+        time, _, own = table.clock(0, "ns", start, "dropped")
         return Samples(time, table.take(1, 2, 3)[own], str(table.path))
 
     upright = Rotation.from_euler("x", 90.0 if arcore else 0.0, degrees=True)  # of a y-up world
-    time, own = rows(pose)
+    time, _, own = pose.clock(0, "ns", start, "dropped")
     poses = Poses(
         time,
         upright * pose.rotations(4, 5, 6, 7, scalar_first=False)[own],
@@ -187,7 +170,7 @@ def _from_text_files(folder: Path, arcore: bool) -> Streams:
     device = None
     if (folder / "orientation.txt").is_file():
         game = text("orientation.txt")
-        time, own = rows(game)
+        time, _, own = game.clock(0, "ns", start, "dropped")
         attitude = game.rotations(1, 2, 3, 4, scalar_first=False)[own]
         device = Samples(time, quaternions(attitude), str(game.path))
     streams = Streams(folder.name, str(folder), samples(gyro), samples(accel))

@@ -27,7 +27,7 @@ from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.tables import damaged, json_object, read_hdf5_fields, shortened
 from gnio_jax.data.splits import find_folders, find_list, listed
-from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE, check_increasing
+from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE
 from gnio_jax.numerics import integrate_gyro, quaternions, rotations
 from gnio_jax.types import Sequence
 
@@ -74,8 +74,7 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
     path, about = folder / _TABLE, folder / _INFO
     info = json_object(about, f"it belongs beside {_TABLE}")
     table = read_hdf5_fields(path, (_TIME, _GYRO, _ACCEL, _GAME, _POSITION, _CHEST, _EKF))
-    time = table.take(_TIME)
-    check_increasing(time, path)
+    time, start, _ = table.clock(_TIME, "s")
     game, chest = table.rotations(_GAME, width=4), table.rotations(_CHEST, width=4, rows=slice(1))
     gyro, accel, position = (table.take(name, width=3) for name in (_GYRO, _ACCEL, _POSITION))
     gyro = gyro - _vector(info, "imu_init_gyro_bias", 3, about)
@@ -107,11 +106,9 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
     }
     if isinstance(error, int | float) and abs(error) <= 360.0:
         attributes["orientation_error_degrees"] = float(error)
-    first = _start_frame(info, len(time), about)
-    kept, start = slice(first, None), float(time[first])
-    time = time[kept] - start
-    streams = Streams.of_imu(folder.name, path, time, gyro[kept], accel[kept])
-    streams = streams._replace(
+    kept = slice(_start_frame(info, len(time), about), None)
+    time = time[kept]
+    streams = Streams.of_imu(folder.name, path, time, gyro[kept], accel[kept])._replace(
         attributes=attributes,
         start=start,
         poses=Poses(time, orientation[kept], position[kept], source=str(path)),

@@ -15,10 +15,8 @@ from pathlib import Path
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
-from gnio_jax.data.parsing.stamps import first_stamp, seconds
 from gnio_jax.data.parsing.tables import json_object, read_npy, shortened
 from gnio_jax.data.splits import listed
-from gnio_jax.data.validation import check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
@@ -48,16 +46,12 @@ def read(folder: Path) -> list[Sequence]:
     """One sequence of its folder. Raises `InputError` naming file and field."""
     path = folder / _TABLE
     table = read_npy(path, *_columns(folder / _DESCRIPTION))
-    stamps = table.take(_STAMPS, width=1)[:, 0]
-    start = first_stamp(stamps, "us", path, _STAMPS)
-    time = seconds(stamps, start, "us")
-    check_increasing(time, path)
+    time, start, _ = table.clock(_STAMPS, "us")
     attitude = table.rotations(_ATTITUDE, width=4, scalar_first=False)
     gyro, accel, position, velocity = (
         table.take(name, width=3) for name in (_GYRO, _ACCEL, _POSITION, _VELOCITY)
     )
-    to_body = attitude.inv()
-    streams = Streams.of_imu(folder.name, path, time, to_body.apply(gyro), to_body.apply(accel))
+    gyro, accel = (attitude.inv().apply(values) for values in (gyro, accel))
     about = {
         "group": folder.name,
         "placement": "head",
@@ -65,6 +59,7 @@ def read(folder: Path) -> list[Sequence]:
         "imu_compensated": "reference",
     }
     poses = Poses(time, attitude, position, velocity, source=str(path))
+    streams = Streams.of_imu(folder.name, path, time, gyro, accel)
     streams = streams._replace(attributes=about, start=start * 1e-6, poses=poses)
     return assemble(streams, RATE)
 

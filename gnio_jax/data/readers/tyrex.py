@@ -30,20 +30,19 @@ from __future__ import annotations
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.alignment import TooLittle, align, check_fit, without_jumps
+from gnio_jax.data.alignment.body import laid_on, without_jumps
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording, Refusal
-from gnio_jax.data.parsing.stamps import distinct
-from gnio_jax.data.parsing.tables import damaged, parsed_as, read_text, shortened, text_of
+from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text, shortened, text_of
 from gnio_jax.data.splits import find_folders
-from gnio_jax.data.validation import check_accel, check_gyro
 from gnio_jax.errors import InputError
+from gnio_jax.numerics import finite_rows
 from gnio_jax.types import STANDARD_G, Sequence
 
 RATE = 100.0
@@ -87,6 +86,7 @@ LIMITS = {
     "accel's delay": (0.15, "s"),  # phones filter the accelerometer (0.046)
 }
 
+_TEXT_FILES = ("accelerometer.txt", "gyroscope.txt", "description.txt", "timeAlignment.txt")
 _NAME = re.compile(rf"(\w+?)_({'|'.join(DEVICES)})_(Dist|NoDist)_(\w+)")
 
 
@@ -137,10 +137,8 @@ def _split(walk: Walk) -> str:
 
 
 def _recording(walk: Walk) -> Recording:
-    files = ("accelerometer.txt", "gyroscope.txt", "description.txt", "timeAlignment.txt")
-    paths = (*(walk.folder / name for name in files), walk.track)
-    present = tuple(path for path in paths if path.is_file())
-    return Recording(walk.folder.name, partial(read, walk.folder), present, slow=True)
+    files = *(walk.folder / name for name in _TEXT_FILES), walk.track
+    return Recording(walk.folder.name, partial(read, walk.folder), files, slow=True)
 
 
 # --- one walk
@@ -156,11 +154,6 @@ def read(folder: Path) -> list[Sequence]:
     phone, track = read_phone(walk), read_track(walk.track, _offset(folder))
     # Whichever is damaged, they do not fit together.
     both = f"{walk.track} and accelerometer.txt, gyroscope.txt, timeAlignment.txt of the phone"
-    try:
-        fit = align(phone, track, LAG_KNOTS, search_seconds=LAG_SEARCH)
-    except TooLittle as error:
-        raise Refusal(both, f"cannot be aligned with the phone ({error})") from None
-    check_fit(fit, both, LIMITS)
     about = {
         "group": walk.person,
         "subject": walk.person,
@@ -170,15 +163,9 @@ def read(folder: Path) -> list[Sequence]:
         "truth": "Qualisys",
         "imu_compensated": "no" if walk.device.startswith("iPhone") else "Android's gyro bias",
         "accel_clipped": clipped(phone.accel.values),
-        "lag": float(np.mean(fit.lag)),
-        "accel_delay_removed": fit.accel_delay,
-        "gyro_unexplained": fit.gyro_unexplained,
-        "accel_unexplained": fit.accel_unexplained,
-        "gyro_bias": float(np.linalg.norm(fit.gyro_bias)),
     }
-    accel = phone.accel._replace(time=phone.accel.time - fit.accel_delay)
-    streams = phone._replace(accel=accel, poses=fit.poses, attributes=about)
-    return assemble(streams, RATE, divide=True)
+    phone, track = phone._replace(attributes=about), track._replace(source=both)
+    return assemble(laid_on(phone, track, LIMITS, LAG_KNOTS, LAG_SEARCH), RATE, divide=True)
 
 
 def clipped(accel: Float[np.ndarray, "n 3"]) -> float:
@@ -199,11 +186,9 @@ def read_phone(walk: Walk) -> Streams:
     for name, widths in (("gyroscope.txt", (4,) if apple else (7,)), ("accelerometer.txt", (4,))):
         path = walk.folder / name
         table = read_text(path, separator=" ", header=False, widths=widths)
-        stamps, values = table.take(0), table.take(1, 2, 3)
+        (time, _, rows), values = table.clock(0, "s", start, "dropped"), table.take(1, 2, 3)
         if 7 in widths:
             values = values - table.take(4, 5, 6)
-        rows = distinct(stamps, path)
-        time = stamps[rows] - start
         remedy = "cut the rows of other times, or check that all files are of one phone"
         if not abs(time[0]) <= LATEST_START:
             problem = f"field 'time' (column 0) begins {time[0]:.3g} s after the record"
@@ -215,8 +200,6 @@ def read_phone(walk: Walk) -> Streams:
     gyro, accel = sensors
     if apple:
         accel = accel._replace(values=-STANDARD_G * accel.values)
-    check_accel(accel.values, accel.source, accel.time)
-    check_gyro(gyro.values, gyro.source, gyro.time)
     return Streams(walk.folder.name, str(walk.folder), gyro, accel)
 
 
@@ -255,31 +238,26 @@ def read_track(path: Path, offset: float) -> Poses:
         content = loadmat(path, simplify_cells=True)
     structs = [value for name, value in content.items() if not name.startswith("__")]
     struct = structs[0] if len(structs) == 1 and isinstance(structs[0], dict) else {}
-    bodies = struct.get("RigidBodies")
-    if not isinstance(bodies, dict) or "Positions" not in bodies or "Rotations" not in bodies:
+    bodies, rate = struct.get("RigidBodies"), struct.get("FrameRate")
+    widths = {"Positions": 3, "Rotations": 9}
+    if not isinstance(bodies, dict) or not widths.keys() <= bodies.keys():
         problem = "field 'RigidBodies' with Positions and Rotations is missing"
         raise InputError(path, problem, "export it from QTM with its one rigid body (6DOF)")
-    rate = _numbers(path, struct, "FrameRate", ())
-    place, matrices = (
-        _numbers(path, bodies, name, (width, -1))
-        for name, width in (("Positions", 3), ("Rotations", 9))
-    )
-    if not 1.0 <= rate <= 1000.0:
-        raise damaged(path, f"field 'FrameRate' is {float(rate):.3g} Hz, expected 60")
-    if place.shape[1] != matrices.shape[1]:
-        problem = f"fields 'Positions' and 'Rotations' hold {place.shape[1]} and"
-        raise damaged(path, f"{problem} {matrices.shape[1]} frames")
-    seen = np.flatnonzero(np.isfinite(place).all(axis=0) & np.isfinite(matrices).all(axis=0))
-    if len(seen) < 0.5 * place.shape[1]:
-        raise damaged(path, f"only {len(seen)} of {place.shape[1]} frames hold a pose")
-    place = place[:, seen].T * 1e-3
-    turns = matrices[:, seen].T.reshape(-1, 3, 3).transpose(0, 2, 1)  # column by column
+    if not isinstance(rate, int | float) or not 1.0 <= rate <= 1000.0:
+        raise damaged(path, f"field 'FrameRate' is {shortened(rate)} Hz, expected 60")
+    table = Table(path, {name: np.asarray(bodies[name]).T for name in widths}, "field")
+    place, matrices = (table.take(name, width=w, gaps=True) for name, w in widths.items())
+    seen = np.flatnonzero(finite_rows(place) & finite_rows(matrices))
+    if len(seen) < 0.5 * len(place):
+        raise damaged(path, f"only {len(seen)} of {len(place)} frames hold a pose")
+    place = place[seen] * 1e-3
+    turns = matrices[seen].reshape(-1, 3, 3).transpose(0, 2, 1)  # column by column
     off = np.abs(turns.transpose(0, 2, 1) @ turns - np.eye(3)).max(axis=(1, 2))
     bad = ~(off <= 1e-3) | ~(np.linalg.det(turns) > 0)
     if bad.any():
         frame = f"first in frame {seen[np.argmax(bad)] + 1}"
         raise damaged(path, f"field 'Rotations' is no rotation in {bad.sum()} frames, {frame}")
-    poses = Poses(seen / float(rate) - offset, Rotation.from_matrix(turns), place, noisy=True)
+    poses = Poses(seen / rate - offset, Rotation.from_matrix(turns), place, noisy=True)
     good = without_jumps(poses, FASTEST_TURN, FASTEST)._replace(source=str(path))
     if len(good.time) < 0.5 * len(seen):
         raise damaged(path, f"only {len(good.time)} of {len(seen)} poses are plausible")
@@ -288,23 +266,6 @@ def read_track(path: Path, offset: float) -> Poses:
         problem = f"field 'Positions' spans {span:.3g} m as mm, expected {least:g} to {most:g} m"
         raise InputError(path, problem, "give it in mm")
     return good
-
-
-def _numbers(path: Path, fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """A field as float64 of this shape; −1 stands for any number from 2 on."""
-    try:
-        values = np.asarray(fields.get(name), dtype=np.float64)
-    except (TypeError, ValueError):
-        values = np.zeros((0, 0, 0))
-    fits = values.ndim == len(shape) and all(
-        found == wanted or (wanted < 0 and found >= 2)
-        for found, wanted in zip(values.shape, shape, strict=False)
-    )
-    if not fits:
-        wanted = str(shape).replace("-1", "n")
-        problem = f"field '{name}' has shape {values.shape} of numbers, expected {wanted}"
-        raise InputError(path, problem, "export it from QTM with its one rigid body (6DOF)")
-    return values
 
 
 DATASET = Dataset(

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import numerics
-from gnio_jax.data import alignment
+from gnio_jax.data.alignment import positions
 from gnio_jax.data.assembly import Samples, Streams
 from tests.support import known_walk as walk
 
@@ -34,7 +34,7 @@ def test_clock_and_attitude_are_found_and_a_relocalisation_does_not_matter():
     position = walk.position(time)
     position[5000:] += [2.0, -1.0, 0.3]  # the tracker relocalised
     streams = phone(85.0, lag=1.3, drift=0.003, tilt=(0.05, -0.03))
-    found = alignment.align_positions(streams, Samples(time, position, "track"))
+    found = positions.align_positions(streams, Samples(time, position, "track"))
     np.testing.assert_allclose(found.lag, 1.3, atol=0.01)
     assert found.correlation > 0.95 and found.runner_up < 1.0
     assert found.yaw_drift == pytest.approx(0.003 * 80, abs=0.1)
@@ -54,7 +54,7 @@ def test_what_the_tracker_lost_bends_nothing():
     time = np.arange(0.0, 90.0, 0.01)
     time = np.repeat(time[(time < 30.0) | (time > 65.0)], 2)  # each row is there twice
     track = Samples(time, walk.position(time), "track")
-    found = alignment.align_positions(phone(95.0, lag=0.8, drift=0.003), track)
+    found = positions.align_positions(phone(95.0, lag=0.8, drift=0.003), track)
     np.testing.assert_allclose(found.lag, 0.8, atol=0.01)
     assert found.yaw_drift == pytest.approx(0.003 * 90, abs=0.1)
     poses = found.poses
@@ -66,7 +66,7 @@ def test_what_the_tracker_lost_bends_nothing():
 def test_positions_of_another_walk_do_not_correlate():
     time = np.arange(0.0, 50.0, 0.01)
     other = Samples(time, walk.position(1.3 * time), "track")
-    assert alignment.align_positions(phone(50.0), other).correlation < 0.5
+    assert positions.align_positions(phone(50.0), other).correlation < 0.5
 
 
 @pytest.mark.parametrize(
@@ -84,5 +84,5 @@ def test_too_little_is_refused(seconds, lag, device, gain, problem):
     streams = phone(seconds, lag)
     own = streams.device._replace(time=streams.device.time + device)
     track = Samples(time, gain * walk.position(time), "track")
-    with pytest.raises(alignment.TooLittle, match=problem):
-        alignment.align_positions(streams._replace(device=own), track)
+    with pytest.raises(positions.TooLittle, match=problem):
+        positions.align_positions(streams._replace(device=own), track)

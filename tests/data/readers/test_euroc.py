@@ -95,7 +95,8 @@ def test_a_mount_that_appears_makes_another_entry_of_the_cache_and_a_truth_is_ne
     recorded(mav, seconds=3.0)
     files.write_yaml(mav / "imu0" / "sensor.yaml", files.Mount())
     (recording,) = euroc.recordings(tmp_path, "test")
-    assert [path.name for path in recording.files] == ["data.csv", "sensor.yaml", "data.csv"]
+    there = [path.name for path in recording.files if path.is_file()]
+    assert there == ["data.csv", "sensor.yaml", "data.csv"]
     (mav / "state_groundtruth_estimate0" / "data.csv").unlink()
     refused(lambda: euroc.read(mav.parent), mav, "has no reference", "csv")
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.data import loading
+from gnio_jax.data.alignment import body
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.loading import read_recording
 from gnio_jax.data.readers import oxiod
@@ -182,7 +183,7 @@ def test_what_no_phone_on_a_marker_body_can_be_is_refused_by_name(tmp_path, monk
     files.write_raw(dataset(tmp_path, "handheld", "data1"), 1, files.Truth(), seconds=25)
     (walk,) = oxiod.find_walks(tmp_path)
     phone = oxiod.read_phone(walk.files["raw"][0], "raw")
-    fit = oxiod.align(phone, oxiod.read_vicon(walk.files["raw"][1], "raw", phone.start))
+    fit = body.align(phone, oxiod.read_vicon(walk.files["raw"][1], "raw", phone.start))
     for change, message in (
         ({"lever": np.array([0.1, 0.5, -0.2])}, "the lever arm would be 0.548 m"),
         ({"accel_delay": 0.2}, "the accel's delay would be 0.2 s"),
@@ -190,10 +191,10 @@ def test_what_no_phone_on_a_marker_body_can_be_is_refused_by_name(tmp_path, monk
         ({"gyro_bias": np.array([0.1, -0.1, 0.1])}, "the gyro's bias would be 0.17"),
         ({"lag": fit.lag - 6.0}, "s, at most 5 s is plausible"),
     ):
-        monkeypatch.setattr(oxiod, "align", lambda *_, c=change, **__: fit._replace(**c))
+        monkeypatch.setattr(body, "align", lambda *_, c=change, **__: fit._replace(**c))
         assert message in refused(tmp_path)
     walk = walk._replace(files={"syn": walk.files["raw"]})  # whose rows the authors have matched
-    monkeypatch.setattr(oxiod, "align", lambda *_, **__: fit._replace(lag=fit.lag - 2.5))
+    monkeypatch.setattr(body, "align", lambda *_, **__: fit._replace(lag=fit.lag - 2.5))
     with pytest.raises(Refusal, match="s, at most 1 s is plausible"):
         oxiod.build(walk, "syn")
 
