@@ -70,7 +70,8 @@ UPWARD = np.array([0.0, 0.0, GRAVITY])
 """What an accelerometer at rest feels in a level world, m/s²."""
 CUTOFF = 2.0
 """Hz, half response of the smoother of the positions: what is faster is the tracker's noise and the
-sway of the other device."""
+sway of the other device. OxIOD's walks on two floors disagree: with 4 Hz three of them would
+correlate with the accelerometer by 0.81 in place of 0.77, and three by 0.28 in place of 0.35."""
 
 
 class PositionsFit(NamedTuple):

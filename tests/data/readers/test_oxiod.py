@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import pickle
 
+import loky
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
-from gnio_jax.data import loading
 from gnio_jax.data.alignment import body
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.loading import read_recording
@@ -37,10 +37,10 @@ def read_back(tmp_path, write, kind, truth, place=("handheld", "data1"), seconds
 def compare(sequence, truth, time):
     """Reference, IMU and what the fit has found; the world's yaw and origin are Vicon's own."""
     keep, a, walk = sequence.valid, sequence.attributes, truth.walk
-    known = walk.position(time)
-    off = np.linalg.norm(sequence.position - known, axis=1)[keep]
-    walked = np.linalg.norm(np.diff(known, axis=0), axis=1).sum()
-    assert off.max() < 0.01 + 0.01 * walked and np.median(off) < 0.01
+    off = np.linalg.norm(sequence.position - walk.position(time), axis=1)[keep]
+    assert np.quantile(off, 0.95) < 2e-3 and off.max() < 4e-3  # beside the flip and the jump
+    speed = np.linalg.norm(sequence.velocity - walk.velocity(time), axis=1)[keep]
+    assert np.sqrt((speed**2).mean()) < 0.01
     turn = rotations(sequence.orientation[keep]) * walk.attitude(time[keep]).inv()
     assert np.degrees(turn.magnitude()).max() < 0.5
     # The flip and the jump of the tracker are found out.
@@ -89,13 +89,6 @@ def test_raw_walk_comes_back(tmp_path, skew):
     middle = 0.5 * (time[0] + time[-1])
     assert a["lag"] == pytest.approx(-truth.offset - skew * middle, abs=3e-3 + abs(skew) * 2)
     assert a["lag_drift"] == pytest.approx(abs(skew) * 45, abs=6e-3)
-    # Over one second, what a network learns from.
-    step = sequence.position[100:] - sequence.position[:-100]
-    known = truth.walk.position(time[100:]) - truth.walk.position(time[:-100])
-    whole = sequence.valid[100:] & sequence.valid[:-100]
-    assert np.linalg.norm(step - known, axis=1)[whole].max() < 0.015
-    off = np.abs(sequence.velocity - truth.walk.velocity(time))[sequence.valid]
-    assert off.max() < 0.06 and np.median(off) < 0.01 and np.sqrt((off**2).mean()) < 0.02
     # The device's own attitude is right but for its yaw.
     turn = rotations(sequence.device_orientation) * truth.walk.attitude(time).inv()
     expected = np.broadcast_to([0, 0, 1.1], (len(time) - 100, 3))
@@ -246,7 +239,7 @@ def test_reading_again_uses_the_cache_and_another_process_can_read(tmp_path, mon
         files.write_syn(dataset(tmp_path, "handheld", "data5"), number, files.Truth(), seconds=15)
     (dataset(tmp_path, "handheld", "data5").parent / "Test.txt").write_text("data5")
     with monkeypatch.context() as patch:
-        patch.setattr(loading, "ProcessPoolExecutor", lambda *_: pytest.fail("unasked"))
+        patch.setattr(loky, "ProcessPoolExecutor", lambda *_: pytest.fail("unasked"))
         alone = data.load("oxiod", tmp_path, "test")
         patch.setattr(oxiod, "build", lambda *_: pytest.fail("built again"))
         again = data.load("oxiod", tmp_path, "test")
