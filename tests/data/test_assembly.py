@@ -14,7 +14,6 @@ from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.validation import validate
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import rotations
 from gnio_jax.types import Waypoints
 from tests.support import known_walk as walk
 
@@ -33,61 +32,6 @@ def known(gyro_time, accel_time, **options):
 def tracked(stamps, **options):
     place = walk.position(stamps)
     return Poses(stamps, walk.attitude(stamps), place, source="poses.csv", **options)
-
-
-def test_two_sensors_and_a_tracker_each_on_its_own_clock_come_back():
-    """A gyro at 90 Hz, an accelerometer at 107 Hz and noisy poses at 60 Hz with a lever."""
-    gyro_time, accel_time = 0.7 + np.arange(2700) / 90.3, np.arange(3300) / 107.1
-    stamps = 1.0 + np.arange(1700) / 60.0
-    poses = tracked(stamps, noisy=True)
-    lever = np.array([0.0, 0.02, -0.05])
-    poses = poses._replace(position=poses.position - poses.attitude.apply(lever), lever=lever)
-    (sequence,) = assemble(
-        known(gyro_time, accel_time, poses=poses, start=50.0, attributes={"device": "phone"}), 100.0
-    )
-    time = sequence.time + sequence.attributes["start_time"] - 50.0
-    inner = slice(30, -30)
-    np.testing.assert_allclose(np.diff(sequence.time), 0.01, rtol=1e-9)
-    np.testing.assert_allclose(sequence.gyro[inner], walk.rate(time)[inner], atol=1e-3)
-    np.testing.assert_allclose(sequence.accel[inner], walk.force(time)[inner], atol=1e-3)
-    np.testing.assert_allclose(sequence.position[inner], walk.position(time)[inner], atol=2e-3)
-    error = rotations(sequence.orientation) * walk.attitude(time).inv()
-    assert np.degrees(error.magnitude())[inner].max() < 0.5
-    off = (sequence.velocity - walk.velocity(time))[inner]
-    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.05
-    assert sequence.valid[inner].all() and sequence.imu_valid is None
-    # Cut to the poses, from the first sample of the gyro after the first pose.
-    assert 0.0 <= time[0] - stamps[0] < 1 / 90.0 and 0.0 <= stamps[-1] - time[-1] < 0.02
-    assert sequence.attributes["device"] == "phone"
-
-
-def test_slow_phones_are_read_as_they_are():
-    time = np.arange(800) / 40.0
-    (sequence,) = assemble(known(time, time))
-    assert 1.0 / np.diff(sequence.time).mean() == pytest.approx(40.0, rel=1e-3)
-    np.testing.assert_allclose(sequence.gyro, walk.rate(sequence.time), atol=1e-3)
-    assert not sequence.valid.any() and np.isnan(sequence.position).all()
-
-
-def test_at_ten_hertz_jitter_is_no_hole():
-    """At 10.5 Hz two samples of a jittering clock lie more than 0.1 s apart half of the time."""
-    rng = np.random.default_rng(3)
-    time = np.arange(300) / 10.5 + rng.uniform(-0.02, 0.02, 300)
-    (sequence,) = assemble(known(time, time))
-    assert sequence.imu_valid is None
-    holed = np.delete(time, np.s_[100:104])
-    (sequence,) = assemble(known(holed, holed))
-    assert sequence.imu_valid is not None and 2 <= (~sequence.imu_valid).sum() <= 6
-
-
-def test_samples_on_the_clock_already_stay_to_the_bit():
-    time = np.round(5.0 + np.arange(800) / 200.0, 6)
-    streams = known(time, time, poses=tracked(time, velocity=walk.velocity(time)))
-    (sequence,) = assemble(streams, 200.0)
-    np.testing.assert_array_equal(sequence.gyro, streams.gyro.values)
-    np.testing.assert_array_equal(sequence.accel, streams.accel.values)
-    np.testing.assert_array_equal(sequence.position, walk.position(time))
-    np.testing.assert_array_equal(sequence.velocity, walk.velocity(time))
 
 
 def test_the_imu_beyond_the_poses_is_cut_away_unless_all_of_it_is_wanted():

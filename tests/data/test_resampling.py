@@ -39,18 +39,6 @@ def test_resampling_returns_the_signal_at_the_new_stamps(native, rate):
     assert result.attributes == sequence.attributes
 
 
-def test_resampling_accepts_uneven_stamps():
-    rng = np.random.default_rng(0)
-    stamps = np.arange(400) / 100
-    stamps[1:-1] += rng.uniform(-0.003, 0.003, 398)
-    result = resample(circle(stamps=stamps), 100.0)
-    np.testing.assert_allclose(np.diff(result.time), 0.01, rtol=1e-9)
-    truth = circle(stamps=result.time)
-    np.testing.assert_allclose(result.position, truth.position, atol=1e-6)
-    np.testing.assert_allclose(result.accel, truth.accel, atol=5e-3)
-    assert result.valid.all()
-
-
 def test_what_the_new_rate_cannot_carry_does_not_fold_into_the_gait_band():
     sequence = circle(200.0, 10.0)
     # Taken at 100 Hz it would look like 30 Hz.

@@ -202,23 +202,16 @@ def test_the_worst_tenth_of_the_rows_is_not_held_against_a_fit():
 # --- the lag alone
 
 
-@pytest.mark.parametrize("lag", [-0.12, 0.0, 0.033, 0.187])
-def test_lag_from_noisy_rates_with_a_bias(lag):
+@pytest.mark.parametrize(("lag", "hz"), [(-0.12, 100), (0.0, 30), (0.033, 60), (0.187, 100)])
+def test_lag_from_noisy_rates_with_a_bias(lag, hz):
     noise = np.random.default_rng(1)
-    time = np.arange(0, 60, 0.01)
+    time, stamps = np.arange(0, 60, 0.01), np.arange(0, 60, 1.0 / hz)
     gyro = walk.rate(time) + BIAS + noise.normal(0, 0.02, (len(time), 3))
     gyro[2000:2020] += 8.0  # a knock
-    shaken = Rotation.from_rotvec(noise.normal(0, np.radians(0.05), (len(time), 3)))
-    poses, keep = walk.attitude(time - lag) * shaken, (time < 30) | (time > 30.4)
-    fit = body.pose_lag(time, gyro, time[keep], poses[keep])
+    shaken = Rotation.from_rotvec(noise.normal(0, np.radians(0.05), (len(stamps), 3)))
+    poses, keep = walk.attitude(stamps - lag) * shaken, (stamps < 30) | (stamps > 30.4)
+    fit = body.pose_lag(time, gyro, stamps[keep], poses[keep])
     assert fit.lag == pytest.approx(lag, abs=3e-3) and fit.correlation > 0.5
-
-
-@pytest.mark.parametrize("hz", [30.0, 60.0])
-def test_poses_of_every_rate_have_a_lag(hz):
-    time, stamps = np.arange(0, 40, 0.01), np.arange(0, 40, 1.0 / hz)
-    fit = body.pose_lag(time, walk.rate(time), stamps, walk.attitude(stamps - 0.1))
-    assert fit.lag == pytest.approx(0.1, abs=3e-3) and fit.correlation > 0.99
 
 
 def test_poses_of_another_time_or_of_what_stands_still_tell_nothing_of_a_lag():

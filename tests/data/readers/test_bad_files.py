@@ -285,6 +285,8 @@ BAD = {
         (".npz", times("t", 10), "field 'time'", "10 Hz", "_extract"),
     ],
     "blackbird": [
+        (".hdf5", put("traj_target", (7, slice(3, 7)), 0.0), "not a unit quaternion", "row 8"),
+        (".hdf5", put("ts", 8, 1_525_745_865.0), "field 'time'", "does not increase", "row 9"),
         ("imu.txt", lines(lambda rows: rows[:-5]), "'ts'", "695 and 700 rows"),
         ("imu.txt", lines(lambda rows: [rows[0], *rows[2:], rows[1]]), "'ts'"),
         ("imu.txt", NO_CELL, "has 10 columns"),

@@ -12,7 +12,6 @@ from gnio_jax.data.self_check import self_check
 from gnio_jax.numerics import rotations
 from tests.support import known_walk
 from tests.support.blackbird_files import FLIP, START, write
-from tests.support.refusals import refused
 from tests.support.tlio_files import spoil
 
 
@@ -34,18 +33,6 @@ def test_a_flight_comes_back_in_a_world_whose_z_points_up(tmp_path, down, text):
     assert sequence.valid.all() and self_check(sequence, pedestrian=False).failures == ()
     assert sequence.attributes["native_world"] == ("z-down, turned" if down else "z-up")
     assert sequence.attributes["start_time"] == pytest.approx(START, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (spoil("traj_target", (7, slice(3, 7)), 0.0), ("not a unit quaternion", "row 8")),
-        (spoil("ts", 8, START), ("field 'time'", "does not increase", "row 9")),
-    ],
-)
-def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, words):
-    folder = write(tmp_path / "flight", spoil=change, text=0)
-    refused(lambda: blackbird.read(folder), folder / "data.hdf5", *words)
 
 
 def test_rounded_quaternions_are_mended(tmp_path):

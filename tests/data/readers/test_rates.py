@@ -12,7 +12,6 @@ from tests.support import (
     blackbird_files,
     idol_files,
     kitti_files,
-    known_walk,
     ridi_files,
     ronin_files,
     tlio_files,
@@ -31,56 +30,57 @@ def thinned(rate, native):
     return thin
 
 
-def of_blackbird(root, rate):
-    folder = blackbird_files.write(root / "fast" / "test", text=0, spoil=thinned(rate, 100))
-    return blackbird.read(folder)
-
-
 def of_euroc(root, rate):
-    mav = root / "V1_01_easy" / "mav0"
-    asl_files.write_imu(mav, seconds=12.0, step=1 / rate)
-    asl_files.write_estimate(mav, step=1 / 50)
-    return euroc.read(mav.parent)
+    asl_files.write_imu(root / "V1_01_easy" / "mav0", seconds=12.0, step=1 / rate)
+    asl_files.write_estimate(root / "V1_01_easy" / "mav0", step=1 / 50)
+    return root / "V1_01_easy"
 
 
 def of_idol(root, rate):
     table = idol_files.frame()
     rows = np.arange(0, len(table), 100 / rate).astype(int)
-    return idol.read(idol_files.write(root, table.iloc[rows]))
+    return idol_files.write(root, table.iloc[rows])
 
 
-def of_kitti(root, rate):
-    drive = kitti_files.write_drive(root, "2011_09_26_drive_0014", seconds=6.0, rate=rate)
-    return kitti.read_packets(drive)
+READERS = {
+    "blackbird": (
+        100,
+        blackbird.read,
+        lambda r, hz: blackbird_files.write(r / "a", text=0, spoil=thinned(hz, 100)),
+    ),
+    "euroc": (200, euroc.read, of_euroc),
+    "idol": (100, idol.read, of_idol),
+    "kitti": (
+        100,
+        kitti.read_packets,
+        lambda r, hz: kitti_files.write_drive(r, "2011_09_26_drive_0014", 6.0, rate=hz),
+    ),
+    "ridi": (
+        200,
+        lambda table: ridi.read(table.parents[1]),
+        lambda r, hz: ridi_files.write_table(r, "dan_bag1", np.arange(round(36 * hz)) / hz),
+    ),
+    "ronin": (
+        200,
+        ronin.read,
+        lambda r, hz: ronin_files.write(r / "a", start_frame=100, spoil=thinned(hz, 200)),
+    ),
+    "tlio": (
+        200,
+        tlio.read,
+        lambda r, hz: tlio_files.write_sequence(r / "a", spoil=thinned(hz, 200)),
+    ),
+}
+"""The rate (Hz) that each gives, how it reads, and what writes a recording of another rate."""
 
 
-def of_ridi(root, rate):
-    time = np.arange(round(known_walk.SECONDS * rate)) / rate
-    return ridi.read(ridi_files.write_table(root, "dan_bag1", time).parents[1])
-
-
-def of_ronin(root, rate):
-    folder = ronin_files.write(root / "a001_1", start_frame=100, spoil=thinned(rate, 200))
-    return ronin.read(folder)
-
-
-def of_tlio(root, rate):
-    return tlio.read(tlio_files.write_sequence(root / "walk", spoil=thinned(rate, 200)))
-
-
-READERS = [of_blackbird, of_euroc, of_idol, of_kitti, of_ridi, of_ronin, of_tlio]
-
-
-@pytest.mark.parametrize("rate", [40.0, 50.0])
-@pytest.mark.parametrize("read", READERS)
-def test_a_slow_recording_comes_back_at_the_rate_of_the_others(tmp_path, read, rate):
-    (sequence,) = read(tmp_path, rate)
-    native = {of_euroc: 200, of_ridi: 200, of_ronin: 200, of_tlio: 200}.get(read, 100)
+@pytest.mark.parametrize("name", READERS)
+def test_a_slow_recording_comes_back_at_the_rate_of_the_others_unless_it_is_of_no_imu(
+    tmp_path, name
+):
+    native, read, write = READERS[name]
+    (sequence,) = read(write(tmp_path / "slow", 40.0))
     np.testing.assert_allclose(np.diff(sequence.time), 1 / native, rtol=1e-3)
     assert sequence.valid.mean() > 0.9
-
-
-@pytest.mark.parametrize("read", READERS)
-def test_what_is_slower_than_an_imu_is_refused_in_one_line(tmp_path, read):
     with pytest.raises(InputError, match=r"^[^\n]* runs at 5 Hz, [^\n]*$"):
-        read(tmp_path, 5.0)
+        read(write(tmp_path / "slower", 5.0))

@@ -51,23 +51,13 @@ def test_table_comes_back(tmp_path, shuffled):
     assert a["truth"] == "Tango VIO of the phone itself"
 
 
-def test_the_cache_is_keyed_by_the_files_that_are_read(tmp_path):
-    folder = write_text(tmp_path, "hang_leg1", "android_sensor_pose.txt", seconds=5.0)
-    sensors = {path.name for path in folder.iterdir()}
-    assert len(sensors) == 5
-    for files in (sensors, {"data.csv"}):
-        (recording,) = ridi.recordings(tmp_path, "all")
-        assert {path.name for path in recording.files} == files
-        # Once the table is there, it is what is read.
-        (folder / "processed").mkdir(exist_ok=True)
-        (folder / "processed" / "data.csv").touch()
-
-
 @pytest.mark.parametrize("poses", ["pose.txt", "android_sensor_pose.txt"])
 def test_text_files_come_back(tmp_path, poses):
     without = () if poses == "pose.txt" else ("orientation.txt",)  # the phone's own filter
     folder = write_text(tmp_path, "hang_leg_new3", poses, seconds=SECONDS, without=without)
-    (sequence,) = ridi.read(folder)
+    (recording,) = ridi.recordings(tmp_path, "all")
+    assert set(folder.iterdir()) <= set(recording.files)  # by which the cache is keyed
+    (sequence,) = recording.read()
     compare(sequence, device=not without)
     assert (sequence.device_orientation is None) == bool(without)
     assert sequence.valid.mean() > 0.999
