@@ -224,8 +224,7 @@ def _on_clock(
         rates, measured = resampled(gyro.time, gyro.values, clock, rate)
         forces, also = resampled(accel.time, accel.values, clock, rate)
         measured &= also
-    nothing = np.full((len(clock), 4), np.nan)
-    reference = Reference(nothing, nothing[:, 1:], nothing[:, 1:], np.zeros(len(clock), dtype=bool))
+    reference = Reference.none(len(clock))
     if poses is not None:
         reference = reference_at(clock, rates, poses, max_speed, max_drift)
     known = reference.valid[:, None]

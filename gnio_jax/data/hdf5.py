@@ -76,15 +76,8 @@ def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
         attributes[key] = value
 
 
-class _Stored(NamedTuple):
-    """What a group holds, as HDF5 has it."""
-
-    about: dict[str, Any]
-    """Its own attributes."""
-    fields: dict[str, np.ndarray | None]
-    """Of a group of the package's format; None for what is missing."""
-    attributes: dict[str, Any]
-    """Of the sequence."""
+_Stored = tuple[dict[str, Any], dict[str, np.ndarray | None], dict[str, Any]]
+"""Attributes of a group, its fields (None for what is missing), attributes of the sequence."""
 
 
 def _stored(group: h5py.Group, path: Path) -> _Stored:
@@ -93,33 +86,33 @@ def _stored(group: h5py.Group, path: Path) -> _Stored:
     ours = about.get("format") == _FORMAT
     fields = {name: hdf5_field(group, name, path) for name in names if ours}
     inner = hdf5_node(group, "attributes", path)
-    return _Stored(about, fields, {} if inner is None else dict(inner.attrs))
+    return about, fields, {} if inner is None else dict(inner.attrs)
 
 
 def _sequence(stored: _Stored, path: Path) -> Sequence:
     """The sequence of a group, validated. Raises `InputError`."""
-    if (form := stored.about.get("format")) != _FORMAT:
+    about, fields, attributes = stored
+    if (form := about.get("format")) != _FORMAT:
         problem = f"is not a '{_FORMAT}' file (format: {form!r})"
         raise InputError(path, problem, "convert the recording with gnio data convert")
-    there = {name for name, values in stored.fields.items() if values is not None}
-    fields = (*_FIELDS, *(field for field in _OPTIONAL_FIELDS if field in there))
-    values: dict[str, Any] = {field: _values(stored, field, path) for field in fields}
+
+    def values(field: str) -> np.ndarray:
+        """Booleans of what is valid, float64 of every other field."""
+        kind, content = ("b", "booleans") if field.endswith("valid") else ("f", "numbers")
+        found = fields[field]
+        if found is not None and found.dtype.kind == kind and found.shape:
+            return found if kind == "b" else found.astype(np.float64, copy=False)
+        problem = "is missing" if found is None else f"is not an array of {content}"
+        raise InputError(path, f"field '{field}' {problem}", "convert the recording again")
+
+    there = {name for name, found in fields.items() if found is not None}
+    optional: dict[str, Any] = {each: values(each) for each in _OPTIONAL_FIELDS if each in there}
     if there.intersection(_WAYPOINTS):
-        values["waypoints"] = Waypoints(*(_values(stored, name, path) for name in _WAYPOINTS))
-    attributes = stored.attributes.items()
-    plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in attributes}
-    name = str(stored.about.get("name", path.stem))
-    return validate(Sequence(name=name, attributes=plain, **values), path)
-
-
-def _values(stored: _Stored, field: str, path: Path) -> np.ndarray:
-    """Booleans of what is valid, float64 of every other field."""
-    kind, content = ("b", "booleans") if field.endswith("valid") else ("f", "numbers")
-    values = stored.fields[field]
-    if values is not None and values.dtype.kind == kind and values.shape:
-        return values if kind == "b" else values.astype(np.float64, copy=False)
-    problem = "is missing" if values is None else f"is not an array of {content}"
-    raise InputError(path, f"field '{field}' {problem}", "convert the recording again")
+        optional["waypoints"] = Waypoints(*map(values, _WAYPOINTS))
+    name = str(about.get("name", path.stem))
+    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in attributes.items()}
+    required = map(values, _FIELDS)
+    return validate(Sequence(name, *required, **optional, attributes=plain), path)
 
 
 # --- the cache

@@ -51,10 +51,9 @@ def load(
 
     Recordings that are of no use, or fail the physical self-check, are left out with a warning.
     With `workers` > 1 that many processes read the recordings that are slow to read and not in the
-    cache yet; a script that asks for them needs its `if __name__ == "__main__"`. Sequences,
-    warnings and errors do not depend on their number. `progress` is told the share of these
-    recordings that is read. Raises `InputError` on an unknown name or split, a missing folder, a
-    damaged file, two sequences of one name, or a split without a sequence.
+    cache yet. Sequences, warnings and errors do not depend on their number. `progress` is told the
+    share of these recordings that is read. Raises `InputError` on an unknown name or split, a
+    missing folder, a damaged file, two sequences of one name, or a split without a sequence.
     """
     return list(load_each(name, root, split, workers, progress))
 

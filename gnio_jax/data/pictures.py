@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from gnio_jax.data.self_check import SelfCheck, gyro_windows
+from gnio_jax.data.self_check import WINDOW_SECONDS, SelfCheck, gyro_windows
 from gnio_jax.data.waypoints import with_poses
 from gnio_jax.errors import InputError
 from gnio_jax.files import replacing, shown_name
@@ -24,7 +24,6 @@ BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
 UNTRUSTED = "#F3D9CC"
 POINTS = 3000
 """A line of more points than the picture has pixels only makes the file larger."""
-WINDOW_SECONDS = 10.0
 COLOURS = 96
 
 
@@ -58,7 +57,9 @@ def overview(sequence: Sequence, check: SelfCheck) -> Figure:
     speed = figure.add_subplot(grid[0, 1])
     accel, gyro = (figure.add_subplot(grid[row, 1], sharex=speed) for row in (1, 2))
     _speed(speed, sequence)
-    _accel(accel, sequence)
+    size = np.linalg.norm(sequence.accel, axis=1)
+    _over_time(accel, sequence, size, color=VERMILION, lw=0.5)
+    accel.set_ylabel("|accel| (m/s²)")
     _gyro(gyro, sequence)
     for panel in (speed, accel):
         panel.tick_params(labelbottom=False)
@@ -91,11 +92,6 @@ def _speed(axes: Axes, sequence: Sequence) -> None:
     if not sequence.valid.all():
         axes.fill_between([], [], [], color=UNTRUSTED, lw=0, label="reference not valid")
         axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
-
-
-def _accel(axes: Axes, sequence: Sequence) -> None:
-    _over_time(axes, sequence, np.linalg.norm(sequence.accel, axis=1), color=VERMILION, lw=0.5)
-    axes.set_ylabel("|accel| (m/s²)")
 
 
 def _gyro(axes: Axes, sequence: Sequence) -> None:

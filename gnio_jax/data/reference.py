@@ -82,6 +82,12 @@ class Reference(NamedTuple):
     velocity: Float[np.ndarray, "m 3"]
     valid: Bool[np.ndarray, " m"]
 
+    @classmethod
+    def none(cls, count: int) -> Reference:
+        """Of so many stamps of which nothing is known."""
+        nothing = np.full((count, 4), np.nan)
+        return cls(nothing, nothing[:, 1:], nothing[:, 1:], np.zeros(count, dtype=bool))
+
 
 def reference_at(
     clock: Float[np.ndarray, " m"],
@@ -162,8 +168,7 @@ def _fused(
     runs = stretches(np.diff(poses.time) > usual)
     sure = [np.arange(run.start, run.stop) for run in runs if run.stop - run.start >= SHORTEST_RUN]
     poses = poses.rows(np.concatenate(sure)) if sure else poses
-    stamps, nothing = poses.time, np.full((len(clock), 4), np.nan)
-    unknown = Reference(nothing, nothing[:, :3], nothing[:, :3], np.zeros(len(clock), dtype=bool))
+    stamps, unknown = poses.time, Reference.none(len(clock))
     measured = known_at(stamps, clock, usual)
     if measured.sum() < SHORTEST_RUN:
         return unknown

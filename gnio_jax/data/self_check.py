@@ -45,20 +45,20 @@ class SelfCheck(NamedTuple):
     """s."""
     rate: float
     """Hz, from the median interval."""
-    gravity_mean: Float[np.ndarray, "3"]
+    gravity_mean: Float[np.ndarray, "3"] = np.full(3, np.nan)
     """Mean of R·accel in the world less the mean acceleration of the reference, (v_end −
     v_start)/T, m/s²: (0, 0, 9.81). Of waypoints its length stands in z."""
-    gyro_consistency_degrees: float
+    gyro_consistency_degrees: float = np.nan
     """Median angle between gyro-integrated and reference rotation over 10 s windows, one constant
     bias removed. NaN for what is shorter than two windows: the bias would take up whatever is
     wrong."""
-    median_speed: float
+    median_speed: float = np.nan
     """m/s."""
-    accel_correlation_horizontal: float
+    accel_correlation_horizontal: float = np.nan
     """Correlation of the second difference of the position with R·accel + g, x and y together."""
-    share_valid: float
+    share_valid: float = np.nan
     """Share of the samples whose reference can be trusted; NaN of waypoints."""
-    failures: tuple[str, ...]
+    failures: tuple[str, ...] = ()
     """What is implausible, one sentence each; empty when the sequence may be used."""
 
 
@@ -74,21 +74,12 @@ def self_check(sequence: Sequence, pedestrian: bool = True, correlates: bool = T
     gyro's windows. Of waypoints only gravity and the speed between them can be asked.
     """
     step = float(np.median(np.diff(sequence.time)))
-    check = SelfCheck(
-        duration=float(sequence.time[-1] - sequence.time[0]),
-        rate=1.0 / step,
-        gravity_mean=np.full(3, np.nan),
-        gyro_consistency_degrees=np.nan,
-        median_speed=np.nan,
-        accel_correlation_horizontal=np.nan,
-        share_valid=float(sequence.valid.mean()),
-        failures=(),
-    )
+    check = SelfCheck(float(sequence.time[-1] - sequence.time[0]), 1.0 / step)
     strength, has_windows = 0.0, True
     if sequence.waypoints is not None:
         check = _with_waypoints(check, sequence, step)
     elif not sequence.valid.any():
-        return check._replace(failures=("no sample has a valid reference",))
+        return check._replace(share_valid=0.0, failures=("no sample has a valid reference",))
     else:
         check, strength, has_windows = _with_reference(check, sequence, step)
     turned = np.degrees(float(np.linalg.norm(sequence.gyro, axis=1).mean())) * WINDOW_SECONDS
@@ -152,6 +143,7 @@ def _with_reference(
         gyro_consistency_degrees=float(np.median(gyro_errors)) if apart else np.nan,
         median_speed=float(np.median(np.linalg.norm(velocity[valid], axis=1))),
         accel_correlation_horizontal=correlation,
+        share_valid=float(valid.mean()),
     )
     return check, strength, starts.size > 0
 
@@ -171,7 +163,7 @@ def _with_waypoints(check: SelfCheck, sequence: Sequence, step: float) -> SelfCh
     legs = np.linalg.norm(np.diff(position, axis=0), axis=1) / np.diff(stamps)
     gravity = np.array([0.0, 0.0, np.median(means)])
     speed = float(np.median(legs))
-    return check._replace(gravity_mean=gravity, median_speed=speed, share_valid=np.nan)
+    return check._replace(gravity_mean=gravity, median_speed=speed)
 
 
 def _held_attitude(sequence: Sequence) -> Float[np.ndarray, "n 4"]:

@@ -127,7 +127,7 @@ def align_positions(imu: Streams, track: Samples) -> PositionsFit:
     `TooLittle` where both share less than 20 s.
     """
     imu = ordered(imu)
-    rows = in_order(track.time, track.values, track.source).rows
+    rows, _ = in_order(track.time, track.values, track.source)
     stamps, values = track.time[rows], track.values[rows]
     assert imu.device is not None
     streams = (imu.gyro, imu.accel, imu.device)

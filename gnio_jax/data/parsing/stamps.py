@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Float, Int, Real
 
@@ -93,19 +91,11 @@ def distinct(
     return rows
 
 
-class InOrder(NamedTuple):
-    """Rows in the order of their stamps."""
-
-    rows: Int[np.ndarray, " m"]
-    """Of the file: sorted, without those whose stamp is there already."""
-    repairs: dict[str, float]
-    """The counts `rows_sorted` and `rows_repeated`, where they are not zero."""
-
-
 def in_order(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n w"], source: object
-) -> InOrder:
-    """The rows sorted by their stamps (s), of those that share a stamp the first.
+) -> tuple[Int[np.ndarray, " m"], dict[str, float]]:
+    """(rows sorted by their stamps (s), of those that share a stamp the first; the counts
+    `rows_sorted` and `rows_repeated` where they are not zero).
 
     Raises `InputError` where the clock was set back, since the samples before and after it would
     lie among each other, and where more than `MOST_REPEATED` of the rows give the stamp of another
@@ -113,7 +103,7 @@ def in_order(
     """
     steps = np.diff(time)
     if (steps > 0).all():
-        return InOrder(np.arange(len(time)), {})
+        return np.arange(len(time)), {}
     order = np.argsort(time, kind="stable")
     backward = int((steps < 0).sum())
     if (np.abs(np.diff(order)) > 1).sum() > MOST_APART * max(backward, 1):
@@ -130,4 +120,4 @@ def in_order(
         problem = f"field 'time' {problem}"
         raise InputError(source, problem, "give stamps fine enough to tell the samples apart")
     counts = {"rows_sorted": float(backward), "rows_repeated": float(again.sum())}
-    return InOrder(order[~again], {name: count for name, count in counts.items() if count})
+    return order[~again], {name: count for name, count in counts.items() if count}
