@@ -39,19 +39,22 @@ def test_a_walk_comes_back_with_its_waypoints(tmp_path):
     assert check.failures == () and np.isnan(check.accel_correlation_horizontal)
 
 
-def test_lines_without_a_newline_between_them_are_divided(tmp_path):
-    text = lines()
+def merged(text):
+    """Lines without a newline between them."""
     tap = next(i for i, line in enumerate(text[50:], 50) if "WAYPOINT" in line)
     for row in (tap - 1, tap - 40, 20):
         text[row : row + 2] = [text[row] + text[row + 1]]
-    (sequence,) = indoor_location.read(write(tmp_path, text))
-    check_walk(sequence)
 
 
-def test_rows_out_of_order_and_repeated_are_mended(tmp_path):
-    text = lines()
+def disordered(text):
     text[200:200] = text[200:230]
     text[400], text[403] = text[403], text[400]
+
+
+@pytest.mark.parametrize("trap", [merged, disordered])
+def test_lines_with_traps_come_back(tmp_path, trap):
+    text = lines()
+    trap(text)
     (sequence,) = indoor_location.read(write(tmp_path, text))
     check_walk(sequence)
 
