@@ -115,10 +115,8 @@ class BodyFit(NamedTuple):
     """Unit vector against gravity in the tracker's world."""
     gyro_bias: Float[np.ndarray, "3"]
     accel_bias: Float[np.ndarray, "3"]
-    knots: Float[np.ndarray, " k"]
-    """Knots of the lag on the tracker's clock, s."""
     lag: Float[np.ndarray, " k"]
-    """Time of the IMU minus time of the tracker for the same event, at the knots, s."""
+    """Time of the IMU minus time of the tracker for the same event, at even knots, s."""
     accel_delay: float
     """How much later than the gyro the accelerometer reports the same event, s."""
     gyro_residual: float
@@ -226,7 +224,6 @@ def align(
         up=up,
         gyro_bias=x[GYRO_BIAS],
         accel_bias=x[ACCEL_BIAS],
-        knots=finer,
         lag=x[LAG],
         accel_delay=float(x[DELAY]),
         gyro_residual=robust_std(fit.gyro),
