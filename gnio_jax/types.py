@@ -62,7 +62,8 @@ class Sequence(NamedTuple):
     """False where `gyro` and `accel` were interpolated across a gap; None if nothing is missing.
     The filter takes no measurement there (`filtering.gaps`)."""
     waypoints: Waypoints | None = None
-    """The reference of a recording without poses. What needs poses refuses the recording."""
+    """Where somebody was at a few moments. A recording that has nothing else is valid nowhere, and
+    what needs poses refuses it."""
     attributes: dict[str, Any] = {}
     """The origin: dataset, session, group, subject, device, placement, truth, licence, ...
     (str, float or bool)."""

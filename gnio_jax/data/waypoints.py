@@ -78,7 +78,7 @@ class Legs(NamedTuple):
 
 
 def with_poses(sequence: Sequence) -> Sequence:
-    """A sequence with waypoints as one with poses, valid on its legs.
+    """A sequence with waypoints as one with poses too, valid on its legs.
 
     Positions are in the map's frame, z is 0. Not valid are legs on which nobody walked with the
     phone ahead (`Legs.fits`), what lies before the first tap and after the last, and what was not
@@ -110,7 +110,6 @@ def with_poses(sequence: Sequence) -> Sequence:
         orientation=quaternions(about_z(np.full(len(time), legs.yaw)) * level),
         position=place,
         velocity=velocity,
-        waypoints=None,
         attributes=sequence.attributes | {"yaw_residual_degrees": legs.residual},
     ).known_where(valid)
 

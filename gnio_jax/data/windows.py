@@ -71,7 +71,7 @@ def window_source(
     """
     found: list[WindowSource] = []
     for sequence in sequences:
-        if sequence.waypoints is not None:
+        if sequence.waypoints is not None and not sequence.valid.any():
             problem = "has waypoints, no poses"
             raise InputError(sequence.name, problem, "windows need a pose at every sample")
         part = _recording_windows(sequence, config, stride, 1 if shift else stride)

@@ -19,7 +19,7 @@ from gnio_jax import geometry
 from gnio_jax.config import ThroughFilter
 from gnio_jax.filtering import FilterConfig, FilterHistory
 from gnio_jax.filtering.history import POSITION, VELOCITY
-from gnio_jax.training.segments import Path
+from gnio_jax.training.segments import Path, Segment
 from gnio_jax.types import Array
 
 HORIZON_SECONDS = (1.0, 5.0, 10.0, 30.0, 60.0)
@@ -27,6 +27,8 @@ HORIZON_SECONDS = (1.0, 5.0, 10.0, 30.0, 60.0)
 DISTANCE_FLOOR = 1.0
 """Added in squares to the distance that an error is divided by, m: standing still is no singular
 point (ours)."""
+FAR_OFF = 1.5
+"""Distance from a waypoint beyond which it counts less and less, m (ours)."""
 VELOCITY_POSITION = slice(VELOCITY.start, POSITION.stop)
 
 
@@ -45,6 +47,8 @@ class FilterLosses(NamedTuple):
     """`gaussian_nll` of the true velocity (m/s) and position (m)."""
     window: Float[Array, ""]
     """`window_error`, m²."""
+    waypoints: Float[Array, ""]
+    """`waypoint_error`."""
     nis: Float[Array, ""]
     """Mean normalised innovation squared over its degrees of freedom; no part of the total."""
     nees: Float[Array, ""]
@@ -55,15 +59,18 @@ class FilterLosses(NamedTuple):
 
 def filter_losses(
     estimate: Path,
-    truth: Path,
+    segment: Segment,
     history: FilterHistory,
     config: FilterConfig,
     weights: ThroughFilter,
 ) -> FilterLosses:
     """All losses of a segment, and their sum with the weights.
 
-    `estimate` begins with the filter's start; `history` has the whole core covariance.
+    `estimate` begins with the filter's start; `history` has the whole core covariance. Of a
+    recording with waypoints the reference is interpolated, and is nothing to learn from: the error
+    at the waypoints takes the place of all that need poses, with the weight of displacements.
     """
+    truth = segment.truth
     intervals = len(truth.position) - 1
     chex.assert_shape(history.covariance, (intervals, 15, 15))
     assert history.covariance is not None  # for type checkers
@@ -80,18 +87,20 @@ def filter_losses(
     covariance = history.covariance[:, VELOCITY_POSITION, VELOCITY_POSITION]
     state = gaussian_nll(error[1:], covariance)
     window = window_error(history.displacement, estimate, truth, config.clones_per_window)
-    total = (
+    waypoints = waypoint_error(estimate.position, segment.waypoint)
+    posed = (
         weights.displacement_weight * jnp.mean(displacement)
         + weights.yaw_weight * jnp.mean(yaw)
-        + weights.innovation_weight * innovation
         + weights.state_weight * state
         + weights.window_weight * window
     )
+    tapped = weights.displacement_weight * waypoints
+    total = weights.innovation_weight * innovation + jnp.where(segment.tapped, tapped, posed)
     of_position = history.covariance[:, POSITION, POSITION]
     squares = normalised_squares(error[1:, 3:], of_position)
     nis, healthy = jnp.nanmean(history.nis) / 3, history.healthy[-1] > 0
     return FilterLosses(
-        *(total, displacement, yaw, innovation, state, window),
+        *(total, displacement, yaw, innovation, state, window, waypoints),
         *(nis, jnp.mean(squares) / 3, healthy),
     )
 
@@ -138,6 +147,35 @@ def _squared_distance(position: Float[Array, "k 3"], count: int) -> Float[jax.Ar
     walked = jnp.cumsum(jnp.sqrt(jnp.sum(step**2, axis=1)))
     walked = jnp.concatenate([jnp.zeros_like(walked[:1]), walked])
     return (walked[count:] - walked[:-count]) ** 2 + DISTANCE_FLOOR**2
+
+
+def waypoint_error(
+    position: Float[Array, "k 3"], waypoint: Float[Array, "s 2"]
+) -> Float[jax.Array, ""]:
+    """Mean square of the distances of a path from the waypoints, over the mean square of the
+    waypoints' distances from their mean and the floor: about 1 for a path that never moves.
+
+    `position` is that at both ends of the k − 1 clone intervals, between which it is interpolated;
+    `waypoint` has a row for each sample, NaN where there is none. The path is compared after the
+    one rotation and shift of the plane that bring it nearest: how the filter's world lies on the
+    map is not known. A square d² counts as c² ln(1 + d²/c²), c = `FAR_OFF`, because somebody may
+    tap too early, too late or in the wrong place. 0 where there are fewer than two waypoints.
+    """
+    samples = len(waypoint) // (len(position) - 1)
+    share = (jnp.arange(samples) / samples)[None, :, None]
+    before, after = position[:-1, None, :2], position[1:, None, :2]
+    path = (before + share * (after - before)).reshape(-1, 2)
+    present = jnp.all(jnp.isfinite(waypoint), axis=1)
+    several = jnp.sum(present) >= 2
+    place = jnp.where(present[:, None], waypoint, 0.0)
+    weight = jnp.where(several, present, True).astype(path.dtype)
+    rotation, shift = geometry.planar_alignment(path, place, weight)
+    squared = jnp.sum((geometry.matmul(path, rotation.T) + shift[None] - place) ** 2, axis=1)
+    counted = FAR_OFF**2 * jnp.log1p(squared / FAR_OFF**2)
+    middle = jnp.average(place, axis=0, weights=weight)
+    spread = jnp.sum((place - middle[None]) ** 2, axis=1)
+    error = jnp.sum(weight * counted) / (jnp.sum(weight * (spread + DISTANCE_FLOOR**2)))
+    return jnp.where(several, error, 0.0)
 
 
 def innovation_nll(log_likelihood: Float[Array, "k"]) -> Float[jax.Array, ""]:

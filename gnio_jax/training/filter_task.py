@@ -55,7 +55,7 @@ class FilterTask(Task):
     """Training through the filter, on segments, which a `SegmentSource` holds."""
 
     unit = "segments"
-    figures = ("loss", "mse", "displacement", "yaw", "innovation", "state")
+    figures = ("loss", "mse", "displacement", "yaw", "innovation", "state", "waypoints")
     skip_above = 1000.0
     joined = staticmethod(joined)
 
@@ -147,7 +147,7 @@ class FilterTask(Task):
                     for name in Path._fields
                 )
             )
-            return filter_losses(path, segment.truth, history, ekf, self.config.through_filter)
+            return filter_losses(path, segment, history, ekf, self.config.through_filter)
 
         return over_sequences(one, shared=1)((frozen, variables["filter"]), segments, starts)
 
@@ -169,6 +169,7 @@ class FilterTask(Task):
             "val_rmse": math.sqrt(found.window),
             "val_innovation": float(found.innovation),
             "val_state": float(found.state),
+            "val_waypoint_error": math.sqrt(found.waypoints),
         }
         # Roots of the squared errors of each horizon: shares of the distance, rad per metre.
         for name in ("displacement", "yaw"):

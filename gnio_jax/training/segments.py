@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from gnio_jax import geometry
 from gnio_jax.errors import InputError
@@ -34,6 +34,10 @@ class SegmentSource(NamedTuple):
     """Reference, m/s."""
     position: Float[Array, "t 3"]
     """Reference, m."""
+    waypoint: Float[Array, "t 2"]
+    """Horizontal position of the waypoint at the nearest sample, m; NaN at all others."""
+    tapped: Bool[Array, "t"]
+    """Whether the recording has waypoints: its reference is then interpolated between them."""
     earliest: Int[Array, "p"]
     """First row at which each segment of an epoch may begin …"""
     latest: Int[Array, "p"]
@@ -60,6 +64,10 @@ class Segment(NamedTuple):
     """m/s², raw."""
     truth: Path
     """The reference."""
+    waypoint: Float[Array, "s 2"]
+    """As in `SegmentSource`."""
+    tapped: Bool[Array, ""]
+    """Likewise."""
 
 
 Start = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
@@ -112,12 +120,19 @@ def _source_of(sequence: Sequence, samples: int) -> SegmentSource:
         latest.append(shares[1:] - 1)
     orientation = np.where(known[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
     nothing = [np.zeros(0, np.int64)]
+    waypoint = np.full((len(known), 2), np.nan)
+    if sequence.waypoints is not None:
+        step = sequence.time[1] - sequence.time[0]
+        rows = np.rint((sequence.waypoints.time - sequence.time[0]) / step).astype(int)
+        waypoint[np.clip(rows, 0, len(known) - 1)] = sequence.waypoints.position
     return SegmentSource(
         gyro=sequence.gyro,
         accel=sequence.accel,
         rotation=matrix_from_quaternion(orientation),
         velocity=sequence.velocity,
         position=sequence.position,
+        waypoint=waypoint,
+        tapped=np.full(len(known), sequence.waypoints is not None),
         earliest=np.concatenate(earliest or nothing).astype(np.int32),
         latest=np.concatenate(latest or nothing).astype(np.int32),
     )
@@ -142,12 +157,12 @@ def cut_segment(
         rows = jax.lax.dynamic_slice_in_dim(signal, start, samples + 1)
         return rows[::stride]
 
-    gyro, accel = (
+    gyro, accel, waypoint = (
         jax.lax.dynamic_slice_in_dim(signal, start, samples)
-        for signal in (source.gyro, source.accel)
+        for signal in (source.gyro, source.accel, source.waypoint)
     )
     truth = (at_clones(signal) for signal in (source.rotation, source.velocity, source.position))
-    return Segment(gyro, accel, Path(*truth))
+    return Segment(gyro, accel, Path(*truth), waypoint, source.tapped[start])
 
 
 def turned_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
@@ -156,7 +171,7 @@ def turned_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
     turn = geometry.exp(jnp.stack([jnp.zeros_like(angle), jnp.zeros_like(angle), angle]))
     rotation, velocity, position = segment.truth
     truth = Path(jnp.einsum("ij,kjl->kil", turn, rotation), velocity @ turn.T, position @ turn.T)
-    return segment._replace(truth=truth)
+    return segment._replace(truth=truth, waypoint=segment.waypoint @ turn[:2, :2].T)
 
 
 def draw_start(key: PRNGKeyArray, truth: Path, std: InitialStd, spread: float) -> Start:
