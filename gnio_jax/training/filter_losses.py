@@ -159,23 +159,22 @@ def waypoint_error(
     `waypoint` has a row for each sample, NaN where there is none. The path is compared after the
     one rotation and shift of the plane that bring it nearest: how the filter's world lies on the
     map is not known. A square d² counts as c² ln(1 + d²/c²), c = `FAR_OFF`, because somebody may
-    tap too early, too late or in the wrong place. 0 where there are fewer than two waypoints.
+    tap too early, too late or in the wrong place. 0 where there are fewer than two.
     """
     samples = len(waypoint) // (len(position) - 1)
     share = (jnp.arange(samples) / samples)[None, :, None]
     before, after = position[:-1, None, :2], position[1:, None, :2]
     path = (before + share * (after - before)).reshape(-1, 2)
     present = jnp.all(jnp.isfinite(waypoint), axis=1)
-    several = jnp.sum(present) >= 2
     place = jnp.where(present[:, None], waypoint, 0.0)
-    weight = jnp.where(several, present, True).astype(path.dtype)
+    weight = jnp.where(present.any(), present, True).astype(path.dtype)
     rotation, shift = geometry.planar_alignment(path, place, weight)
     squared = jnp.sum((geometry.matmul(path, rotation.T) + shift[None] - place) ** 2, axis=1)
     counted = FAR_OFF**2 * jnp.log1p(squared / FAR_OFF**2)
     middle = jnp.average(place, axis=0, weights=weight)
     spread = jnp.sum((place - middle[None]) ** 2, axis=1)
     error = jnp.sum(weight * counted) / (jnp.sum(weight * (spread + DISTANCE_FLOOR**2)))
-    return jnp.where(several, error, 0.0)
+    return jnp.where(present.any(), error, 0.0)
 
 
 def innovation_nll(log_likelihood: Float[Array, "k"]) -> Float[jax.Array, ""]:
