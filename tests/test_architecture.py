@@ -32,6 +32,7 @@ LIBRARIES = {
     "bokeh": {"evaluation.page"},
     "flax": {"models", "training", "evaluation", "interop"},
     "jax2onnx": {"apps.onnx.conversion"},
+    "loky": {"data.loading"},
     "mcap": {"apps.importing.ros", "apps.export"},
     "matplotlib": {"data", "evaluation.plots", "tables.plots"},
     "onnx": ONNX,

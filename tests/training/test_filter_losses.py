@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from gnio_jax.config import ThroughFilter
 from gnio_jax.filtering import FilterConfig, FilterHistory
 from gnio_jax.training import filter_losses
-from gnio_jax.training.segments import Path
+from gnio_jax.training.segments import Path, Segment
 from tests.support.compiling import quick
 
 K, W = 40, 5
@@ -136,7 +136,9 @@ def test_the_sum_has_the_weights_and_the_horizons_that_fit():
         window_weight=11.0,
     )
     losses = quick(filter_losses.filter_losses, static_argnums=(3, 4))
-    found = losses(estimate, truth, history, CONFIG, weights)
+    signal, nowhere = np.zeros((4 * K, 3)), np.full((4 * K, 2), np.nan)
+    segment = Segment(signal, signal, truth, nowhere, jnp.bool_(False))
+    found = losses(estimate, segment, history, CONFIG, weights)
     np.testing.assert_allclose(found.displacement, [relative(5)[0], relative(25)[0]], rtol=1e-12)
     np.testing.assert_allclose(found.yaw, [relative(5)[1], relative(25)[1]], rtol=1e-12)
     error = np.concatenate(
