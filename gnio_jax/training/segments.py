@@ -162,7 +162,7 @@ def cut_segment(
         for signal in (source.gyro, source.accel, source.waypoint)
     )
     truth = (at_clones(signal) for signal in (source.rotation, source.velocity, source.position))
-    return Segment(gyro, accel, Path(*truth), waypoint, source.tapped[start])
+    return Segment(gyro, accel, Path(*truth), waypoint, jnp.asarray(source.tapped)[start])
 
 
 def turned_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
