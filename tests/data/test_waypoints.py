@@ -42,7 +42,7 @@ def test_taps_give_the_attitude_and_the_path(seed):
     assert np.sqrt((place**2).mean()) < 0.9 and np.sqrt((speed**2).mean()) < 0.5
     inside = (found.time >= walk.ends[0]) & (found.time <= walk.ends[-1])
     assert (found.valid != inside).mean() < 0.01
-    assert np.isnan(found.position[~found.valid]).all() and found.waypoints is None
+    assert np.isnan(found.position[~found.valid]).all() and found.waypoints is not None
     assert found.attributes["yaw_residual_degrees"] < 6.0
     # A walker comes 1.1 m in a second that a tap is early or late, and 0.64 m (rms) in one that is
     # drawn uniformly.

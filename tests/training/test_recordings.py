@@ -77,6 +77,7 @@ def smoothed(earlier, monkeypatch):
             orientation=np.tile([1.0, 0.0, 0.0, 0.0], (len(walk.time), 1)),
             velocity=np.zeros((len(walk.time), 3)),
             valid=walk.time < walk.time[-1] - 3.0,
+            waypoints=None,
         )
         return filtering.WaypointPoses(poses, None, None)
 
