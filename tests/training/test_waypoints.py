@@ -101,6 +101,8 @@ def test_few_waypoints_and_those_in_a_line_or_in_one_place_have_a_gradient(rows)
         value, slope = error_and_slope(position, waypoint)
         assert np.isfinite(slope).all()
         if len(rows) < 2:
+            # The compiler turns 0 · NaN into 0; operation by operation nothing hides it.
+            slope = jax.grad(filter_losses.waypoint_error)(position, waypoint)
             assert value == 0 and not slope.any()
         elif step:
             assert value > 0 and slope[:, :2].any()
