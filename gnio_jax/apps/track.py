@@ -1,6 +1,6 @@
 """The trajectory of one's own recording, and how far to trust it: what `gnio track` does.
 
-recording + weights → prepare → estimate → summarise → folder
+recording + weights → check → prepare → estimate → score → summarise → write
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from gnio_jax import config as configuration
 from gnio_jax.apps import export, rerun
@@ -133,26 +134,27 @@ def track(
     for the page, `rerun_file` a file to write for the viewer Rerun. The folder is written whole or
     not at all and takes the place of an earlier track. Raises `InputError`.
     """
-    sequence = recording.sequence
+    sequence, config = recording.sequence, weights.run.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
-    track = all((out / name).is_file() for name in NAMES)
-    if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
-        raise InputError(out, "exists and is not an earlier track", "name another --out")
-    check_writable_folder(out.parent)
-    for kind in formats:
-        export.check("--format", kind, sequence.time + start_time)
-    if rerun_file is not None:
-        rerun.check(rerun_file)
+    _check_results(out, formats, rerun_file, sequence.time + start_time)
     _check_bridged(sequence)
-    config, ekf = weights.run.config, tracking_filter(weights.run)
-    how = {"init": "static", "gyro_bias": "rest", "from_first": True}
-    raw = ekf.raw_gyro_bias
-    ready, left_out = prepare([sequence], config.data, ekf.initial_std, raw_gyro_bias=raw, **how)
+    ekf = tracking_filter(weights.run)
+    ready, left_out = prepare(
+        [sequence],
+        config.data,
+        ekf.initial_std,
+        init="static",
+        gyro_bias="rest",
+        from_first=True,
+        raw_gyro_bias=ekf.raw_gyro_bias,
+    )
     if not ready:
         raise InputError(sequence.name, left_out[sequence.name], "record for longer")
     network = Network.of(weights.run.model, weights.run.variables)
     (found,) = estimate(ready, network, config.data, ekf, 1, progress)
-    summary = summarise(found, ready[0], recording, weights, ekf)
+    compared = np.isfinite(found.reference.position).any() or found.waypoints is not None
+    errors = metrics.score([found])[found.name].values if compared else {}
+    summary = summarise(found, errors, ready[0], recording, weights, ekf)
     with replacing_folder(out) as folder:
         _write_figures(folder, found, summary, formats)
         _draw(folder, found, summary, config, command)
@@ -161,29 +163,47 @@ def track(
     return Tracked(found, summary, out)
 
 
+def _check_results(
+    out: Path, formats: tuple[str, ...], rerun_file: Path | None, stamps: Float[np.ndarray, "n"]
+) -> None:
+    """Raise `InputError`, before the work, for what could not be written after it."""
+    track = all((out / name).is_file() for name in NAMES)
+    if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
+        raise InputError(out, "exists and is not an earlier track", "name another --out")
+    check_writable_folder(out.parent)
+    for kind in formats:
+        export.check("--format", kind, stamps)
+    if rerun_file is not None:
+        rerun.check(rerun_file)
+
+
 def _check_bridged(sequence: Sequence) -> None:
     """Raise `InputError` for a hole that nothing bridges: what was walked in it is in no sample."""
-    check_gaps(sequence.time, sequence.name)
     # Lines of an earlier resampling; each clock has widened a hole by up to a sample at each end.
     there = np.union1d(sequence.time[measured_rows(sequence)], sequence.time[[0, -1]])
     bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
+    check_gaps(sequence.time, sequence.name)
     check_gaps(there, sequence.name, WINDOW_SECONDS + bridged)
 
 
 def summarise(
-    found: Estimate, ready: Recording, recording: Imported, weights: Weights, ekf: FilterSetup
+    found: Estimate,
+    errors: dict[str, float | None],
+    ready: Recording,
+    recording: Imported,
+    weights: Weights,
+    ekf: FilterSetup,
 ) -> Summary:
     """The figures of a finished track, up to where it diverged if it did."""
     filtered, sequence = found.filtered, recording.sequence
     assert filtered is not None
-    last = int(np.flatnonzero(found.trajectory.known)[-1])
-    position, time = found.trajectory.position[: last + 1, :2], found.trajectory.time
-    seconds, length = float(time[last] - time[0]), 0.0
-    if last:
-        length = metrics.path_length(position, float(time[1] - time[0]))
-    used = filtered.accepted[: last + 1]
+    rows = int(np.flatnonzero(found.trajectory.known)[-1]) + 1
+    time, position = found.trajectory.time[:rows], found.trajectory.position[:rows]
+    seconds = float(time[-1] - time[0])
+    length = 0.0 if rows < 2 else metrics.path_length(position[:, :2], float(time[1] - time[0]))
+    used = filtered.accepted[:rows]
     used = used[np.isfinite(used)]
-    error = float(np.sqrt(np.trace(filtered.covariance[last, :2, :2])))
+    error = float(np.sqrt(np.trace(filtered.covariance[rows - 1, :2, :2])))
     share = f" ({error / length:.1%} of the path)" if length >= 1.0 else ""
     counted = "with consider covariance"
     if ekf.considered is None:
@@ -196,21 +216,19 @@ def summarise(
         start_time=float(sequence.attributes.get("start_time", 0.0)),
         seconds=seconds,
         path_length=length,
-        from_start=float(np.linalg.norm(position[-1] - position[0])),
+        from_start=float(np.linalg.norm((position[-1] - position[0])[:2])),
         expected_error=error,
         rest=_share_at_rest(ready, ekf),
         running=_share_running(ready, ekf),
-        climb=float(np.ptp(found.trajectory.position[: last + 1, 2])),
+        climb=float(np.ptp(position[:, 2])),
         accepted=float(used.mean()) if len(used) else None,
-        errors={},
+        errors=errors,
         warnings=(),
         notes=(*recording.notes, *ready.notes),
         limits=f"limits: {length:.1f} m in {seconds:.0f} s; expected error at the end "
         f"{error:.1f} m{share} by the filter, {counted}; weights {weights.name}; place and heading "
         "are relative to the start",
     )
-    if np.isfinite(found.reference.position).any() or found.waypoints is not None:
-        summary = summary._replace(errors=metrics.score([found])[found.name].values)
     own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
     own_rate = min(own_rate, float(sequence.attributes.get(RECORDED_RATE, own_rate)))
     warnings = [*recording.warnings, *_warnings(summary, own_rate, 1.0 / ekf.config.dt)]
