@@ -22,7 +22,7 @@ from gnio_jax.config import DataConfig
 from gnio_jax.evaluation.infer import Displacements, keep
 from gnio_jax.evaluation.metrics import Filtered
 from gnio_jax.evaluation.prepare import Recording, Start
-from gnio_jax.evaluation.trajectory import Alignment, Trajectory, in_frame_of, turned_covariance
+from gnio_jax.evaluation.trajectory import Alignment, Trajectory, in_frame_of, relative_yaw
 from gnio_jax.filtering import (
     ConsideredStd,
     FilterConfig,
@@ -40,7 +40,14 @@ from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signal
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION
 from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.models import Network
-from gnio_jax.numerics import filled_up, finite_rows, quaternion_from_matrix, yaw_rotation
+from gnio_jax.numerics import (
+    filled_up,
+    finite_rows,
+    last_true,
+    quaternion_from_matrix,
+    rotation_z,
+    yaw_rotation,
+)
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.types import Array, Prediction, Waypoints
 
@@ -135,15 +142,17 @@ def perfect(ekf: FilterSetup) -> FilterSetup:
 def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> Estimate:
     """Estimate and reference in one frame, to be looked at together: the estimate with its
     covariance aligned, or without an `alignment` the reference moved so that both start alike. To
-    waypoints it is aligned in their own way. Unchanged where that is impossible."""
+    waypoints it is aligned in their own way. Unchanged where that is impossible. Covariances are
+    turned about the vertical alone, which is what an alignment turns of a level world."""
     if alignment is None and estimate.waypoints is None:
         return estimate._replace(reference=in_frame_of(estimate.reference, estimate.trajectory))
     reference = estimate.waypoints or estimate.reference
-    aligned = in_frame_of(estimate.trajectory, reference, alignment or "origin")
-    filtered = None
-    if estimate.filtered is not None:
-        covariance = turned_covariance(estimate.filtered.covariance, estimate.trajectory, aligned)
-        filtered = estimate.filtered._replace(covariance=covariance)
+    path, filtered = estimate.trajectory, estimate.filtered
+    aligned = in_frame_of(path, reference, alignment or "origin")
+    if filtered is not None and aligned is not path:
+        turn = rotation_z(relative_yaw(aligned.orientation, path.orientation))
+        covariance = turn @ filtered.covariance @ np.swapaxes(turn, 1, 2)
+        filtered = filtered._replace(covariance=covariance)
     return estimate._replace(trajectory=aligned, filtered=filtered)
 
 
@@ -305,7 +314,7 @@ def integrate(recording: Recording, found: Displacements, windows: DataConfig) -
     ends = n * np.arange(clones, recording.strides + 1)  # of the windows, in samples
     to_world = yaw_rotation(recording.attitude[ends - windows.window])
     steps = np.einsum("mij,mj->mi", to_world, found.value[clones - 1 :]) / clones
-    moved = np.cumsum(mean_over_windows(steps, recording.strides, clones), 0)
+    moved = np.cumsum(mean_over_windows(steps, clones), 0)
     position = recording.start.position + np.concatenate([np.zeros((1, 3)), moved])
     orientation = quaternion_from_matrix(recording.attitude[::n])
     return Estimate(
@@ -318,9 +327,7 @@ def integrate(recording: Recording, found: Displacements, windows: DataConfig) -
     )
 
 
-def mean_over_windows(
-    steps: Float[np.ndarray, "m 3"], strides: int, window: int
-) -> Float[np.ndarray, "k 3"]:
+def mean_over_windows(steps: Float[np.ndarray, "m 3"], window: int) -> Float[np.ndarray, "k 3"]:
     """Movement in each stride: the mean of displacement × stride/window (`steps`) over the windows
     that cover it. Window i covers strides i … i + `window` − 1.
 
@@ -329,14 +336,9 @@ def mean_over_windows(
     keeps the movement of the one before; those before all windows (the context of the first) take
     that of the first that has one.
     """
-    good = finite_rows(steps)
-    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(good[:, None], steps, 0.0), 0)])
-    counts = np.concatenate([[0], np.cumsum(good)])
-    stride = np.arange(strides)
-    first = np.clip(stride - window + 1, 0, len(steps))
-    last = np.minimum(stride + 1, len(steps))
-    covering = (counts[last] - counts[first])[:, None]
-    moved = np.zeros((strides, 3))
-    np.divide(sums[last] - sums[first], covering, out=moved, where=covering > 0)
-    covered = covering[:, 0] > 0
-    return moved[np.maximum.accumulate(np.where(covered, stride, int(np.argmax(covered))))]
+    good, over = finite_rows(steps), np.ones(window)
+    counts = np.convolve(good, over)
+    axes = np.where(good[:, None], steps, 0.0).T
+    sums = np.stack([np.convolve(axis, over) for axis in axes], 1)
+    moved = sums / np.maximum(counts, 1.0)[:, None]
+    return moved[last_true(counts > 0.5)]

@@ -101,38 +101,25 @@ def rte_distance(estimate: Positions, reference: Positions, metres: float) -> fl
 
 
 def rpe(
-    estimate: Trajectory, reference: Trajectory, step: float, seconds: float, dims: int = 3
+    estimate: Trajectory,
+    reference: Trajectory,
+    step: float,
+    seconds: float,
+    dims: int = 3,
+    full: bool = False,
 ) -> float:
     """Relative pose error: RMS of R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i) over pairs `seconds` apart,
     from every row, m (TLIO).
 
     ψ is the yaw error at the start (`relative_yaw`), so a wrong heading of the whole trajectory
-    costs nothing. With `dims` 2 it is of the horizontal part.
+    costs nothing. With `full` the whole attitude at the start is aligned, R_i R̂_iᵀ in the place of
+    R_z (the translation part of TUM and evo). With `dims` 2 it is of the horizontal part.
     """
-    turn = rotation_z(-relative_yaw(estimate.orientation, reference.orientation))
-    return _rms_of_moves(turn, estimate, reference, step, seconds, dims)
-
-
-def rpe_se3(
-    estimate: Trajectory, reference: Trajectory, step: float, seconds: float = 1.0, dims: int = 3
-) -> float:
-    """The translation part of the relative pose error with the full attitude at the start aligned,
-    over all pairs, m (TUM, evo): RMS of R_i R̂_iᵀ (p̂_j − p̂_i) − (p_j − p_i)."""
-    ours, true = (matrix_from_quaternion(each.orientation) for each in (estimate, reference))
-    turn = true @ np.swapaxes(ours, 1, 2)
-    return _rms_of_moves(turn, estimate, reference, step, seconds, dims)
-
-
-def _rms_of_moves(
-    turn: Float[np.ndarray, "n 3 3"],
-    estimate: Trajectory,
-    reference: Trajectory,
-    step: float,
-    seconds: float,
-    dims: int,
-) -> float:
-    """RMS of the estimated displacements, turned by the `turn` at their starts, minus the true
-    ones; over the pairs whose start has a trusted orientation too."""
+    if full:
+        ours, true = (matrix_from_quaternion(each.orientation) for each in (estimate, reference))
+        turn = true @ np.swapaxes(ours, 1, 2)
+    else:
+        turn = rotation_z(-relative_yaw(estimate.orientation, reference.orientation))
     apart = round(seconds / step)
     if apart >= len(estimate.time):
         raise Undefined(f"no two trusted rows {seconds:g} s apart")
@@ -179,17 +166,9 @@ def path_length(position: Positions, step: float, seconds: float = 1.0) -> float
     """
     if len(position) < 2:
         raise Undefined("a single row")
-    return float(np.nansum(path_sides(position, step, seconds)[1]))
-
-
-def path_sides(
-    position: Positions, step: float, seconds: float = 1.0
-) -> tuple[Int[np.ndarray, "c"], Float[np.ndarray, "c1"]]:
-    """Corners of the polygon of `path_length`, as rows, and the lengths of its c − 1 sides, m; NaN
-    where a side touches an untrusted row."""
     apart = max(1, round(seconds / step))
     corners = np.unique(np.append(np.arange(0, len(position), apart), len(position) - 1))
-    return corners, np.linalg.norm(np.diff(position[corners], axis=0), axis=1)
+    return float(np.nansum(np.linalg.norm(np.diff(position[corners], axis=0), axis=1)))
 
 
 def path_length_ratio(estimate: Positions, reference: Positions, step: float) -> float:
@@ -327,11 +306,6 @@ def coverage(squared: Float[np.ndarray, "n"], dims: int, level: float = 0.95) ->
     return float(100 * np.mean(_present(squared) <= quantile))
 
 
-def accepted_share(accepted: Float[np.ndarray, "n"]) -> float:
-    """Share of the measurements that the filter used, %."""
-    return float(100 * np.mean(_present(accepted)))
-
-
 def _present(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
     present = values[~np.isnan(values)]
     if not len(present):
@@ -371,13 +345,9 @@ class Compared(NamedTuple):
 
     @property
     def paths(self) -> tuple[Positions, Positions]:
-        """Of the aligned estimate and of the reference."""
+        """Of the aligned estimate and of the reference. Lengths are of the estimate as it is given:
+        an alignment of all axes would turn some of the height into the plane."""
         return self.aligned.position[:, : self.dims], self.reference.position[:, : self.dims]
-
-    @property
-    def raw_paths(self) -> tuple[Positions, Positions]:
-        """The same, of the estimate as the estimator gives it."""
-        return self.raw.position[:, : self.dims], self.reference.position[:, : self.dims]
 
     def at_waypoints(self) -> tuple[Positions, Positions]:
         """The aligned estimate's positions, and the waypoints that are within it."""
@@ -416,10 +386,10 @@ SPATIAL: dict[str, Metric] = {
     "rte_10m": lambda c: rte_distance(*c.paths, 10.0),
     "rpe_1s": lambda c: rpe(c.raw, c.reference, c.step, 1.0, c.dims),
     "rpe_10s": lambda c: rpe(c.raw, c.reference, c.step, 10.0, c.dims),
-    "rpe_se3": lambda c: rpe_se3(c.raw, c.reference, c.step, 1.0, c.dims),
+    "rpe_se3": lambda c: rpe(c.raw, c.reference, c.step, 1.0, c.dims, full=True),
     "drift": lambda c: drift(*c.paths, c.step),
-    "path_length_ratio": lambda c: path_length_ratio(*c.raw_paths, c.step),
-    "stationary_drift": lambda c: stationary_drift(*c.raw_paths, c.step),
+    "path_length_ratio": lambda c: path_length_ratio(*c._replace(aligned=c.raw).paths, c.step),
+    "stationary_drift": lambda c: stationary_drift(*c._replace(aligned=c.raw).paths, c.step),
 }
 """In 3-D, and in 2-D as `<name>_2d`. Those of `_ronin` average over components too: they are the
 others over √d (RoNIN, DeepILS)."""
@@ -435,7 +405,7 @@ OTHERS: dict[str, Metric] = {
 OF_FILTER: dict[str, Metric] = {
     "nis": lambda c: mean_normalised(c.of_filter().nis, 3),
     "nis_coverage": lambda c: coverage(c.of_filter().nis, 3),
-    "accepted": lambda c: accepted_share(c.of_filter().accepted),
+    "accepted": lambda c: 100.0 * mean_normalised(c.of_filter().accepted, 1),
 }
 """They need no reference."""
 LEGS: dict[str, Metric] = {

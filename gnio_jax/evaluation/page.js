@@ -1,5 +1,5 @@
 // Runs when the figures are drawn. `columns[run][sequence]` holds the data of the page; `paths`,
-// `marks`, `starts` and `corners` are what the figures draw, `along` the strip over distance.
+// `marks`, `starts` and `corners` are what the figures draw.
 const sequence = document.getElementById("sequence");
 const slider = document.getElementById("time");
 const readout = document.getElementById("readout");
@@ -20,7 +20,7 @@ function move() {
   const values = (name) => at.map((row, run) => shown(run)[name][row]);
   const data = {colour: marks.data.colour, width: values("major").map((m) => 2 * m)};
   data.height = values("minor").map((m) => 2 * m);
-  for (const name of ["time", "distance", "x", "y", "reference_x", "reference_y", "angle"]) {
+  for (const name of ["time", "x", "y", "reference_x", "reference_y", "angle"]) {
     data[name] = values(name);
   }
   marks.data = data;
@@ -42,7 +42,6 @@ function explain() {
   for (const legend of legends) {
     for (const item of legend.items) item.visible = item.renderers.some(drawn);
   }
-  if (along) along.visible = shown(0).error.some(Number.isFinite);
 }
 
 // A legend stands in one line where that is wide enough.
@@ -70,7 +69,6 @@ function choose() {
   slider.step = end / Math.max(last, 1);
   slider.value = end;
   times.setv({start: 0, end: end});
-  distances.setv({start: 0, end: Math.max(first.distance[last], 1e-3)});
   rows.forEach((row) => row.classList.toggle("chosen", row.dataset.sequence === sequence.value));
   move();
   explain();

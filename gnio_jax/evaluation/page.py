@@ -25,7 +25,7 @@ from jaxtyping import Float
 from jinja2 import Environment
 
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import colours, metrics, plots, tabulate
+from gnio_jax.evaluation import colours, plots, tabulate
 from gnio_jax.evaluation.plots import View
 from gnio_jax.evaluation.report import Report, read, read_estimates
 from gnio_jax.evaluation.tabulate import COLUMNS
@@ -194,7 +194,6 @@ def columns(seen: View, rows: int) -> Columns:
         "reference_x": reference[:, 0],
         "reference_y": reference[:, 1],
         "error": np.linalg.norm((path - reference)[:, :2], axis=1),
-        "distance": walked(reference if seen.known else path, seen.time, seen.step),
         **plots.ellipses(seen.filtered.covariance)._asdict(),
     }
     curves = {**seen.network.diagnostics, "std": seen.network.std}
@@ -202,11 +201,12 @@ def columns(seen: View, rows: int) -> Columns:
         if name in curves and np.isfinite(values := curves[name]).any():
             found |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(colours.AXES)}
     found = {name: values[::step] for name, values in found.items()}
-    if len(seen.taps.time):
+    if len(seen.passed):
         # In the row that is nearest in time: a row without a waypoint is NaN.
-        rows = np.abs(found["time"][:, None] - seen.taps.time).argmin(0)
-        passed = {"waypoint_x": seen.taps.position[:, 0], "waypoint_y": seen.taps.position[:, 1]}
-        for name, values in (passed | {"waypoint_error": seen.taps.error}).items():
+        rows = np.abs(found["time"][:, None] - seen.waypoints.time).argmin(0)
+        x, y = seen.waypoints.position.T
+        tapped = {"waypoint_x": x, "waypoint_y": y, "waypoint_error": seen.errors}
+        for name, values in tapped.items():
             found[name] = np.full(len(found["time"]), np.nan)
             found[name][rows] = values
     if np.isfinite(nis := seen.filtered.nis).any():
@@ -216,16 +216,6 @@ def columns(seen: View, rows: int) -> Columns:
         largest = peaks.reshape(-1, step).max(axis=1)
         found["nis"] = np.where(np.isneginf(largest), np.nan, largest)
     return {name: values.astype(np.float32) for name, values in found.items()}
-
-
-def walked(
-    position: Float[np.ndarray, "n 3"], time: Float[np.ndarray, "n"], step: float
-) -> Float[np.ndarray, "n"]:
-    """Horizontal distance along a path, m, that of `metrics.path_length`. A stretch that is not
-    known adds none."""
-    corners, sides = metrics.path_sides(position[:, :2], step)
-    total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(sides))])
-    return np.interp(time, time[corners], total)
 
 
 def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
@@ -238,7 +228,7 @@ def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
     parts = [
         part[:, :2]
         for seen in views
-        for part in (seen.position, seen.reference, seen.taps.position)
+        for part in (seen.position, seen.reference, seen.waypoints.position)
     ]
     points = np.concatenate([own - reach, own + reach, *parts])
     points = points[np.isfinite(points).all(1)] if np.isfinite(points).any() else np.zeros((1, 2))
@@ -266,7 +256,7 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     """Bokeh's document, with the script that fills its figures when they are drawn, and the names
     of its figures."""
     palette, one = list(colours.COLOURS[: len(runs)]), [1.0] * len(runs)
-    marks = ("time", "distance", "x", "y", "reference_x", "reference_y", "width", "height", "angle")
+    marks = ("time", "x", "y", "reference_x", "reference_y", "width", "height", "angle")
     sources = Sources(
         [ColumnDataSource({name: [1.0, 2.0] for name in of_run[0]}) for of_run in held],
         ColumnDataSource(dict.fromkeys(marks, one) | {"colour": palette}),
@@ -276,7 +266,7 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     first, there = sources.paths[0], held[0][0].keys()
     known = any(seen.known for seen in runs[0].views)
     tapped = "waypoint_x" in there
-    times, distances = Range1d(0.0, 1.0), Range1d(0.0, 1.0)
+    times = Range1d(0.0, 1.0)
     drawn = [
         (path, run.name, own) for path, run, own in zip(sources.paths, runs, palette, strict=True)
     ]
@@ -284,8 +274,6 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     label_of_error = "error" if len(runs) == 1 else ""  # of several the map names the colours
     errors = [(path, "error", label_of_error, colour) for path, _, colour in drawn if known]
     label = "error (m)" if known or tapped else "3σ (m)"
-    if known:
-        figures["distance"] = _draw_strip(sources, distances, label, errors, "distance", band=True)
     strips = [_draw_strip(sources, times, label, errors, band=True, tapped=tapped)]
     for name, label in STRIPS.items():
         if f"{name}_x" in there:
@@ -306,7 +294,7 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     document = Document()
     for root in figures.values():
         document.add_root(root)
-    drawings = [figures["map"], *([figures["distance"]] if known else []), *strips]
+    drawings = [figures["map"], *strips]
     for place, line in enumerate(figures["map"].select(name="x")):
         # What the legend of the map hides is hidden everywhere.
         for drawing in drawings[1:]:
@@ -319,9 +307,7 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
         "frames": [frame(runs, seen.name) for seen in runs[0].views],
         "plan": figures["map"],
         "legends": [drawing.legend[0] for drawing in drawings if drawing.legend],
-        "along": figures.get("distance"),
         "times": times,
-        "distances": distances,
     }
     document.js_on_event("document_ready", CustomJS(args=arguments, code=_file("page.js")))
     return document, list(figures)
@@ -374,14 +360,13 @@ def _draw_strip(
     x_range: Range1d,
     label: str,
     curves: list[tuple[ColumnDataSource, str, str, str]],
-    along: str = "time",
     band: bool = False,
     tapped: bool = False,
     levels: tuple[tuple[str, float, str], ...] = (),
 ) -> new_figure:
-    """Curves over time or distance: of each its source, column, label and colour. A `band` is the
-    filter's 3σ behind errors, to which those at waypoints (`tapped`) belong; `levels` are marked on
-    an axis of powers."""
+    """Curves over time: of each its source, column, label and colour. A `band` is the filter's 3σ
+    behind errors, to which those at waypoints (`tapped`) belong; `levels` are marked on an axis of
+    powers."""
     strip = new_figure(
         height=STRIP_HEIGHT,
         sizing_mode="stretch_width",
@@ -392,25 +377,20 @@ def _draw_strip(
     )
     if band:
         grey = {"color": "#BBBBBB", "alpha": 0.35, "legend_label": "3σ", "name": "major"}
-        strip.varea(along, 0.0, "major", source=sources.paths[0], **grey)
+        strip.varea("time", 0.0, "major", source=sources.paths[0], **grey)
     for source, name, text, colour in curves:
         style: dict[str, Any] = {"color": colour, "line_width": 1.3, "name": name}
         style |= {"legend_label": text} if text else {}
-        strip.line(along, name, source=source, **style)
+        strip.line("time", name, source=source, **style)
     if tapped:
-        marks = {"source": sources.paths[0], "name": "waypoint_error"}
-        strip.scatter(
-            along, "waypoint_error", size=8, legend_label="at waypoints", **WAYPOINT, **marks
-        )
+        marks = {"source": sources.paths[0], "name": "waypoint_error", **WAYPOINT}
+        strip.scatter("time", "waypoint_error", size=8, legend_label="at waypoints", **marks)
     for text, level, colour in levels:
         style = {"color": colour, "legend_label": f"{text} {level:.3g}"}
         strip.line([0.0, LONG], [level, level], **style)
     strip.y_range = DataRange1d(renderers=list(strip.renderers))
-    strip.vspan(along, source=sources.marks, line_color="#444444", line_width=1.2)
-    if along == "time":
-        strip.js_on_event("tap", CustomJS(code=GO_THERE))
-    else:
-        strip.xaxis.axis_label, strip.height = "distance walked (m)", STRIP_HEIGHT + LABEL_HEIGHT
+    strip.vspan("time", source=sources.marks, line_color="#444444", line_width=1.2)
+    strip.js_on_event("tap", CustomJS(code=GO_THERE))
     return _finish(strip)
 
 

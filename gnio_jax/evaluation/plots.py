@@ -42,26 +42,9 @@ ELLIPSES = 4
 """Outlines on a map, at even times, the last at the end."""
 TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
 """Errors in the title of a sequence."""
-NO_WAYPOINTS = Waypoints(np.zeros(0), np.zeros((0, 2)))
 
 
 # --- what is drawn of an estimate
-
-
-class Taps(NamedTuple):
-    """The waypoints of a sequence, k of them; none where it has poses."""
-
-    time: Float[np.ndarray, "k"]
-    """From the start, s."""
-    position: Float[np.ndarray, "k 2"]
-    """m."""
-    passed: Float[np.ndarray, "k 2"]
-    """Where the estimate is at these times, m."""
-
-    @property
-    def error(self) -> Float[np.ndarray, "k"]:
-        """Distance of the two, m."""
-        return np.linalg.norm(self.passed - self.position, axis=1)
 
 
 class View(NamedTuple):
@@ -79,7 +62,10 @@ class View(NamedTuple):
     """Position, m."""
     network: Displacements
     filtered: Filtered
-    taps: Taps
+    waypoints: Waypoints
+    """At times from the start; none where the sequence has poses."""
+    passed: Float[np.ndarray, "k 2"]
+    """Where the estimate is at the times of the waypoints, m."""
 
     @property
     def step(self) -> float:
@@ -93,9 +79,9 @@ class View(NamedTuple):
 
     @property
     def errors(self) -> Float[np.ndarray, "_"]:
-        """Horizontal, where there is a reference, m."""
+        """Horizontal, where there is a reference or at the waypoints, m."""
         if not self.known:
-            return self.taps.error
+            return np.linalg.norm(self.passed - self.waypoints.position, axis=1)
         error = (self.position - self.reference)[finite_rows(self.reference), :2]
         return np.linalg.norm(error, axis=1)
 
@@ -106,7 +92,8 @@ def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
     seen = in_one_frame(estimate, alignment)
     rows = len(seen.trajectory.time)
     none, blank = np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan)
-    begin, (stamps, waypoints) = seen.trajectory.time[0], seen.waypoints or NO_WAYPOINTS
+    begin = seen.trajectory.time[0]
+    stamps, places = seen.waypoints or Waypoints(np.zeros(0), np.zeros((0, 2)))
     return View(
         seen.name,
         seen.trajectory.time - begin,
@@ -114,7 +101,8 @@ def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
         seen.reference.position,
         seen.displacements or Displacements(none, blank),
         seen.filtered or Filtered(blank, none[:, 0], none[:, 0]),
-        Taps(stamps - begin, waypoints, positions_at(seen.trajectory, stamps)),
+        Waypoints(stamps - begin, places),
+        positions_at(seen.trajectory, stamps),
     )
 
 
@@ -159,7 +147,7 @@ def sequence(seen: View, title: str = "") -> Figure:
     strips: list[Callable[[Axes, View], None]] = [_draw_speed]
     if seen.known or np.isfinite(seen.filtered.covariance).any():
         strips = [_draw_error, functools.partial(_draw_error, vertical=True), *strips]
-    elif len(seen.taps.time):
+    elif len(seen.passed):
         strips = [_draw_error, *strips]
     if np.isfinite(seen.network.diagnostics.get("gate", np.nan)).any():
         strips.append(_draw_gate)
@@ -188,9 +176,11 @@ def _draw_map(axes: Axes, seen: View) -> None:
     if seen.known:
         axes.plot(*seen.reference[:, :2].T, color=colours.REFERENCE, lw=1.6, label="reference")
     axes.plot(*seen.position[:, :2].T, color=colours.BLUE, lw=1.4, label="estimate")
-    if len(seen.taps.time):
-        axes.plot(*seen.taps.position.T, color=colours.REFERENCE, zorder=5, label="waypoint", **TAP)
-        for ends in np.stack([seen.taps.position, seen.taps.passed], 1):
+    if len(seen.passed):
+        axes.plot(
+            *seen.waypoints.position.T, color=colours.REFERENCE, zorder=5, label="waypoint", **TAP
+        )
+        for ends in np.stack([seen.waypoints.position, seen.passed], 1):
             axes.plot(*ends.T, color=colours.VERMILION, lw=1.0, zorder=3)
         axes.plot([], [], color=colours.VERMILION, lw=1.0, label="error at its time")
     shapes = ellipses(seen.filtered.covariance)
@@ -230,10 +220,10 @@ def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
         axes.fill_between(seen.time, low, bound, color=colour, alpha=0.16, lw=0, label="3σ")
     if seen.known:
         axes.plot(seen.time, error, color=colour, lw=1.2, label="error")
-    tapped = len(seen.taps.time) > 0 and not vertical
+    tapped = len(seen.passed) > 0 and not vertical
     if tapped:
         style = {"color": colours.REFERENCE, "label": "at waypoints", "clip_on": False, **TAP}
-        axes.plot(seen.taps.time, seen.taps.error, **style)
+        axes.plot(seen.waypoints.time, seen.errors, **style)
     axes.axhline(0, color=colours.REFERENCE, lw=0.6)
     axes.set_ylabel(f"{name}\n{'error' if seen.known or tapped else '3σ'} (m)")
 
@@ -242,10 +232,10 @@ def _draw_speed(axes: Axes, seen: View) -> None:
     black = {"color": colours.REFERENCE, "lw": 1.4}
     if seen.known:
         axes.plot(seen.time, speed(seen.reference, seen.step), label="reference", **black)
-    if len(seen.taps.time):
-        lengths = np.linalg.norm(np.diff(seen.taps.position, axis=0), axis=1)
-        legs = lengths / np.diff(seen.taps.time)
-        axes.stairs(legs, seen.taps.time, baseline=None, label="legs", **black)
+    if len(seen.passed):
+        times, places = seen.waypoints
+        legs = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times)
+        axes.stairs(legs, times, baseline=None, label="legs", **black)
     own = speed(seen.position, seen.step)
     axes.plot(seen.time, own, color=colours.BLUE, lw=1.1, label="estimate")
     axes.set_ylabel("horizontal\nspeed (m/s)")
@@ -278,7 +268,7 @@ def error_cdf(views: list[View], report: Report) -> Figure:
     left, right = figure.subplots(1, 2, sharey=True)
     errors = [seen.errors for seen in views if len(seen.errors)]
     posed = any(seen.known for seen in views)
-    tapped = any(len(seen.taps.time) for seen in views)
+    tapped = any(len(seen.passed) for seen in views)
     for error in errors:
         _step(left, error, color=colours.BLUE, lw=0.7, alpha=0.25)
     if errors:

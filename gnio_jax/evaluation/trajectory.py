@@ -152,17 +152,6 @@ def in_frame_of(
         return path
 
 
-def turned_covariance(
-    covariance: Float[np.ndarray, "n 3 3"], before: Trajectory, after: Trajectory
-) -> Float[np.ndarray, "n 3 3"]:
-    """Covariances of positions, m², after an alignment. They are turned about the vertical alone,
-    which is what an alignment turns of a level world."""
-    if after is before:
-        return covariance
-    turn = rotation_z(relative_yaw(after.orientation, before.orientation))
-    return turn @ covariance @ np.swapaxes(turn, 1, 2)
-
-
 def write_waypoints(path: Path, waypoints: Waypoints) -> None:
     """Write a line `t x y` (s, m) for every waypoint."""
     np.savetxt(path, np.column_stack(waypoints), fmt="%.9f", header=TXY)

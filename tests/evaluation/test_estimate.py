@@ -89,7 +89,7 @@ def test_integration_against_a_loop(walks):
 )
 def test_a_stride_without_a_window_goes_on_as_before(steps, moved):
     """Those before all windows take the movement of the first."""
-    found = mean_over_windows(np.array(steps, float)[:, None] * np.ones(3), len(moved), 2)
+    found = mean_over_windows(np.array(steps, float)[:, None] * np.ones(3), 2)
     np.testing.assert_allclose(found[:, 0], moved)
 
 

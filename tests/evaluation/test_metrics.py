@@ -118,7 +118,7 @@ def test_rpe_against_a_loop(seconds):
     for dims in (2, 3):
         found = metrics.rpe(estimate, truth, STEP, seconds, dims)
         assert found == pytest.approx(rms(np.array(errors)[:, :dims]), rel=1e-9)
-    found = metrics.rpe_se3(estimate, truth, STEP, seconds)
+    found = metrics.rpe(estimate, truth, STEP, seconds, full=True)
     assert found == pytest.approx(rms(errors_se3), rel=1e-9)
 
 
@@ -359,7 +359,7 @@ def test_agreement_with_evo(tmp_path):
     for seconds in (1.0, 10.0):
         rows = round(seconds / STEP)
         rpe = evo.RPE(part, delta=rows, delta_unit=evo.Unit.frames, all_pairs=True)
-        assert metrics.rpe_se3(estimate, truth, STEP, seconds) == rmse(rpe, other)
+        assert metrics.rpe(estimate, truth, STEP, seconds, full=True) == rmse(rpe, other)
     assert metrics.rpe(yaw_only, truth, STEP, 10.0) == rmse(rpe, turned)
     other.align(reference)
     aligned = align(estimate, truth, "se3").position

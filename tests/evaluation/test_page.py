@@ -60,15 +60,6 @@ def test_thinned_curves_keep_the_largest_innovation(walks):
     assert all(len(values) == 134 and values.dtype == np.float32 for values in found.values())
 
 
-def test_the_distance_walked_is_not_of_noise():
-    time = np.arange(100) * 0.1
-    path = np.stack([1.5 * time, 0.01 * (-1.0) ** np.arange(100), 0 * time], 1)
-    path[50:60] = np.nan  # hides the seconds that begin at 4 s and 5 s
-    found = page.walked(path, time, 0.1)
-    assert found[30] == pytest.approx(4.5, abs=1e-3)
-    assert found[-1] == pytest.approx(1.5 * (9.9 - 2.0), abs=0.01)
-
-
 def test_the_map_has_room_for_the_ellipses(walks):
     """However large they are."""
     walk = walks[0]
@@ -121,7 +112,7 @@ def test_the_page_is_one_file_that_loads_nothing(written, runs):
 
 def test_without_a_reference_nothing_is_called_an_error(estimates):
     text = page.render("blind", [run_of([estimates[2]])])
-    assert "error (m)" not in text and "distance walked" not in text
+    assert "error (m)" not in text
     assert r"3\\u03c3 (m)" in text  # as JSON in a script has it
     assert '"value":"start"' in text
     assert re.search(r"<label hidden>sequence", text)  # of a single one none is chosen

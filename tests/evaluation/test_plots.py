@@ -133,7 +133,7 @@ def test_one_picture_for_each_sequence(tmp_path, estimates, made):
     assert pictures.keys() == {"error_cdf.png", "room_1_walk.png", "room_1_walk_.png"}
     assert all(each.startswith(b"\x89PNG") for each in pictures.values())
     seen = plots.view(estimates[0])._replace(name="a$x^$\udcff")  # of any bytes, and short
-    kept = (x for x in seen._fields if x not in ("name", "taps"))
+    kept = (x for x in seen._fields if x not in ("name", "waypoints", "passed"))
     parts = {x: jax.tree.map(lambda rows: rows[:3], getattr(seen, x)) for x in kept}
     assert np.isnan(plots.speed(parts["position"], 0.1)).all()
     plots.save(tmp_path / "p.png", plots.sequence(seen._replace(**parts)))

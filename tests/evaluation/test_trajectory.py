@@ -6,13 +6,13 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import metrics
+from gnio_jax.evaluation import Estimate, Filtered, metrics
+from gnio_jax.evaluation.estimate import in_one_frame
 from gnio_jax.evaluation.trajectory import (
     Undefined,
     align,
     read_tum,
     relative_yaw,
-    turned_covariance,
     write_tum,
 )
 from gnio_jax.numerics import matrix_from_quaternion
@@ -38,9 +38,11 @@ def test_a_covariance_is_turned_with_its_trajectory():
     before = np.einsum("nki,nkj->nij", spread, spread)
     turned = Rotation.from_euler("z", 2.0).apply(spread.reshape(-1, 3)).reshape(spread.shape)
     wanted = np.einsum("nki,nkj->nij", turned, turned)
-    found = turned_covariance(before, estimate, align(estimate, truth))
-    np.testing.assert_allclose(found, wanted, atol=1e-9)
-    assert turned_covariance(before, estimate, estimate) is before
+    filtered = Filtered(before, *np.full((2, len(before)), np.nan))
+    found = Estimate("walk", estimate, truth, filtered=filtered)
+    covariance = in_one_frame(found).filtered.covariance
+    np.testing.assert_allclose(covariance, wanted, atol=1e-9)
+    assert in_one_frame(found, "none").filtered.covariance is before
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
