@@ -112,18 +112,13 @@ def compare(
         if not row.recordings() & rows[0].recordings():
             problem = f"shares no recording with {rows[0].label} that all seeds have"
             raise InputError(row.label, problem, "compare evaluations of the same recordings")
-    cells = tabulate.cells([row.reports for row in rows], _metrics(reports, config.metrics))
-    return Comparison(rows, cells)
-
-
-def _metrics(reports: list[Report], wanted: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Those that are wanted; by default the usual ones that some row has."""
     there = {x for report in reports for own in report.scores.values() for x in own.values}
-    for metric in wanted or ():
+    for metric in config.metrics or ():
         if metric not in there:
             has = ", ".join(name for name in NAMES if name in there)
             raise InputError("--metrics", f"no row has '{metric}'", f"there are: {has}")
-    return wanted or tuple(metric for metric in USUAL if metric in there)
+    wanted = config.metrics or [metric for metric in USUAL if metric in there]
+    return Comparison(rows, tabulate.cells([row.reports for row in rows], wanted))
 
 
 # --- the evaluations

@@ -33,8 +33,6 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory
 from gnio_jax.evaluation.metrics import path_length
 from gnio_jax.evaluation.prepare import ROUGH_START
-from gnio_jax.evaluation.trajectory import write_tum
-from gnio_jax.files import replacing
 from gnio_jax.filtering import Pose, Tracker
 from gnio_jax.filtering.start import level_state
 from gnio_jax.models import Network
@@ -66,28 +64,13 @@ class Sample(NamedTuple):
         return _is_finite(self.gyro) and _is_finite(self.accel)
 
 
-class Scale(NamedTuple):
-    """What one unit of a stream is."""
-
-    gyro: float = 1.0
-    """rad/s."""
-    accel: float = 1.0
-    """m/s²."""
+Units = tuple[str, str]
+"""Of gyro and accelerometer, by the names that an import knows."""
+SI: Units = ("rad/s", "m/s2")
 
 
-SI = Scale()
-
-
-def scale_of(gyro_unit: str | None, accel_unit: str | None) -> Scale:
-    """rad/s and m/s² of one unit, of the names that an import knows; None: of the package's own."""
-    return Scale(
-        units.TO_RAD_PER_SECOND[gyro_unit or "rad/s"],
-        units.TO_METRES_PER_SECOND_SQUARED[accel_unit or "m/s2"],
-    )
-
-
-def parse_line(line: str, scale: Scale = SI) -> Sample | None:
-    """The sample of a line, whose units are `scale`, or None where it is no sample.
+def parse_line(line: str, stated: Units = SI) -> Sample | None:
+    """The sample of a line, whose units are `stated`, or None where it is no sample.
 
     Two forms: seven numbers `time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z`, separated by
     commas, semicolons, tabs or blanks, an empty one missing; or a JSON object with `time`, `gyro`
@@ -113,7 +96,8 @@ def parse_line(line: str, scale: Scale = SI) -> Sample | None:
             return None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
         return None
-    gyro, accel = [scale.gyro * each for each in gyro], [scale.accel * each for each in accel]
+    gyro = [units.TO_RAD_PER_SECOND[stated[0]] * each for each in gyro]
+    accel = [units.TO_METRES_PER_SECOND_SQUARED[stated[1]] * each for each in accel]
     if any(abs(each) > FASTEST_TURN for each in gyro):
         return None
     if any(abs(each) > STRONGEST_FORCE for each in accel):
@@ -230,9 +214,9 @@ class Source(NamedTuple):
     name: str
 
 
-def lines_of(stream: Iterable[str], name: str = "standard input", scale: Scale = SI) -> Source:
-    """The lines of a stream, until it ends; its units are `scale`."""
-    return Source(paired(parse_line(line, scale) for line in stream), name)
+def lines_of(stream: Iterable[str], name: str = "standard input", stated: Units = SI) -> Source:
+    """The lines of a stream, until it ends; its units are `stated`."""
+    return Source(paired(parse_line(line, stated) for line in stream), name)
 
 
 def from_recording(sequence: Sequence, speed: float) -> Source:
@@ -271,26 +255,24 @@ class Datagrams:
 
     def source(
         self,
-        scale: Scale = SI,
+        stated: Units = SI,
         silence: float | None = None,
         say: Callable[[str], None] = print,
         at_rest: Callable[[list[Sample]], bool] = bool,
     ) -> Source:
-        """The samples, in units of `scale`, until after the first one nothing comes for `silence` s
-        (None: for ever).
+        """The samples, in the units `stated`, until nothing comes for `silence` s after the first
+        one (None: for ever).
 
         `say` is told where nothing comes. What has come so far counts if `at_rest` says that it
         begins at rest; else the device was carried before anybody could know, and it is left out.
         """
         come = [self._waiting.get_nowait() for _ in range(self._waiting.qsize())]
         messages = self._messages(silence, say, begun=bool(come))
-        samples = list(paired(parse_line(line, scale) for line in _lines(come)))
-        whole = [each for each in samples if each is not None and each.whole]
-        if come and not at_rest(whole):
+        early = lines_of(_lines(come), self.name, stated).samples
+        if come and not at_rest([each for each in early if each is not None and each.whole]):
             say(f"{len(come)} datagrams came before the device was still and are left out")
             come = []
-        lines = itertools.chain(_lines(come), _lines(messages))
-        return Source(paired(parse_line(line, scale) for line in lines), self.name)
+        return lines_of(_lines(itertools.chain(come, messages)), self.name, stated)
 
     def _messages(
         self, silence: float | None, say: Callable[[str], None], begun: bool
@@ -441,11 +423,10 @@ def _rate_of(stamps: list[float], imu_rate: float | None, where: str) -> float:
 
 def _check_gravity(samples: list[Sample], where: str) -> None:
     size = float(np.median(np.linalg.norm([sample.accel for sample in samples], axis=1)))
-    ranges = units.GRAVITY_RANGES
-    low, high = ranges["m/s2"]
-    if low <= size <= high:
+    ranges = units.GRAVITY_RANGES.items()
+    looks = [unit for unit, (least, most) in ranges if least <= size <= most]
+    if looks == ["m/s2"]:
         return
-    looks = [unit for unit, (least, most) in ranges.items() if least <= size <= most]
     problem = f"its accelerometer reads {size:.3g} m/s² at the start, and gravity is 9.81"
     known = ", ".join(units.TO_METRES_PER_SECOND_SQUARED)
     remedy = f"give --accel-unit {looks[0]}" if looks else f"give its --accel-unit: {known}"
@@ -592,14 +573,6 @@ def _add(found: Followed, pose: Pose) -> None:
     if pose.healthy:
         attitude = quaternion_from_matrix(pose.rotation[None])[0]
         found.path.extend((pose.time, *pose.position, *attitude))
-
-
-def write_trajectory(path: Path, found: Followed) -> None:
-    """Write the healthy poses in TUM format. Raises `InputError` where there is none."""
-    if not found.path:
-        raise InputError(path, "no pose could be written, because the filter diverged at once")
-    with replacing(path) as temporary:
-        write_tum(temporary, found.trajectory)
 
 
 # --- the terminal

@@ -131,7 +131,14 @@ def choose(which: str | Path | None = None) -> Weights:
     if is_package(place):
         about, content = read(place)
         name, trained_on, measured = about.name, about.data, about.measured
-        run = _run_of(place, about, content)
+        source = str(place / MANIFEST)
+        config = configuration.parse(json.dumps(about.config), source)
+        config = configuration.validate(config, source)
+        model = models.from_config(config.model)
+        shapes = models.variable_shapes(model, config.data.seen)
+        template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
+        variables = from_bytes(content, template, place / WEIGHTS)
+        run = Run(config, model, variables, about.epoch, about.step)
     else:
         run = checkpoint.load_run(place)
         names, split = ", ".join(run.config.datasets), run.config.data.train_split
@@ -140,11 +147,7 @@ def choose(which: str | Path | None = None) -> Weights:
             measured = _measured(_figures(place), run.config.datasets)
         except InputError:
             measured = ""  # a damaged evaluation keeps nobody from tracking
-    about = f"{trained_on}, whose {measured}" if measured else trained_on
-    return Weights(name, run, about)
-
-
-# --- reading
+    return Weights(name, run, f"{trained_on}, whose {measured}" if measured else trained_on)
 
 
 def load_pretrained(which: str | Path | None = None) -> Run:
@@ -156,8 +159,7 @@ def load_pretrained(which: str | Path | None = None) -> Run:
     [accel m/s², gyro rad/s] in the gravity frame at `run.config.data.rate`; `run.config.filter` are
     the filter's settings as they were calibrated or trained. Raises `InputError`.
     """
-    place = find(which)
-    return _run_of(place, *read(place)) if is_package(place) else checkpoint.load_run(place)
+    return choose(which).run
 
 
 def card_of(which: str | Path) -> str:
@@ -179,6 +181,9 @@ def write_run(which: str | Path, workdir: Path) -> None:
     with replacing_folder(workdir) as new:
         configuration.save(new / "config.yaml", run.config)
         checkpoint.write_best(new, run)
+
+
+# --- reading
 
 
 def read(place: Path) -> tuple[About, bytes]:
@@ -261,17 +266,6 @@ def _content(place: Path, name: str, most: int) -> bytes:
     if len(content) > most:
         raise InputError(place, f"'{name}' is larger than {most} bytes", _DAMAGED)
     return content
-
-
-def _run_of(place: Path, about: About, content: bytes) -> Run:
-    source = str(place / MANIFEST)
-    config = configuration.parse(json.dumps(about.config), source)
-    config = configuration.validate(config, source)
-    model = models.from_config(config.model)
-    shapes = models.variable_shapes(model, config.data.seen)
-    template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
-    variables = from_bytes(content, template, place / WEIGHTS)
-    return Run(config, model, variables, about.epoch, about.step)
 
 
 def to_bytes(variables: Any) -> bytes:

@@ -78,6 +78,7 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
 
     from gnio_jax.apps import live as following
     from gnio_jax.apps import packages, rerun
+    from gnio_jax.apps.export import export
     from gnio_jax.apps.importing import read_imported
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
@@ -113,15 +114,15 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
         say(f"  samples come at {imu_rate:.4g} Hz{lower if imu_rate < 0.99 * own else ''}")
 
     if stream is None:
-        scale = following.scale_of(asked.gyro_unit, asked.accel_unit)
+        stated = asked.gyro_unit or "rad/s", asked.accel_unit or "m/s2"
         say(f"ready: hold still now, for {asked.rest_seconds:g} s")
         if datagrams is None:
             if isinstance(sys.stdin, io.TextIOWrapper):
                 sys.stdin.reconfigure(errors="replace")  # noise on a line is no text
-            stream = following.lines_of(sys.stdin, scale=scale)
+            stream = following.lines_of(sys.stdin, stated=stated)
         else:
             at_rest = following.begins_at_rest(run)
-            stream = datagrams.source(scale, asked.silence, say, at_rest)
+            stream = datagrams.source(stated, asked.silence, say, at_rest)
         stream = following.measured(stream, begin, asked.imu_rate)
     else:
         following.expect(tracker, found, run, rate)
@@ -144,7 +145,7 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
     if found.pose is not None:
         say(following.line(found))
         if asked.out:
-            following.write_trajectory(asked.out, found)
+            export(asked.out, found.trajectory, "tum")
             say(f"trajectory: {asked.out}")
     if stopped is not None:
         raise stopped

@@ -366,7 +366,7 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_told():
     walk = time, np.degrees(known_walk.rate(time)), known_walk.force(time)
     with pytest.raises(InputError, match=r"udp:5: its gyro looks like deg/s.*state the unit"):
         rate_of(as_lines(walk))
-    source = live.lines_of(as_lines(walk), "udp:5", live.scale_of("deg/s", None))
+    source = live.lines_of(as_lines(walk), "udp:5", ("deg/s", "m/s2"))
     found = list(live.measured(source, print).samples)
     np.testing.assert_allclose([s.gyro for s in found], known_walk.rate(time), atol=1e-9)
 
