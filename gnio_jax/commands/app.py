@@ -27,6 +27,7 @@ GNIO = options.Group(
         "live": "live:live",
         "train": "train:train",
         "evaluate": "evaluate:evaluate",
+        "score": "evaluate:score",
         "calibrate": "calibrate:calibrate",
         "compare": "compare:compare",
         "tables": "tables:tables",

@@ -1,12 +1,25 @@
-"""`gnio evaluate`: trajectories and errors of a trained network."""
+"""`gnio evaluate`, `gnio score`: trajectories and errors, of a trained network or of anybody."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import EvaluateConfig
+from gnio_jax.config.schema import UNNAMED
 from gnio_jax.cores import usable_cores
+
+
+@dataclass(frozen=True)
+class ScoreOptions:
+    reference: Annotated[Path, UNNAMED]
+    """File in TUM format: t x y z qx qy qz qw."""
+    estimate: Annotated[Path, UNNAMED]
+    """The same of the estimate, with stamps of the same clock."""
+    alignment: Literal["origin", "none", "yaw_position", "se3"] = "origin"
+    """What is matched before the errors are taken (docs/tables.md)."""
 
 
 def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
@@ -47,3 +60,20 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
         console.say(f"page: {found.folder / 'report.html'} (open it in a browser)")
         pictures = found.folder / "plots" / "error_cdf.png"
         console.say(f"pictures: {pictures}, and there <name>.png of each sequence")
+
+
+def score(asked: ScoreOptions, _call: options.Call) -> None:
+    """Errors of any trajectory against a reference, as gnio evaluate prints them.
+
+    Each pose of the reference is compared with the nearest one of the estimate, if their stamps
+    differ by at most 0.01 s.
+
+    examples:
+      {prog} truth.txt odometry.txt
+      {prog} truth.txt odometry.txt --alignment se3      aligned as evo does
+    """
+    from gnio_jax import evaluation  # late: mistakes do not wait for JAX
+    from gnio_jax.evaluation import tabulate
+
+    found = evaluation.score_files(asked.reference, asked.estimate, asked.alignment)
+    console.say(tabulate.render(found))

@@ -4,8 +4,8 @@ The way through, a file each: `prepare` (sequences with a start) → `infer` (th
 displacements) → `estimate` (trajectories) → `metrics` (`score`) → `report`. `evaluate` walks it.
 """
 
-from gnio_jax.evaluation.estimate import Estimate, estimate, never_moves, perfect
-from gnio_jax.evaluation.evaluate import Evaluation, evaluate
+from gnio_jax.evaluation.estimate import Estimate, States, estimate, never_moves, perfect
+from gnio_jax.evaluation.evaluate import Evaluation, evaluate, score_files
 from gnio_jax.evaluation.infer import Displacements, given_displacements, infer, no_displacements
 from gnio_jax.evaluation.metrics import Filtered, Measures, measure, score
 from gnio_jax.evaluation.prepare import Recording, prepare
@@ -21,6 +21,7 @@ __all__ = [
     "Measures",
     "Recording",
     "Report",
+    "States",
     "Trajectory",
     "Undefined",
     "align",
@@ -35,4 +36,5 @@ __all__ = [
     "perfect",
     "prepare",
     "score",
+    "score_files",
 ]

@@ -57,6 +57,22 @@ SHORTEST = 16
 """No batch is padded to less than about this many strides."""
 
 
+class States(NamedTuple):
+    """What the filter estimates beside poses, a row for each row of the trajectory."""
+
+    velocity: Float[np.ndarray, "n 3"]
+    """In the filter's own world, m/s."""
+    gyro_bias: Float[np.ndarray, "n 3"]
+    """In the body, rad/s."""
+    accel_bias: Float[np.ndarray, "n 3"]
+    """In the body, m/s²."""
+    std: Float[np.ndarray, "n 15"]
+    """Standard deviations of the errors of attitude (in the world, rad), velocity, position, gyro
+    bias, accelerometer bias, with those that the filter considers."""
+    innovation: Float[np.ndarray, "n 3"]
+    """Measured minus predicted displacement, m; NaN where there was no measurement."""
+
+
 class Estimate(NamedTuple):
     """A trajectory with what the estimator knows beside it: K + 1 rows for K strides.
 
@@ -72,10 +88,7 @@ class Estimate(NamedTuple):
     displacements: Displacements | None = None
     """With the standard deviations that the filter used, or those of the network without one."""
     filtered: Filtered | None = None
-    velocity: Float[np.ndarray, "k 3"] | None = None
-    """m/s."""
-    std: Float[np.ndarray, "k 15"] | None = None
-    """Standard deviation of the filter's error in θ, v, p, b_g, b_a."""
+    states: States | None = None
     notes: tuple[str, ...] = ()
     """What a reader of the result should know."""
     waypoints: Waypoints | None = None
@@ -286,8 +299,13 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) 
             _after(np.nan, history.nis),
             _after(np.nan, history.accepted),
         ),
-        velocity=_after(start.velocity, history.velocity),
-        std=_after(std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
+        States(
+            _after(start.velocity, history.velocity),
+            _after(start.gyro_bias, history.gyro_bias),
+            _after(0.0, history.accel_bias),
+            _after(std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
+            _after(np.nan, history.innovation),
+        ),
         notes=notes,
         waypoints=recording.waypoints,
     )

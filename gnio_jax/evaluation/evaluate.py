@@ -29,6 +29,7 @@ from gnio_jax.evaluation.infer import given_displacements, infer, no_displacemen
 from gnio_jax.evaluation.metrics import score
 from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
+from gnio_jax.evaluation.trajectory import Alignment, Undefined, paired, read_tum
 from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, Reporter, Silence
@@ -138,6 +139,22 @@ def evaluate(
     folder = folder_of(workdir, config, run.config)
     write(folder, report, estimates, run.config, command, config.plots, stage("drawing"))
     return Evaluation(report, estimates, recordings, folder)
+
+
+def score_files(reference: Path, estimate: Path, alignment: Alignment = "origin") -> Report:
+    """The report about two trajectories in TUM format, whoever wrote them, at the stamps that they
+    share. Raises `InputError` where these are too few."""
+    try:
+        path, truth = paired(read_tum(estimate), read_tum(reference))
+    except Undefined as problem:
+        remedy = "give both the stamps of one clock, in s"
+        raise InputError(estimate, f"{problem} as in {reference}", remedy) from None
+    found = [Estimate(estimate.stem, path, truth)]
+    settings = {"dataset": estimate.name, "split": f"against {reference.name}"}
+    settings |= {"estimator": "given poses", "alignment": alignment}
+    still = {"never_moves": score(never_moves(found), alignment)}
+    groups = {estimate.stem: estimate.stem}
+    return Report(settings, score(found, alignment), still, groups, {}, {})
 
 
 def _check(config: EvaluateConfig) -> None:

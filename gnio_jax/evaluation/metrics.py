@@ -50,11 +50,6 @@ def ate(estimate: Positions, reference: Positions) -> float:
     return _rms(_trusted_errors(estimate, reference))
 
 
-def ate_mean(estimate: Positions, reference: Positions) -> float:
-    """Mean ‖p̂ − p‖, m (TLIO's test of the network)."""
-    return float(np.mean(np.linalg.norm(_trusted_errors(estimate, reference), axis=1)))
-
-
 def drift(estimate: Positions, reference: Positions, step: float) -> float:
     """Error at the last trusted row over the length of the reference's path, % (position drift
     error, PDE). The error has grown over the whole path, so its holes are bridged by straight
@@ -349,6 +344,11 @@ class Compared(NamedTuple):
         an alignment of all axes would turn some of the height into the plane."""
         return self.aligned.position[:, : self.dims], self.reference.position[:, : self.dims]
 
+    @property
+    def errors(self) -> Float[np.ndarray, "m"]:
+        """‖p̂ − p‖ of the aligned estimate in the trusted rows, m."""
+        return np.linalg.norm(_trusted_errors(*self.paths), axis=1)
+
     def at_waypoints(self) -> tuple[Positions, Positions]:
         """The aligned estimate's positions, and the waypoints that are within it."""
         assert self.waypoints is not None
@@ -379,7 +379,9 @@ PATH: dict[str, Metric] = {"path_length": lambda c: path_length(c.paths[1], c.st
 SPATIAL: dict[str, Metric] = {
     "ate": lambda c: ate(*c.paths),
     "ate_ronin": lambda c: ate(*c.paths) / math.sqrt(c.dims),
-    "ate_mean": lambda c: ate_mean(*c.paths),
+    "ate_mean": lambda c: float(np.mean(c.errors)),
+    "ate_median": lambda c: float(np.median(c.errors)),
+    "ate_max": lambda c: float(np.max(c.errors)),
     "rte_60s": lambda c: rte(*c.paths, c.step),
     "rte_60s_ronin": lambda c: rte(*c.paths, c.step) / math.sqrt(c.dims),
     "rte_1m": lambda c: rte_distance(*c.paths, 1.0),

@@ -5,6 +5,7 @@ metrics.csv       a line per sequence, a column per metric
 trajectories/     estimates in TUM format, for evo
 references/       references in TUM format
 waypoints/        references of sequences without poses: t x y
+states/           everything that the estimator gave, for NumPy (docs/tables.md)
 plots/            a picture per sequence, and the distribution of the errors
 report.html       a page with map, curves and a time slider
 """
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
@@ -101,10 +103,11 @@ def write(
         columns = list(dict.fromkeys(x for own in report.scores.values() for x in own.values))
         rows = ([name, *map(own.values.get, columns)] for name, own in report.scores.items())
         write_csv(new / "metrics.csv", [["sequence", *columns], *rows])
-        for kind in ("trajectories", "references"):
+        for kind in ("trajectories", "references", "states"):
             (new / kind).mkdir()
         for stem, each in zip(file_names(list(report.scores)), estimates, strict=True):
             write_tum(new / "trajectories" / f"{stem}.txt", each.trajectory)
+            np.savez(new / "states" / f"{stem}.npz", **arrays(each))
             if each.reference.known.any():
                 write_tum(new / "references" / f"{stem}.txt", each.reference)
             if each.waypoints is not None:
@@ -121,6 +124,18 @@ def write(
             run = page.of_report(report, views, command, configuration.text(trained))
             title = f"{report.settings['dataset']} {report.settings['split']}: {run.name}"
             page.write(new / PAGE, title, [run, *page.beside(folder, report.settings)])
+
+
+def arrays(estimate: Estimate) -> dict[str, Float[np.ndarray, "n ..."]]:
+    """What the estimator gave, as docs/tables.md lists it: a row for each of the trajectory."""
+    found: dict[str, Any] = estimate.trajectory._asdict()
+    if estimate.displacements is not None:
+        value, covariance, diagnostics = estimate.displacements
+        found |= {"displacement": value, "displacement_covariance": covariance, **diagnostics}
+    if estimate.filtered is not None:
+        covariance, nis, accepted = estimate.filtered
+        found |= {"position_covariance": covariance, "nis": nis, "accepted": accepted}
+    return found | (estimate.states._asdict() if estimate.states else {})
 
 
 def as_json(report: Report) -> dict[str, Any]:

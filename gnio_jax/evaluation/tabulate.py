@@ -204,12 +204,14 @@ def way(settings: Mapping[str, Any]) -> str:
     """How trajectories were estimated: the estimator, and what is not as usual."""
     loose = settings.get("coupling") == "loose"
     own_attitude = settings["estimator"] == "imu_only" or settings.get("coupling") == "tight"
+    turned, started = settings.get("orientation_source"), settings.get("initial_state", "reference")
+    bias = settings.get("gyro_bias", "zero")
     parts = {
         settings["estimator"]: True,
         "loose coupling": loose,
-        f"{settings.get('orientation_source')} orientation": not own_attitude,
-        f"{settings.get('initial_state')} start": settings.get("initial_state") != "reference",
-        f"gyro bias: {settings.get('gyro_bias')}": settings.get("gyro_bias") != "zero",
+        f"{turned} orientation": turned and not own_attitude,
+        f"{started} start": started != "reference",
+        f"gyro bias: {bias}": bias != "zero",
         f"{settings['alignment']} alignment": settings["alignment"] != "origin",
         f"{settings.get('checkpoint')} checkpoint": settings.get("checkpoint") == "latest",
     }
@@ -317,7 +319,7 @@ def render(report: Report) -> Group:
         add(label, numbers({name: of.mean for name, of in report.summary(row).items()}), "italic")
         lost = lost + own
     how = "; ".join(f"{name}: {text}" for name, text in about(report.settings).items())
-    signs = "reference rows are means; – is not defined (the reason is in metrics.json)"
+    signs = "reference rows are means; – is not defined (metrics.json of an evaluation has the reason)"
     warnings = [DIVERGED] if lost else []
     return Group(
         grid,

@@ -25,6 +25,10 @@ Quaternions = Float[np.ndarray, "n 4"]
 Alignment = Literal["origin", "none", "yaw_position", "se3"]
 TUM = "t x y z qx qy qz qw"
 TXY = "t x y"
+SAME_MOMENT = 0.01
+"""s by which stamps of an estimate and of a reference may differ: that of evo."""
+SCATTERED = 100
+"""Steps for each shared stamp, on average, from which on two files are not of one walk (ours)."""
 NEAR = 0.2
 """How far beyond the ends of a trajectory a waypoint may lie and count at the end, s (ours). A
 person taps no more exactly, and a trajectory ends with a whole stride."""
@@ -139,6 +143,41 @@ def _moved(
         (estimate.position - source) @ turn.T + target,
         quaternion_product(quaternion_from_matrix(turn), estimate.orientation),
     )
+
+
+def paired(
+    estimate: Trajectory, reference: Trajectory, most: float = SAME_MOMENT
+) -> tuple[Trajectory, Trajectory]:
+    """Both at the stamps that they share, to `most` s: each pose of the reference with the nearest
+    one of the estimate, as evo matches them.
+
+    The rows are a median step of the shared stamps apart. Where the reference has none it is NaN,
+    and the estimate stays where it was: it counts nowhere. Raises `Undefined` for fewer than two
+    shared stamps, or where they are scattered over more than a hundred times as many steps.
+    """
+    if len(reference.time) < 2:
+        raise Undefined("the reference has a single pose")
+    after = np.searchsorted(reference.time[1:-1], estimate.time) + 1
+    late, early = (np.abs(reference.time[x] - estimate.time) for x in (after, after - 1))
+    near, apart = np.where(late < early, after, after - 1), np.minimum(late, early)
+    order = np.argsort(apart, kind="stable")
+    there, first = np.unique(near[order[apart[order] <= most]], return_index=True)
+    here = order[first]
+    if len(here) < 2:
+        raise Undefined(f"fewer than two stamps are the same to {most:g} s")
+    time = reference.time[there]
+    step = float(np.median(np.diff(time)))
+    rows, kept = np.unique(np.round((time - time[0]) / step).astype(int), return_index=True)
+    if rows[-1] > SCATTERED * len(rows):
+        raise Undefined(f"only {len(rows)} stamps in {time[-1] - time[0]:.0f} s are the same")
+    shared = np.isin(np.arange(rows[-1] + 1), rows)
+    clock = time[0] + step * np.arange(rows[-1] + 1)
+    poses = [np.full((len(clock), width), np.nan) for width in (3, 4)]
+    for part, given in zip(poses, reference[1:], strict=True):
+        part[rows] = given[there[kept]]
+    latest = here[kept][np.cumsum(shared) - 1]
+    ours = Trajectory(clock, estimate.position[latest], estimate.orientation[latest])
+    return ours, Trajectory(clock, *poses)
 
 
 def in_frame_of(

@@ -44,7 +44,7 @@ def test_null_takes_away_what_a_file_sets(tmp_path):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ([], "command: is missing; give one of track, live, train, evaluate, calibrate"),
+        ([], "command: is missing; give one of track, live, train, evaluate, score"),
         (["trian"], "command: unknown 'trian'; did you mean 'train'?"),
         (["--verbose"], "command: unknown '--verbose'; give one of track, live"),
         (["train", "--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean '--optim."),

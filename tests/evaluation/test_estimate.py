@@ -53,7 +53,7 @@ def test_imu_only_is_strap_down_integration(walks):
     rows = slice(0, len(path) * CONFIG.stride, CONFIG.stride)
     np.testing.assert_array_equal(found.trajectory.time, walks[0].time[rows])
     np.testing.assert_array_equal(found.reference.position, walks[0].position[rows])
-    assert np.isnan(found.filtered.accepted).all() and found.std.shape == (len(path), 15)
+    assert np.isnan(found.filtered.accepted).all() and found.states.std.shape == (len(path), 15)
 
 
 def test_integration_against_a_loop(walks):
@@ -74,7 +74,7 @@ def test_integration_against_a_loop(walks):
     np.testing.assert_allclose(found.trajectory.position, path, atol=1e-9)
     np.testing.assert_array_equal(found.displacements.value[1:], predicted.value)
     assert np.isnan(found.displacements.value[: 10 + context]).all()
-    assert found.std is None and found.filtered is None
+    assert found.states is None and found.filtered is None
     (still,) = evaluation.never_moves([found])
     assert (still.trajectory.position == walks[0].position[0]).all()
     assert metrics.measure(still.trajectory, still.reference).values["path_length_ratio"] == 0
@@ -152,9 +152,9 @@ def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks, run):
     assert added[-1].max() > 1e-6
     np.testing.assert_allclose(found.filtered.covariance, wanted, rtol=1e-2, atol=1e-7)
     std = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
-    np.testing.assert_allclose(found.std[:, 6:9], std, rtol=1e-2)
-    at_start = np.hypot(plain.std[0, 9:12], 1e-3)  # a constant bias is there from the start
-    np.testing.assert_allclose(found.std[0, 9:12], at_start, rtol=1e-12)
+    np.testing.assert_allclose(found.states.std[:, 6:9], std, rtol=1e-2)
+    at_start = np.hypot(plain.states.std[0, 9:12], 1e-3)  # a constant bias is there from the start
+    np.testing.assert_allclose(found.states.std[0, 9:12], at_start, rtol=1e-12)
 
 
 def with_gyro_bias(recording, off):
@@ -219,8 +219,8 @@ def test_what_the_filter_calls_void_has_diverged(walks, disturbed, factor, row):
     accel = walks[0].accel.copy()
     accel[disturbed] *= factor
     void, whole = tight(ready([walks[0]._replace(accel=accel), walks[1]]))
-    assert np.isfinite(void.velocity).all()
-    assert np.argmax(np.linalg.norm(void.velocity, axis=1) > 100) == row
+    assert np.isfinite(void.states.velocity).all()
+    assert np.argmax(np.linalg.norm(void.states.velocity, axis=1) > 100) == row
     for field in void.trajectory[1:]:
         assert np.isfinite(field[:row]).all() and np.isnan(field[row:]).all()
     words = f"filter: diverged at {row / 10:.1f} s; the poses from then on are invalid"
@@ -265,4 +265,23 @@ def test_the_filter_starts_as_sure_as_its_options_say(walks, how):
     (found, _), own = imu_only(recordings), recordings[0].start.std
     assert (own.yaw, own.gyro_bias) == (0.3, 0.02)
     wanted = np.repeat(np.array(own), [2, 1, 3, 3, 3, 3])
-    np.testing.assert_allclose(found.std[0], wanted, rtol=1e-12)
+    np.testing.assert_allclose(found.states.std[0], wanted, rtol=1e-12)
+
+
+def test_the_states_are_those_of_the_filter(walks):
+    """Biases beside each other, an innovation that is what the displacement adds, and standard
+    deviations whose middle is that of the position."""
+    recordings = ready(walks[:1], gyro_bias="reference")
+    (found,) = with_truth(recordings)
+    states, start = found.states, recordings[0].start
+    np.testing.assert_array_equal(states.gyro_bias[0], start.gyro_bias)
+    assert start.gyro_bias.any() and not states.accel_bias[0].any()
+    assert np.abs(states.gyro_bias[-1] - start.gyro_bias).max() < 0.01
+    variance = np.einsum("nii->ni", found.filtered.covariance)
+    np.testing.assert_allclose(states.std[:, 6:9] ** 2, variance, rtol=1e-6)
+    measured = np.isfinite(found.filtered.nis)
+    np.testing.assert_array_equal(np.isfinite(states.innovation).all(1), measured)
+    length = np.linalg.norm(found.displacements.value[measured], axis=1)
+    assert np.linalg.norm(states.innovation[measured], axis=1).max() < 0.1 < length.max()
+    moved = np.gradient(found.trajectory.position, found.trajectory.time, axis=0)
+    np.testing.assert_allclose(states.velocity[5:-5], moved[5:-5], atol=0.5)

@@ -62,6 +62,32 @@ def test_what_is_written_is_read_back_whole(tmp_path, estimates, made, with_dive
     assert references == trajectories[1:]
 
 
+def test_what_the_estimator_gave_is_there_for_numpy(tmp_path, estimates):
+    """Without a filter nothing is there of one."""
+    walk, summed = estimates[0], estimates[1]._replace(filtered=None, states=None)
+    write(tmp_path, reported([walk, summed]), [walk, summed])
+    first, second = (np.load(tmp_path / "states" / f"room_1_walk{end}.npz") for end in ("", "_"))
+    wanted = {
+        "time": walk.trajectory.time,
+        "position": walk.trajectory.position,
+        "orientation": walk.trajectory.orientation,
+        "displacement": walk.displacements.value,
+        "displacement_covariance": walk.displacements.covariance,
+        "gate": walk.displacements.diagnostics["gate"],
+        "position_covariance": walk.filtered.covariance,
+        "nis": walk.filtered.nis,
+        "accepted": walk.filtered.accepted,
+        "velocity": walk.states.velocity,
+        "gyro_bias": walk.states.gyro_bias,
+        "accel_bias": walk.states.accel_bias,
+        "std": walk.states.std,
+        "innovation": walk.states.innovation,
+    }
+    assert set(first) == wanted.keys() and set(second) == {*list(wanted)[:6]}
+    for name, values in wanted.items():
+        np.testing.assert_array_equal(first[name], values)
+
+
 def test_trajectories_are_read_back_at_their_own_stamps(tmp_path, estimates, made):
     """The reference where it is known, the estimate up to where it diverged."""
     whole, rows = estimates[0], np.arange(400)

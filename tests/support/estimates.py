@@ -8,6 +8,7 @@ from gnio_jax.evaluation import (
     Estimate,
     Filtered,
     Report,
+    States,
     Trajectory,
     never_moves,
     score,
@@ -56,5 +57,5 @@ def estimate(name, seed, n=400, truth=True):
             np.where(np.isnan(accepted), np.nan, 3.0),
             accepted,
         ),
-        std=np.repeat(spread[:, None], 15, 1),
+        States(*random.normal(size=(3, n, 3)), np.repeat(spread[:, None], 15, 1), moved),
     )

@@ -1,0 +1,95 @@
+"""`gnio score`: any two files in TUM format, matched by their stamps."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Trajectory, score_files
+from gnio_jax.evaluation.trajectory import write_tum
+from tests.support.command_lines import run
+from tests.support.trajectories import moved_by, perturbed, walk
+
+SPIN = Rotation.from_euler("z", 0.7)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Writes a reference and an estimate."""
+
+    def write(reference, estimate):
+        for name, path in (("truth", reference), ("odometry", estimate)):
+            write_tum(tmp_path / f"{name}.txt", path)
+        return tmp_path / "truth.txt", tmp_path / "odometry.txt"
+
+    return write
+
+
+def thinned(path, every, shift=0.0, seed=0):
+    """Every few rows of it, with stamps that are off by up to 4 ms."""
+    rows = slice(None, None, every)
+    off = np.random.default_rng(seed).uniform(-0.004, 0.004, len(path.time[rows]))
+    return Trajectory(path.time[rows] + off + shift, *(part[rows] for part in path[1:]))
+
+
+@pytest.mark.parametrize("of_truth, of_estimate", [(1, 5), (5, 1), (2, 3)])
+def test_poses_are_matched_as_evo_matches_them(files, of_truth, of_estimate):
+    """Whichever file has more of them; a hole of the reference counts nowhere."""
+    pytest.importorskip("evo.core.sync")
+    from evo.core import metrics, sync
+    from evo.tools.file_interface import read_tum_trajectory_file
+
+    whole = walk()
+    truth = thinned(whole, of_truth)
+    truth = Trajectory(*(np.delete(part, slice(20, 40), axis=0) for part in truth))
+    estimate = thinned(moved_by(perturbed(whole), SPIN, [5.0, 1.0, 0.0]), of_estimate, seed=1)
+    places = files(truth, estimate)
+    reference, other = sync.associate_trajectories(*map(read_tum_trajectory_file, places))
+    for how in ("none", "se3"):
+        own = score_files(*places, how).scores["odometry"].values
+        if how == "se3":
+            other.align(reference)
+        ape = metrics.APE(metrics.PoseRelation.translation_part)
+        ape.process_data((reference, other))
+        statistics = ape.get_all_statistics()
+        names = {"ate": "rmse", "ate_mean": "mean", "ate_median": "median", "ate_max": "max"}
+        for name, theirs in names.items():
+            assert own[name] == pytest.approx(statistics[theirs], rel=1e-6), (how, name)
+
+
+def test_what_is_over_time_keeps_its_time(files):
+    """A second has as many rows as the stamps say, also where poses are missing: a heading that is
+    wrong throughout costs displacements nothing."""
+    truth = walk()
+    estimate = moved_by(truth, SPIN, [5.0, 1.0, 0.0])
+    holed = Trajectory(*(np.delete(part, slice(300, 417), axis=0) for part in estimate))
+    found = score_files(*files(truth, holed)).scores["odometry"].values
+    assert found["rpe_1s"] < 1e-6 and found["ate"] < 1e-6
+    assert found["duration"] == pytest.approx(truth.time[-1] - truth.time[0])
+
+
+def test_the_table_is_that_of_an_evaluation(files, capsys):
+    truth = walk()
+    estimate = truth._replace(position=truth.position * [1.02, 1.02, 1.0])
+    run("score", *map(str, files(truth, estimate)), "--alignment", "none")
+    told = capsys.readouterr().out
+    ate = 0.02 * np.sqrt(np.mean(np.sum(truth.position[:, :2] ** 2, axis=1)))
+    assert f" {ate:.2f} " in told and "1.02" in told and "never_moves" in told
+    assert "odometry.txt against truth.txt" in told and "none alignment" in told
+
+
+@pytest.mark.parametrize(
+    "rows, shift, words",
+    [
+        (slice(None), 1e4, "fewer than two stamps are the same to 0.01 s"),
+        (slice(None), 0.05, "fewer than two stamps"),
+        (slice(0, 1), 0.0, "single pose"),
+        ([0, 1, 2, 899], 0.0, "only 4 stamps in 90 s"),
+    ],
+)
+def test_files_of_other_clocks_are_refused(files, rows, shift, words):
+    truth = walk()
+    other = Trajectory(*(part[rows] for part in truth))
+    places = files(other._replace(time=other.time + shift), truth)
+    with pytest.raises(InputError, match=f"odometry.txt: .*{words}.*truth.txt"):
+        score_files(*places)
