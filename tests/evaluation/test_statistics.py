@@ -122,16 +122,6 @@ def test_the_interval_of_a_share_ends_where_shares_do():
     assert 85 < low < 91.5 < high < 98
 
 
-def test_a_difference_by_hand():
-    """Means over seeds 2, 2, 5 against 1.5 each: −0.5, −0.5, −3.5, of a standard error of 1."""
-    first = seeds_of([[1.0, 2.0, 6.0], [3.0, 2.0, 4.0]])
-    found = compare(seeds_of([[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]]), first, "ate", ALONE)
-    assert found.mean == pytest.approx(-1.5) and found.gain == pytest.approx(50.0)
-    reach = 4.30265  # t of two degrees of freedom
-    assert found.interval == pytest.approx((-1.5 - reach, -1.5 + reach), rel=1e-5)
-    assert (found.better, found.compared, found.sequences, found.groups) == (3, 3, 3, 3)
-
-
 def test_sequences_are_paired_by_name():
     """The second row lacks a sequence and has another: what both have is compared, in any order."""
     first, second = seeds_of([[9.0, 2.0, 4.0]]), seeds_of([[50.0, 2.0, 1.0]], "hcb")
@@ -142,15 +132,6 @@ def test_sequences_are_paired_by_name():
     assert found.interval == pytest.approx((-1.5 - 6.3531, -1.5 + 6.3531), rel=1e-4)
     found = compare(seeds_of([[1.0]], "h"), first, "ate", ALONE)
     assert (found.mean, found.gain, found.interval, found.compared) == (None, None, None, 0)
-
-
-def test_rows_that_diverged_in_other_sequences_are_no_better_than_each_other():
-    """Equal errors in every sequence that both finished."""
-    pair = seeds_of([[LOST, 2.0, 9.0, 4.0]]), seeds_of([[1.0, 2.0, LOST, 4.0]])
-    for first, second in (pair, pair[::-1]):
-        found = compare(second, first, "ate", ALONE)
-        assert (found.compared, found.sequences) == (2, 4)
-        assert found.gain == 0 and found.mean == 0 and found.interval == (0, 0)
 
 
 @pytest.mark.parametrize("seeds, metric", [(1, "ate"), (3, "ate"), (1, "waypoint_rms")])
@@ -195,4 +176,5 @@ def test_other_metrics_of_a_lost_estimate_are_in_no_difference():
     own = [{"a": measures(ate=LOST, rpe=0.1), "b": measures(ate=1.0, rpe=0.2)}]
     first = [{"a": measures(ate=1.0, rpe=0.5), "b": measures(ate=2.0, rpe=0.1)}]
     found = compare(own, first, "rpe", ALONE)
-    assert found.compared == 1 and found.mean == pytest.approx(0.1)
+    back = compare(first, own, "rpe", ALONE)
+    assert found.compared == back.compared == 1 and found.mean == pytest.approx(0.1) == -back.mean
