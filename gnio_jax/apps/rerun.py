@@ -16,7 +16,9 @@ from jaxtyping import Float
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation import Estimate, Recording, Trajectory
 from gnio_jax.evaluation.colours import AXES, BLUE, REFERENCE, SIGMAS
+from gnio_jax.evaluation.estimate import in_one_frame
 from gnio_jax.evaluation.report import file_names
+from gnio_jax.evaluation.trajectory import Alignment
 from gnio_jax.files import replacing
 from gnio_jax.filtering import Pose
 from gnio_jax.numerics import finite_rows, quaternion_from_matrix, xyzw_from_wxyz
@@ -41,20 +43,26 @@ def check(target: str | Path) -> None:
         raise InputError(OPTION, f"'{path}' is a folder", "name a file in it, NAME.rrd")
 
 
-def write(path: Path, sequences: list[tuple[Estimate, Recording]]) -> None:
-    """Write sequences as one recording of Rerun, whole or not at all: of each its estimate, in the
-    frame in which it is looked at with its reference, and the recording, whose IMU is shown.
+def write(
+    path: Path,
+    estimates: list[Estimate],
+    recordings: list[Recording],
+    alignment: Alignment | None = None,
+) -> None:
+    """Write sequences as one recording of Rerun, whole or not at all: of each its estimate and its
+    reference in one frame (`estimate.in_one_frame`), and the IMU.
 
     Each has a folder of its own, named as its files. Times are those from its start, s.
     """
     import rerun
 
-    stems = file_names([estimate.name for estimate, _ in sequences])
+    stems = file_names([each.name for each in estimates])
     with replacing(path) as temporary:
         log = rerun.RecordingStream("gnio-jax", recording_id="gnio")
         log.save(temporary)
         log.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for stem, (estimate, recording) in zip(stems, sequences, strict=True):
+        for stem, each, recording in zip(stems, estimates, recordings, strict=True):
+            estimate = in_one_frame(each, alignment)
             _log_paths(log, stem, estimate)
             time = estimate.trajectory.time - estimate.trajectory.time[0]
             found, filtered = estimate.displacements, estimate.filtered

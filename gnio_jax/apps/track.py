@@ -24,7 +24,6 @@ from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Recording, estimate, metrics, prepare, report
-from gnio_jax.evaluation.estimate import in_one_frame
 from gnio_jax.evaluation.prepare import ROUGH_START, measured_rows
 from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
@@ -159,7 +158,7 @@ def track(
         _write_figures(folder, found, summary, formats)
         _draw(folder, found, summary, config, command)
     if rerun_file is not None:
-        rerun.write(rerun_file, [(in_one_frame(found, alignment=None), ready[0])])
+        rerun.write(rerun_file, [found], ready)
     return Tracked(found, summary, out)
 
 

@@ -43,7 +43,6 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
     from gnio_jax import evaluation  # late: mistakes do not wait for JAX
     from gnio_jax.apps import rerun
     from gnio_jax.evaluation import tabulate
-    from gnio_jax.evaluation.estimate import in_one_frame
 
     if asked.rerun:
         rerun.check(asked.rerun)
@@ -53,8 +52,7 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
     console.say(tabulate.render(found.report))
     console.say(f"results: {found.folder}")
     if asked.rerun:
-        seen = [in_one_frame(each, asked.alignment) for each in found.estimates]
-        rerun.write(Path(asked.rerun), [*zip(seen, found.recordings, strict=True)])
+        rerun.write(Path(asked.rerun), found.estimates, found.recordings, asked.alignment)
         console.say(f"for Rerun: {asked.rerun}")
     if asked.plots:
         console.say(f"page: {found.folder / 'report.html'} (open it in a browser)")

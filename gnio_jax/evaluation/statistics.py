@@ -189,9 +189,3 @@ class Cell(NamedTuple):
     mean: Summary
     difference: Difference | None
     """To the first row; None for the first itself."""
-
-
-def of_seeds(found: list[float]) -> Summary:
-    """A figure that is not one of sequences, with each seed."""
-    mean = float(np.mean(found)) if found else None
-    return Summary(mean, found, None, None, 0, 0, 0, len(found))

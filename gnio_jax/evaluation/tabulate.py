@@ -319,7 +319,7 @@ def render(report: Report) -> Group:
         add(label, numbers({name: of.mean for name, of in report.summary(row).items()}), "italic")
         lost = lost + own
     how = "; ".join(f"{name}: {text}" for name, text in about(report.settings).items())
-    signs = "reference rows are means; – is not defined (metrics.json of an evaluation has the reason)"
+    signs = "reference rows are means; – is not defined (reasons: metrics.json of an evaluation)"
     warnings = [DIVERGED] if lost else []
     return Group(
         grid,

@@ -20,8 +20,8 @@ from gnio_jax import models
 from gnio_jax.config import TablesConfig, TrainConfig
 from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import statistics, tabulate
-from gnio_jax.evaluation.statistics import Cell
+from gnio_jax.evaluation import tabulate
+from gnio_jax.evaluation.statistics import Cell, Summary
 from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments
@@ -167,7 +167,12 @@ def _entropies(result: Result, split: str) -> Float[np.ndarray, "seeds 2"]:
 
 def _over_seeds(name: str, rows: list[Float[np.ndarray, "_"]]) -> dict[str, list[Cell]]:
     """A figure that belongs to this table alone, of each row with its seeds."""
-    return {name: [Cell(statistics.of_seeds(own.tolist()), None) for own in rows]}
+    means = [float(np.mean(own)) if len(own) else None for own in rows]
+    found = [
+        Summary(mean, own.tolist(), None, None, 0, 0, 0, len(own))
+        for mean, own in zip(means, rows, strict=True)
+    ]
+    return {name: [Cell(each, None) for each in found]}
 
 
 def figures_of(results: list[Result]) -> dict[str, list[Cell]]:

@@ -32,8 +32,7 @@ def test_the_file_is_read_back(tmp_path):
     covariance = np.array([[4.0, 1.5, 0.2], [1.5, 1.0, 0.1], [0.2, 0.1, 0.5]])
     walk = with_covariance(walk, np.tile(covariance, (400, 1, 1)))
     path = tmp_path / "walks.rrd"
-    logged = [(each, recording_of(each)) for each in (walk, blind)]
-    rerun.write(path, logged)
+    rerun.write(path, [walk, blind], [recording_of(walk), recording_of(blind)], "none")
     assert [each.name for each in tmp_path.iterdir()] == ["walks.rrd"]
     found = columns_of(path)
     assert "/blind/estimate" in found and "/blind/reference" not in found

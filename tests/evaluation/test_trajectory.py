@@ -16,7 +16,7 @@ from gnio_jax.evaluation.trajectory import (
     write_tum,
 )
 from gnio_jax.numerics import matrix_from_quaternion
-from tests.support.trajectories import PITCHES, lost, masked, moved_by, perturbed, quaternions, walk
+from tests.support.trajectories import lost, masked, moved_by, perturbed, walk
 
 
 def test_origin_undoes_a_yaw_and_a_shift():
