@@ -67,25 +67,14 @@ def test_what_the_estimator_gave_is_there_for_numpy(tmp_path, estimates):
     walk, summed = estimates[0], estimates[1]._replace(filtered=None, states=None)
     write(tmp_path, reported([walk, summed]), [walk, summed])
     first, second = (np.load(tmp_path / "states" / f"room_1_walk{end}.npz") for end in ("", "_"))
-    wanted = {
-        "time": walk.trajectory.time,
-        "position": walk.trajectory.position,
-        "orientation": walk.trajectory.orientation,
-        "displacement": walk.displacements.value,
-        "displacement_covariance": walk.displacements.covariance,
-        "gate": walk.displacements.diagnostics["gate"],
-        "position_covariance": walk.filtered.covariance,
-        "nis": walk.filtered.nis,
-        "accepted": walk.filtered.accepted,
-        "velocity": walk.states.velocity,
-        "gyro_bias": walk.states.gyro_bias,
-        "accel_bias": walk.states.accel_bias,
-        "std": walk.states.std,
-        "innovation": walk.states.innovation,
-    }
+    names = "time position orientation displacement displacement_covariance gate "
+    names += "position_covariance nis accepted velocity gyro_bias accel_bias std innovation"
+    found, gate = walk.displacements, walk.displacements.diagnostics["gate"]
+    values = [*walk.trajectory, found.value, found.covariance, gate, *walk.filtered, *walk.states]
+    wanted = dict(zip(names.split(), values, strict=True))
     assert set(first) == wanted.keys() and set(second) == {*list(wanted)[:6]}
-    for name, values in wanted.items():
-        np.testing.assert_array_equal(first[name], values)
+    for name, own in wanted.items():
+        np.testing.assert_array_equal(first[name], own)
 
 
 def test_trajectories_are_read_back_at_their_own_stamps(tmp_path, estimates, made):
