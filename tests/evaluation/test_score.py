@@ -57,6 +57,15 @@ def test_poses_are_matched_as_evo_matches_them(files, of_truth, of_estimate):
             assert own[name] == pytest.approx(statistics[theirs], rel=1e-6), (how, name)
 
 
+def test_of_two_poses_beside_one_of_the_reference_the_nearer_counts(files):
+    truth = walk()
+    near, far = (truth._replace(time=truth.time + late) for late in (0.003, -0.007))
+    wrong = far._replace(position=far.position + 1.0)
+    pairs = (np.stack(both, 1) for both in zip(wrong, near, strict=True))
+    estimate = Trajectory(*(each.reshape(-1, *each.shape[2:]) for each in pairs))
+    assert score_files(*files(truth, estimate), "none").scores["odometry"].values["ate"] < 1e-6
+
+
 def test_what_is_over_time_keeps_its_time(files):
     """A second has as many rows as the stamps say, also where poses are missing: a heading that is
     wrong throughout costs displacements nothing."""
