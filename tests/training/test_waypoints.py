@@ -155,6 +155,7 @@ def test_of_a_walk_with_waypoints_the_sum_has_these_in_the_place_of_poses():
     assert found(False, interpolated).total != other.total
 
 
+@pytest.mark.slow
 def test_a_run_learns_the_speed_of_surveyors_from_their_waypoints(tmp_path, monkeypatch):
     """The network starts by saying that nobody moves; the waypoints tell it that they do."""
     monkeypatch.setenv("GNIO_CACHE", str(tmp_path))
