@@ -53,7 +53,7 @@ def export(
         )
     known = trajectory.known & np.isfinite(trajectory.time)
     if not known.any():
-        raise InputError(path, "the trajectory has no pose", "the filter diverged at once")
+        raise InputError(path, "the trajectory has no pose", "it may have diverged at its start")
     poses = Trajectory(*(field[known] for field in trajectory))
     check(path, kind, poses.time)
     with replacing(path) as temporary:

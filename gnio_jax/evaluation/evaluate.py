@@ -150,7 +150,8 @@ def score_files(reference: Path, estimate: Path, alignment: Alignment = "origin"
         remedy = "give both the stamps of one clock, in s"
         raise InputError(estimate, f"{problem} as in {reference}", remedy) from None
     found = [Estimate(estimate.stem, path, truth)]
-    settings = {"dataset": estimate.name, "split": f"against {reference.name}"}
+    count = f"{np.isfinite(truth.position).all(axis=1).sum():,} poses"
+    settings = {"dataset": estimate.name, "split": f"against {count} of {reference.name}"}
     settings |= {"estimator": "given poses", "alignment": alignment}
     still = {"never_moves": score(never_moves(found), alignment)}
     groups = {estimate.stem: estimate.stem}

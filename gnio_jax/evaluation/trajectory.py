@@ -151,9 +151,10 @@ def paired(
     """Both at the stamps that they share, to `most` s: each pose of the reference with the nearest
     one of the estimate, as evo matches them.
 
-    The rows are a median step of the shared stamps apart. Where the reference has none it is NaN,
-    and the estimate stays where it was: it counts nowhere. Raises `Undefined` for fewer than two
-    shared stamps, or where they are scattered over more than a hundred times as many steps.
+    The rows are a median step of the shared stamps apart, or so many times less as no two of them
+    fall in one row. Where the reference has none it is NaN, and the estimate stays where it was: it
+    counts nowhere. Raises `Undefined` for fewer than two shared stamps, or where they are scattered
+    over more than a hundred times as many rows.
     """
     if len(reference.time) < 2:
         raise Undefined("the reference has a single pose")
@@ -166,16 +167,19 @@ def paired(
     if len(here) < 2:
         raise Undefined(f"fewer than two stamps are the same to {most:g} s")
     time = reference.time[there]
-    step = float(np.median(np.diff(time)))
-    rows, kept = np.unique(np.round((time - time[0]) / step).astype(int), return_index=True)
-    if rows[-1] > SCATTERED * len(rows):
-        raise Undefined(f"only {len(rows)} stamps in {time[-1] - time[0]:.0f} s are the same")
+    step, rows = 2 * float(np.median(np.diff(time))), np.zeros(len(time), int)
+    while (np.diff(rows) == 0).any():
+        step /= 2
+        rows = np.round((time - time[0]) / step).astype(int)
+        if rows[-1] > SCATTERED * len(rows):
+            span = f"{time[-1] - time[0]:.0f} s"
+            raise Undefined(f"only {len(rows)} stamps in {span}, unevenly spaced, are the same")
     shared = np.isin(np.arange(rows[-1] + 1), rows)
     clock = time[0] + step * np.arange(rows[-1] + 1)
     poses = [np.full((len(clock), width), np.nan) for width in (3, 4)]
     for part, given in zip(poses, reference[1:], strict=True):
-        part[rows] = given[there[kept]]
-    latest = here[kept][np.cumsum(shared) - 1]
+        part[rows] = given[there]
+    latest = here[np.cumsum(shared) - 1]
     ours = Trajectory(clock, estimate.position[latest], estimate.orientation[latest])
     return ours, Trajectory(clock, *poses)
 

@@ -152,14 +152,15 @@ def _squared_distance(position: Float[Array, "k 3"], count: int) -> Float[jax.Ar
 def waypoint_error(
     position: Float[Array, "k 3"], waypoint: Float[Array, "s 2"]
 ) -> Float[jax.Array, ""]:
-    """Mean square of the distances of a path from the waypoints, over the mean square of the
-    waypoints' distances from their mean and the floor: about 1 for a path that never moves.
+    """Squared distances of a path from the waypoints, over the squares of the waypoints' distances
+    from their mean and the floor, both summed: 0 for a path of the right shape.
 
     `position` is that at both ends of the k − 1 clone intervals, between which it is interpolated;
     `waypoint` has a row for each sample, NaN where there is none. The path is compared after the
     one rotation and shift of the plane that bring it nearest: how the filter's world lies on the
-    map is not known. A square d² counts as c² ln(1 + d²/c²), c = `FAR_OFF`, because somebody may
-    tap too early, too late or in the wrong place. 0 where there are fewer than two.
+    map is not known. A square d² above counts as c² ln(1 + d²/c²), c = `FAR_OFF`, because somebody
+    may tap too early, too late or in the wrong place; so a path that never moves has less than 1,
+    and the less the longer the walk. 0 where there are fewer than two.
     """
     samples = len(waypoint) // (len(position) - 1)
     share = (jnp.arange(samples) / samples)[None, :, None]

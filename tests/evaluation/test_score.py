@@ -66,6 +66,28 @@ def test_of_two_poses_beside_one_of_the_reference_the_nearer_counts(files):
     assert score_files(*files(truth, estimate), "none").scores["odometry"].values["ate"] < 1e-6
 
 
+def test_no_pose_is_lost_where_stamps_are_uneven(files):
+    """Every second pose lies 20 ms behind the one before it, and is a metre off."""
+    whole = walk()
+    time = np.stack([whole.time, whole.time + 0.02], 1).ravel()
+    truth = Trajectory(time, *(np.repeat(part, 2, axis=0) for part in whole[1:]))
+    off = np.tile([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], (len(whole.time), 1))
+    estimate = truth._replace(position=truth.position + off)
+    places = files(truth, estimate)
+    found = score_files(*places, "none")
+    assert found.scores["odometry"].values["ate"] == pytest.approx(np.sqrt(0.5), rel=1e-6)
+    assert f"{len(time):,} poses" in found.settings["split"]
+
+
+def test_the_path_is_whole_where_every_third_stamp_has_no_partner(files):
+    truth = walk()
+    kept = np.arange(len(truth.time)) % 3 > 0
+    estimate = Trajectory(*(part[kept] for part in truth))
+    found = score_files(*files(truth, estimate)).scores["odometry"].values
+    whole = score_files(*files(truth, truth)).scores["odometry"].values
+    assert found["path_length"] == pytest.approx(whole["path_length"], rel=0.01)
+
+
 def test_what_is_over_time_keeps_its_time(files):
     """A second has as many rows as the stamps say, also where poses are missing: a heading that is
     wrong throughout costs displacements nothing."""
@@ -84,7 +106,7 @@ def test_the_table_is_that_of_an_evaluation(files, capsys):
     told = capsys.readouterr().out
     ate = 0.02 * np.sqrt(np.mean(np.sum(truth.position[:, :2] ** 2, axis=1)))
     assert f" {ate:.2f} " in told and "1.02" in told and "never_moves" in told
-    assert "odometry.txt against truth.txt" in told and "none alignment" in told
+    assert "odometry.txt against 900 poses of truth.txt" in told and "none alignment" in told
 
 
 @pytest.mark.parametrize(
@@ -93,7 +115,7 @@ def test_the_table_is_that_of_an_evaluation(files, capsys):
         (slice(None), 1e4, "fewer than two stamps are the same to 0.01 s"),
         (slice(None), 0.05, "fewer than two stamps"),
         (slice(0, 1), 0.0, "single pose"),
-        ([0, 1, 2, 899], 0.0, "only 4 stamps in 90 s"),
+        ([0, 1, 2, 899], 0.0, "only 4 stamps in 90 s, unevenly spaced"),
     ],
 )
 def test_files_of_other_clocks_are_refused(files, rows, shift, words):

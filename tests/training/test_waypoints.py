@@ -69,15 +69,16 @@ def test_the_error_at_the_waypoints(seed):
     assert not slope[:, 2].any() and not np.asarray(slope)[[2, 3, 6, 9, 12]].any()
 
 
-def test_a_turned_and_shifted_path_is_right_and_one_that_never_moves_is_off_by_all():
+def test_a_turned_and_shifted_path_is_right_and_one_that_never_moves_is_not():
     position, waypoint, at = tapped_path()
     present = np.isfinite(waypoint).all(axis=1)
     right = waypoint.copy()
     right[present] = at @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + [5.0, 9.0]
     assert error_and_slope(position, right)[0] < 1e-25
-    still, slope = error_and_slope(np.zeros_like(position), 0.2 * waypoint)
-    spread = 0.04 * np.sum(waypoint[present].var(axis=0))
-    assert 0.6 * spread / (spread + 1) < still < spread / (spread + 1)
+    still, slope = error_and_slope(np.zeros_like(position), waypoint)
+    apart = np.sum((waypoint[present] - waypoint[present].mean(axis=0)) ** 2, axis=1)
+    counted = 1.5**2 * np.log(1 + apart / 1.5**2)
+    np.testing.assert_allclose(still, counted.mean() / (apart.mean() + 1), rtol=1e-12)
     assert np.isfinite(slope).all()
 
 
