@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.alignment.body import LONGEST_POSE_LAG, pose_lag
@@ -149,8 +150,8 @@ def read(path: Path) -> list[Sequence]:
     felt = table.axes("stencilAcc", "XYZ", gaps=True)[rows][known]
     if (measured := finite_rows(felt)).sum() < fewest:
         raise Refusal(path, f"columns 'stencilAcc' hold numbers in only {measured.sum()} rows")
-    gained = _mean_acceleration(time[known][measured], position[known][measured])
-    level = levelling(rig[measured].apply(felt[measured]).mean(axis=0) - gained)
+    force = rig[measured].apply(felt[measured])
+    level = levelling(_gravity(time[known][measured], force, position[known][measured]))
     if (tilt := float(np.degrees(level.magnitude()))) > MAX_TILT:
         problem = f"gravity by 'orient' and 'stencilAcc' is {tilt:.0f}° off the vertical"
         raise Refusal(path, problem)
@@ -187,16 +188,30 @@ def read(path: Path) -> list[Sequence]:
     return assemble(streams, RATE, divide=True, max_speed=FASTEST_WALKER)
 
 
-def _mean_acceleration(
-    time: Float[np.ndarray, " n"], position: Float[np.ndarray, "n 3"]
+def _gravity(
+    time: Float[np.ndarray, " n"], force: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "3"]:
-    """What the positions gain in speed between gaps over the time that it takes, m/s²."""
+    """The mean force in the map's world, less the mean acceleration of the positions, m/s².
+
+    Positions and twice integrated force part by a parabola. Its bend is the difference of two
+    speeds, of the first and the last of each unbroken run: medians over a second of what is gone
+    in a second, which no single pose can move.
+    """
+    mean, second = force.mean(axis=0), round(RATE)
     gained, seconds = np.zeros(3), 0.0
     for run in stretches(np.diff(time) > LONGEST_BRIDGE):
-        if run.stop - run.start > 2:
-            velocity = np.gradient(position[run], time[run], axis=0)
-            gained, seconds = gained + velocity[-1] - velocity[0], seconds + np.ptp(time[run])
-    return gained / max(seconds, 1.0)
+        if run.stop - run.start >= 3 * second:
+            then, apart = time[run], force[run] - mean
+            for _ in range(2):
+                apart = cumulative_trapezoid(apart, then, axis=0, initial=0.0)
+            apart = place[run] - apart
+            lasted = then[second:] - then[:-second]
+            speed = (apart[second:] - apart[:-second]) / lasted[:, None]
+            middle = then[:-second] + lasted / 2.0
+            first, last = slice(second), slice(-second, None)
+            gained += np.median(speed[last], axis=0) - np.median(speed[first], axis=0)
+            seconds += float(np.median(middle[last]) - np.median(middle[first]))
+    return mean - gained / max(seconds, 1.0)
 
 
 def _device(table: Table, time: Float[np.ndarray, " n"], rows: np.ndarray) -> Samples | None:

@@ -71,7 +71,20 @@ def unoriented(value):
     return change
 
 
-@pytest.mark.parametrize("trap", [disordered, wild, unoriented(np.nan), unoriented(0.0)])
+def thrown(row):
+    """One pose a metre off at an end, where the map is levelled by the speed."""
+
+    def change(table):
+        table.loc[table.index[row], "processedPosX"] += 1.0
+        return table
+
+    return change
+
+
+TRAPS = [disordered, wild, unoriented(np.nan), unoriented(0.0), thrown(0), thrown(-1)]
+
+
+@pytest.mark.parametrize("trap", TRAPS)
 def test_a_walk_with_traps_comes_back(tmp_path, trap):
     (sequence,) = idol.read(write(tmp_path, trap(frame())))
     compare(sequence)
