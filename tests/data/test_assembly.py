@@ -34,6 +34,27 @@ def tracked(stamps, **options):
     return Poses(stamps, walk.attitude(stamps), place, source="poses.csv", **options)
 
 
+def test_at_ten_hertz_jitter_is_no_hole():
+    """At 10.5 Hz two samples of a jittering clock lie more than 0.1 s apart half of the time."""
+    rng = np.random.default_rng(3)
+    time = np.arange(300) / 10.5 + rng.uniform(-0.02, 0.02, 300)
+    (sequence,) = assemble(known(time, time), 10.0)
+    assert sequence.imu_valid is None
+    holed = np.delete(time, np.s_[100:104])
+    (sequence,) = assemble(known(holed, holed), 10.0)
+    assert sequence.imu_valid is not None and 2 <= (~sequence.imu_valid).sum() <= 6
+
+
+def test_samples_on_the_clock_already_stay_to_the_bit():
+    time = np.round(5.0 + 0.99995 * np.arange(800) / 200.0, 6)  # a clock that is a little fast
+    streams = known(time, time, poses=tracked(time, velocity=walk.velocity(time)))
+    (sequence,) = assemble(streams, 200.0)
+    np.testing.assert_array_equal(sequence.gyro, streams.gyro.values)
+    np.testing.assert_array_equal(sequence.accel, streams.accel.values)
+    np.testing.assert_array_equal(sequence.position, walk.position(time))
+    np.testing.assert_array_equal(sequence.velocity, walk.velocity(time))
+
+
 def test_the_imu_beyond_the_poses_is_cut_away_unless_all_of_it_is_wanted():
     time = np.arange(2000) / 100.0
     streams = known(time, time, poses=tracked(np.arange(5.0, 15.0, 0.01)))

@@ -175,6 +175,9 @@ NO_GYRO = lines(lambda rows: [row for row in rows if "GYRO" not in row])
 MONTH = str(START)[:7], "1574999"
 LONG_NAME = once("stray line", 1.0, token="x" * 5000)
 THREE = "81205.0 0.1 0.2\n81205.1 0.1 0.2\n"
+ANOTHER_PHONE = lines(
+    lambda rows: [f"{float(row.split(' ')[0]) - 9e3:.4f} {row.partition(' ')[2]}" for row in rows]
+)
 TRUTH, YAML = "state_groundtruth_estimate0/data.csv", "sensor.yaml"
 PACKET = "data/0000000200.txt"
 
@@ -316,6 +319,13 @@ BAD = {
         ),
         ("timeAlignment.txt", written_as("later"), "holds 'later'", "seconds"),
         ("gyroscope.txt", written_as(THREE), "3 columns, expected 4"),
+        (
+            "accelerometer.txt",
+            ANOTHER_PHONE,
+            "(column 0) begins",
+            "s after the record",
+            "one phone",
+        ),
         ("accelerometer.txt", once("scale column", 0, 0, 1.03), "(column 0) ends 2.46e+03 s after"),
     ],
     "indoor_location": [
