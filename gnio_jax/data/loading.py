@@ -4,13 +4,14 @@ several processes), check them, and write them in the package's own form."""
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, wait
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -150,7 +151,11 @@ def _read_all(recordings: list[Recording], workers: int, progress: Progress) -> 
     for recording in recordings:
         if id(recording) in sent and not died:
             try:
-                yield next(readings)
+                reading = next(readings)
+                if reading.damage is not None:  # an error of an item: nothing follows it
+                    with suppress(InputError):
+                        readings.throw(reading.damage)
+                yield reading
                 continue
             except ProcessDied:  # this process reads what is left
                 died = True
@@ -216,40 +221,49 @@ def in_processes(
     items: list[tuple],
     workers: int | None,
     progress: Progress = lambda share: None,
-) -> Iterator[Result]:
+) -> Generator[Result, None, None]:
     """`function(*item)` for every item, in their order, by `workers` processes; 1 starts none, and
-    None asks for as many as are worth starting.
+    None asks for as many as are worth starting. A process that may have no children does it itself.
 
     At most `workers` + 2 results are under way or wait, so that memory stays bounded. `progress` is
     told the share that is finished. Function and items must survive pickling when there is more
-    than one process. Raises `ProcessDied`.
+    than one process. After an error of an item those under way end first, for what they write is
+    to be whole; Ctrl-C and a caller that stops early end them at once. Raises `ProcessDied`.
     """
     if workers is None:
         workers = usable_cores() if len(items) > FEW else 1
     workers = min(workers, len(items))
-    if workers <= 1:
+    if workers <= 1 or multiprocessing.current_process().daemon:
         for number, item in enumerate(items, 1):
             result = function(*item)
             progress(number / len(items))
             yield result
         return
-    from loky import ProcessPoolExecutor  # it takes a fifth of a second to import
+    from loky.process_executor import (  # it takes a fifth of a second to import
+        ProcessPoolExecutor,
+        TerminatedWorkerError,
+    )
 
+    # A process that has grown is replaced, with the same results: nothing that a user could mend.
+    warnings.filterwarnings("ignore", "A worker was restarted", UserWarning, "loky")
     # Python's own pool can wait for ever for a process that died while another one started. Ctrl-C
     # is this process's to answer.
     ignore = (signal.SIGINT, signal.SIG_IGN)
     pool = ProcessPoolExecutor(workers, initializer=signal.signal, initargs=ignore)
+    left, waiting = iter(items), deque[Future[Result]]()
     try:
-        left, waiting = iter(items), deque[Future[Result]]()
         for number in range(1, len(items) + 1):
             new = islice(left, workers + 2 - len(waiting))
             waiting.extend(pool.submit(function, *item) for item in new)
             result = waiting.popleft().result()
             progress(number / len(items))
             yield result
-    except BrokenProcessPool:
+    except TerminatedWorkerError:
         problem = "a process died, perhaps because memory ran out"
         raise ProcessDied("--workers", problem, "try --workers 1") from None
+    except Exception:
+        wait(waiting)
+        raise
     finally:
         pool.shutdown(wait=False, kill_workers=True)
 

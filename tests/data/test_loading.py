@@ -7,7 +7,9 @@ import dataclasses
 import multiprocessing
 import operator
 import os
+import time
 import warnings
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +28,7 @@ from gnio_jax.data.loading import (
 )
 from gnio_jax.data.readers import DATASETS
 from gnio_jax.errors import InputError
+from gnio_jax.files import replacing
 from tests.support.circle import circle
 
 
@@ -258,6 +261,80 @@ def test_what_a_dead_process_left_is_read_here(tmp_path):
         warnings.simplefilter("always")
         found = list(read_split(dataset(*recordings), tmp_path, "test", workers=2))
     assert [sequence.name for sequence in found] == ["a", "b", "c"] and not caught
+
+
+def write_slowly(folder, name):
+    with replacing(folder / name) as temporary:
+        time.sleep(1.5)
+        temporary.write_text("whole")
+    return walk(name)
+
+
+def damaged_meanwhile(folder, name):
+    """Is found to be ruined while another process writes."""
+    until = time.monotonic() + 60.0
+    while not any(folder.iterdir()) and time.monotonic() < until:
+        time.sleep(0.01)
+    return walk(name, damage="field 'time' is ruined")
+
+
+def test_an_error_leaves_no_file_of_another_half_written(tmp_path):
+    (folder := tmp_path / "written").mkdir()
+    recordings = [single("a", damaged_meanwhile, folder, "a")]
+    recordings += [single(name, write_slowly, folder, name) for name in "bc"]
+    recordings = [each._replace(slow=True, files=(tmp_path / each.name,)) for each in recordings]
+    with pytest.raises(InputError, match="is ruined"):
+        list(read_split(dataset(*recordings), tmp_path, "test", workers=2))
+    left = {path.name for path in folder.iterdir()}
+    assert "b" in left <= {"b", "c"}
+
+
+def test_who_stops_early_does_not_wait():
+    results = in_processes(time.sleep, [(0.0,), (60.0,)], 2)
+    next(results)
+    begun = time.monotonic()
+    results.close()
+    assert time.monotonic() - begun < 30.0
+
+
+def grow(number, kept=[]):
+    """Grow by more than a process may, at bounds that no memory is needed for."""
+    from loky import process_executor as bounds
+
+    assert bounds._MAX_MEMORY_LEAK_SIZE > 1e6 and bounds._MEMORY_LEAK_CHECK_DELAY > 0
+    bounds._MAX_MEMORY_LEAK_SIZE, bounds._MEMORY_LEAK_CHECK_DELAY = 2e6, 0.01
+    kept.append(b"x" * 20_000_000)
+    time.sleep(0.05)
+    return number, os.getpid()
+
+
+def test_a_process_that_grows_is_replaced_without_a_word():
+    pytest.importorskip("psutil")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        numbers, processes = zip(*in_processes(grow, [(k,) for k in range(8)], 2), strict=True)
+    assert numbers == tuple(range(8)) and len(set(processes)) > 2 and not caught
+
+
+class Unpicklable(Exception):
+    def __init__(self, field, problem):
+        super().__init__(f"{field} {problem}")
+
+
+def fail_unpicklably(number):
+    raise Unpicklable("time", "is ruined")
+
+
+def test_an_error_that_does_not_unpickle_is_no_dead_process():
+    with pytest.raises(BrokenProcessPool) as caught:
+        list(in_processes(fail_unpicklably, [(0,), (1,)], 2))
+    assert "Unpicklable" in str(caught.value.__cause__)
+
+
+def test_a_process_that_may_have_no_children_does_the_work_itself(monkeypatch):
+    config = multiprocessing.current_process()._config  # as of a child with daemon=True
+    monkeypatch.setitem(config, "daemon", True)
+    assert list(in_processes(os.getpid, [(), ()], 2)) == [os.getpid()] * 2
 
 
 # --- the cache
