@@ -308,6 +308,7 @@ def grow(number, kept=[]):
     return number, os.getpid()
 
 
+@pytest.mark.slow
 def test_a_process_that_grows_is_replaced_without_a_word():
     pytest.importorskip("psutil")
     with warnings.catch_warnings(record=True) as caught:
@@ -325,6 +326,7 @@ def fail_unpicklably(number):
     raise Unpicklable("time", "is ruined")
 
 
+@pytest.mark.slow
 def test_an_error_that_does_not_unpickle_is_no_dead_process():
     with pytest.raises(BrokenProcessPool) as caught:
         list(in_processes(fail_unpicklably, [(0,), (1,)], 2))
