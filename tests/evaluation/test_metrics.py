@@ -133,6 +133,11 @@ def test_path_length_of_a_scaled_circle_and_of_noise():
     assert metrics.path_length(circle, STEP) == pytest.approx(length, rel=1e-12)
     holes = circle.copy()
     holes[300:400] = np.nan
+    # The chord across ten seconds is no way that anybody was seen to walk.
+    assert metrics.path_length(holes, STEP) == pytest.approx(109 / 120 * length, rel=1e-12)
+    scattered = circle.copy()
+    scattered[::10] = np.nan
+    assert metrics.path_length(scattered, STEP) == pytest.approx(length, rel=0.01)
     for scale, reference in ((0.8, circle), (0.0, circle), (0.8, holes)):
         found = metrics.path_length_ratio(circle * scale, reference, STEP)
         assert found == pytest.approx(scale)
