@@ -10,8 +10,7 @@ from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
 from gnio_jax.config.schema import UNNAMED, NewFile, Rate
 from gnio_jax.errors import InputError
-
-HDF5 = (".h5", ".hdf5")
+from gnio_jax.files import HDF5
 
 
 @dataclass(frozen=True)

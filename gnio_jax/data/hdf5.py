@@ -25,8 +25,6 @@ from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
 from gnio_jax.types import Sequence, Waypoints
 
-HDF5 = (".h5", ".hdf5")
-"""Endings of the package's own files."""
 _FORMAT = "gnio-jax sequence 1"
 _OPTIONAL_FIELDS = ("device_orientation", "imu_valid")
 _FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")

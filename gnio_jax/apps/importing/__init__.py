@@ -29,13 +29,14 @@ from gnio_jax.apps.importing.recording import (
     table_layout,
 )
 from gnio_jax.config import ImportOptions
-from gnio_jax.data.hdf5 import HDF5, read_hdf5, write_hdf5
+from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, seconds, time_unit
 from gnio_jax.data.parsing.tables import Table
 from gnio_jax.data.readers import euroc
 from gnio_jax.data.readers.csv_files import ACCEL, GYRO, check_columns, reference
 from gnio_jax.data.reference import SHORTEST_RUN
 from gnio_jax.errors import InputError
+from gnio_jax.files import HDF5
 from gnio_jax.types import Sequence
 
 NOTHING_STATED = ImportOptions()

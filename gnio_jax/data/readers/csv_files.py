@@ -21,13 +21,14 @@ from jaxtyping import Float
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
-from gnio_jax.data.hdf5 import HDF5, read_hdf5
+from gnio_jax.data.hdf5 import read_hdf5
 from gnio_jax.data.parsing.stamps import check_seconds, rounded_rate
 from gnio_jax.data.parsing.tables import Table, read_text, shortened
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.splits import listed
 from gnio_jax.data.validation import check_gaps, check_increasing
 from gnio_jax.errors import InputError
+from gnio_jax.files import HDF5
 from gnio_jax.numerics import finite_rows, quaternions
 from gnio_jax.types import Sequence
 
