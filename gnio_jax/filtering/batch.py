@@ -1,4 +1,4 @@
-"""Many sequences at once: batches of like lengths, vmapped, and shared out among the devices of all
+"""Many sequences at once: batches of similar lengths, vmapped, and divided among the devices of all
 processes."""
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ class Batch(NamedTuple):
     """Recordings that are filtered side by side."""
 
     members: list[int]
-    """Which; the last one repeated where they do not fill the batch."""
+    """Numbers of the recordings; the last one is repeated where they do not fill the batch."""
     intervals: int
-    """Clone intervals that all are padded to."""
+    """Number of clone intervals to which all are padded."""
 
 
 def batches(intervals: Sequence[int], size: int, padded: Callable[[int], int]) -> list[Batch]:
-    """Batches of recordings of like lengths, which need little padding, the longest first.
+    """Batches of recordings of similar lengths, which need little padding, the longest first.
 
     intervals: length of each recording in clone intervals; `padded` gives the length of a batch
-    from that of its longest member. It should know few lengths: each is a compilation. All batches
-    have `size` members.
+    from that of its longest member. It should return few different lengths, because each is a
+    compilation. All batches have `size` members.
     """
     longest_first = sorted(range(len(intervals)), key=lambda i: -intervals[i])
     parts = [longest_first[i : i + size] for i in range(0, len(intervals), size)]
@@ -47,8 +47,8 @@ def padded_signals(
 ) -> tuple[Float[np.ndarray, "b n 3"], Float[np.ndarray, "b n 3"]]:
     """Gyro and accel of recordings, each with `samples` rows.
 
-    What is appended comes after the recording and changes nothing before it: no rotation, and the
-    last specific force.
+    The rows that are appended have no rotation and the last specific force. They come after the
+    recording and change nothing before it.
     """
     gyro, accel = zip(*recordings, strict=True)
     turns = [filled_up(each[:samples], samples, 0.0) for each in gyro]
@@ -58,8 +58,8 @@ def padded_signals(
 def padded_masks(
     masks: Iterable[Bool[np.ndarray, "m"] | None], samples: int
 ) -> Bool[np.ndarray, "b n"] | None:
-    """Which samples of recordings are there, as `run_filter` takes it, each mask with `samples`
-    rows; None where no recording lacks any. What is appended lacks none."""
+    """The masks `imu_valid` of `run_filter` for recordings, each with `samples` rows; None where no
+    recording lacks a sample. Rows that are appended are valid."""
     masks = list(masks)
     if all(mask is None for mask in masks):
         return None
@@ -71,18 +71,18 @@ def padded_masks(
 
 
 def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[..., T]:
-    """`jax.vmap(function)` whose sequences are shared out among all devices of all processes. It is
-    to be jitted, and is differentiable like it.
+    """`jax.vmap(function)` whose sequences are divided among all devices of all processes. The
+    result should be jitted, and it is differentiable.
 
     The first `shared` arguments (parameters, noise) are the same for every sequence; the leaves of
     all others, and of the result, have the sequences as their leading axis. A number of sequences
     that does not divide evenly is filled up with the last one, whose additional results are
-    dropped. With one device it is `jax.vmap`, and for a device that has one sequence the function
+    dropped. With one device it is `jax.vmap`. On a device with one sequence it is the function
     itself. JAX refuses arguments that are bound to a device by `jax.device_put(x, device)`
     (ValueError). In several processes (`jax.distributed`) each of them gives all sequences, and
     `parallel.on_host` gives each of them all results.
 
-    On a machine without a GPU JAX sees one device however many cores there are, and the filter's
+    On a machine without a GPU JAX sees one device, whatever the number of cores, and the filter's
     operations are too small for XLA to split each among cores: call `cores_as_devices` first.
     """
 
@@ -90,8 +90,8 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
         own = arguments[shared:]
         if jax.tree.leaves(own)[0].shape[0] > 1:
             return jax.vmap(function, in_axes=(None,) * shared + (0,) * len(own))(*arguments)
-        # A walk of its own is traced in half of vmap's time, and the network runs only where there
-        # is a window: vmap would take both branches.
+        # A single walk without vmap is traced in half the time, and the network runs only where
+        # there is a window: vmap would take both branches.
         only = jax.tree.map(lambda leaf: leaf[0], own)
         found = function(*arguments[:shared], *only)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], found)
@@ -99,7 +99,7 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
     def mapped(*arguments: object) -> T:
         own = arguments[shared:]
         count = jax.tree.leaves(own)[0].shape[0]
-        # Every process takes part, also where there are fewer sequences than devices.
+        # Every process takes part, even if there are fewer sequences than devices.
         devices = jax.devices() if jax.process_count() > 1 else jax.devices()[:count]
         if len(devices) == 1:
             return batched(*arguments)
@@ -124,7 +124,7 @@ def cores_as_devices() -> None:
     """Let JAX see every core that this process may use as a device of its own, unless a number of
     CPU devices is set already.
 
-    Programs that do not spread anything go on running on the first device, with all cores. Raises
-    RuntimeError after JAX's first computation, when their number can no longer change.
+    Programs that are not divided among devices still run on the first device, with all cores.
+    Raises RuntimeError after JAX's first computation, when their number can no longer change.
     """
     cpu_devices(usable_cores())

@@ -1,7 +1,7 @@
-"""What the filter's public functions refuse, each with a `ValueError` that names the argument, and
-the arguments of a run in one precision.
+"""Checks of the arguments of the filter's public functions, each with a `ValueError` that names the
+argument, and conversion of the arguments of a run to one precision.
 
-Values are only known outside `jax.jit`. Inside it shapes and precisions are checked alone, and
+Values are only known outside `jax.jit`. Inside it only shapes and precisions are checked, and
 `FilterHistory.healthy` reports bad values.
 """
 
@@ -33,9 +33,9 @@ class Inputs(NamedTuple):
     accel: Array
     """(K·n, 3), m/s²."""
     imu_valid: Array | None
-    """(K·n,) booleans: which samples are there; None: the stream is complete."""
+    """(K·n,) booleans: which samples are present; None: the stream is complete."""
     measurements: tuple[Any, ...]
-    """Trees of arrays that lead with K."""
+    """Trees of arrays whose leading axis is K."""
     noise: NoiseModel
 
 
@@ -86,7 +86,7 @@ def check_rows(
 
 
 def check_rotation(name: str, value: jax.Array) -> None:
-    """Refuse what is no rotation matrix, to what rounding and text files leave of one."""
+    """Refuse what is no rotation matrix up to the rounding of text files."""
     if not isinstance(value, Tracer):
         matrix = np.asarray(value, np.float64)
         if not (np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-3 and np.linalg.det(matrix) > 0):
@@ -124,8 +124,8 @@ def checked_inputs(
     config: FilterConfig,
     noise: NoiseModel,
 ) -> Inputs:
-    """What every run takes, checked and in the state's precision. The values of the caller's own
-    measurements are not checked: NaN is no measurement."""
+    """The arguments that every run takes, checked and in the state's precision. The values of the
+    caller's own measurements are not checked: NaN is no measurement."""
     state = checked_state(state, config, noise)
     dtype, n = state.offset.dtype, config.samples_per_clone
     samples = jnp.shape(gyro)[0] if jnp.ndim(gyro) else 0
@@ -139,7 +139,8 @@ def checked_inputs(
             raise ValueError(f"imu_valid: must be booleans, found {imu_valid.dtype}")
 
     def checked_signal(name: str, value: Any, largest: float, unit: str) -> jax.Array:
-        """Finite where there is no mask, and what an IMU can measure where a sample is there."""
+        """The signal, which must be finite if there is no mask, and within the range of an IMU
+        where a sample is present."""
         value = checked_array(name, value, (samples, 3), config, finite=imu_valid is None)
         if not isinstance(imu_valid, Tracer):
             there = True if imu_valid is None else np.asarray(imu_valid)
@@ -168,7 +169,7 @@ def checked_noise(noise: NoiseModel, dtype: Any) -> NoiseModel:
 
 
 def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -> FilterState:
-    """`state` in one precision, with the shapes that `config` and `noise` want.
+    """`state` in one precision, with the shapes that `config` and `noise` need.
 
     A state without a temporally correlated error gets one where `noise` has one.
     """

@@ -1,21 +1,21 @@
 """Errors that are reported in the covariance without being estimated (ours; consider covariance
 analysis, after Schmidt: Tapley, Schutz and Born 2004, ch. 6).
 
-A filter that estimates every error it may have can do worse than one that leaves some out: a
-displacement of uncertain heading corrects the yaw with its own error. But a covariance P that
-leaves them out is too small. With c the errors that are left out, constant over a recording,
-E[c cᵀ] = C, and S = ∂x̂/∂c the sensitivity of the estimate x̂, the covariance of its error is
+A filter that estimates every possible error can be less accurate than one that omits some: a
+displacement of uncertain heading corrects the yaw with its own error. But a covariance P that omits
+these errors is too small. Let c be the omitted errors, constant over a recording, with E[c cᵀ] = C,
+and let S = ∂x̂/∂c be the sensitivity of the estimate x̂. The covariance of its error is then
 
     P + S C Sᵀ.
 
-The estimate, its gains and its innovations are as before. c is the bias that the gyro has beside
-its first estimate (3, rad/s), and an error of all displacements u of a walk (ours):
+The estimate, its gains and its innovations do not change. c has the error of the first gyro bias
+(3, rad/s) and an error of all displacements u of a walk (ours):
 
     d = exp(s) Rz(ψ) u + γ |u_xy| e_z,
 
-with the logarithm s of their scale, their heading ψ (rad) and their slope γ. S is the derivative of
-the whole estimator, taken forward through every update that it made: of a run (`sensitivity`), or
-from clone step to clone step as it goes (`step_with_tangents`).
+with the logarithm s of their scale, their heading ψ (rad) and their slope γ. S is the forward-mode
+derivative of the whole estimator, through every update that it made: of a whole run
+(`sensitivity`), or step by step while the filter runs (`step_with_tangents`).
 """
 
 from __future__ import annotations
@@ -44,14 +44,15 @@ ENTRIES = 6
 OF_BIAS, OF_SCALE, OF_HEADING, OF_SLOPE = slice(0, 3), 3, 4, 5
 """Where the gyro's bias, s, ψ and γ lie in c."""
 STILL = 1e-6
-"""Added in squares to the length of a displacement, m: standing still is no singular point."""
+"""Added in quadrature to the length of a displacement, m, so that standing still is no singular
+point."""
 
 
 def considered_covariance(
     sensitivity: Float[Array, "k d 6"], std: ConsideredStd
 ) -> Float[jax.Array, "k d d"]:
-    """S C Sᵀ, to be added to P; of as many rows of S as are given. Raises `ValueError` for a
-    standard deviation that is negative or not finite."""
+    """S C Sᵀ, to be added to P, for the given rows of S. Raises `ValueError` for a standard
+    deviation that is negative or not finite."""
     check_numbers("considered", std)
     bias, *others = std
     each = jnp.stack([jnp.asarray(value) for value in (bias, bias, bias, *others)])
@@ -73,12 +74,12 @@ def sensitivity(
     state: FilterState,
     displacement: Float[Array, "k 3"],
 ) -> Float[jax.Array, "k 15 6"]:
-    """S of θ, v, p, b_g, b_a after each clone interval of `run(state, displacement)`: a function
-    from the start and the displacements, m, to the history of `run_filter` or `smooth`.
+    """S of θ, v, p, b_g, b_a after each clone interval of `run(state, displacement)`. `run` is a
+    function from the start and the displacements, m, to the history of `run_filter` or `smooth`.
 
-    For a run of `run_odometry` the displacements are those of its history, so the network is not
-    called again, and that other biases would have changed its windows a little is left out. `run`
-    must not cut its gradient (`FilterConfig.truncate_every`): S is of the whole run.
+    For a run of `run_odometry` the displacements are those of its history. The network is not
+    called again, and the small effect of other biases on its windows is neglected. `run` must not
+    cut its gradient (`FilterConfig.truncate_every`), because S is the derivative of the whole run.
     """
 
     def means(c: Float[Array, "6"]) -> tuple[Mean, Array]:
@@ -92,8 +93,8 @@ def sensitivity(
 
 
 def _of_error(rotation: Float[Array, "k 3 3"], derivatives: Mean) -> Float[jax.Array, "k 15 6"]:
-    """S of θ, v, p, b_g, b_a from the derivatives of estimates by c, its 6 entries last, where the
-    rotations are `rotation`."""
+    """S of θ, v, p, b_g, b_a from the derivatives of the estimates by c, whose 6 entries are the
+    last axis. `rotation` has the estimated rotations."""
     of_rotation, *others = derivatives
     # The change of R by a small turn θ in the world is [θ]× R.
     turn = jnp.einsum("kilc,kjl->kijc", of_rotation, rotation)
@@ -105,12 +106,12 @@ def _of_error(rotation: Float[Array, "k 3 3"], derivatives: Mean) -> Float[jax.A
 # ------------------------------------------------------------------------------------------------
 
 Tangents = FilterState
-"""∂x/∂c for each array x of floating numbers of a state, the 6 entries of c leading; None for the
-others, which count, decide or remember."""
+"""∂x/∂c for each floating-point array x of a state, with the 6 entries of c as the leading axis;
+None for all other arrays (counters, decisions, memories)."""
 
 
 def start_tangents(state: FilterState) -> Tangents:
-    """At the start c is nothing but a bias of the gyro."""
+    """The tangents at the start, where only the gyro's bias depends on c."""
     zeros = jax.tree.map(
         lambda leaf: jnp.zeros((ENTRIES, *leaf.shape), leaf.dtype), _floating(state)
     )
@@ -125,9 +126,9 @@ def step_with_tangents(
 ) -> tuple[FilterState, T, Tangents]:
     """One clone step by `step`, and the tangents after it.
 
-    What `measure` gives is held: c disturbs it as a displacement, but the network is called once,
-    and not differentiated. After K steps S is that of `sensitivity` at the end of the run, to
-    rounding.
+    The result of `measure` is held fixed: c disturbs it as a displacement, but the network is
+    called once and is not differentiated. After K steps S is that of `sensitivity` at the end of
+    the run, to rounding.
     """
 
     def moved(floating: Tangents, c: Float[Array, "6"]) -> tuple[Tangents, tuple[FilterState, T]]:
@@ -152,7 +153,7 @@ def step_with_tangents(
         _, after, found = jax.jvp(moved, point, (tangent, direction), has_aux=True)
         return after, found
 
-    # Only the tangents are mapped over: the step itself is made once.
+    # vmap runs over the tangents only: the step itself is computed once.
     after, (state, found) = jax.vmap(along, out_axes=(0, None))(tangents, every_entry)
     return state, found, after
 
@@ -164,7 +165,7 @@ def core_sensitivity(mean: Mean, tangents: Tangents) -> Float[jax.Array, "15 6"]
 
 
 def _floating(state: FilterState) -> Any:
-    """The state without what is no floating number."""
+    """The state without its arrays that are not floating-point."""
     return jax.tree.map(
         lambda leaf: leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else None, state
     )

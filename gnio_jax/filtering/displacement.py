@@ -1,18 +1,18 @@
 """The displacement between the oldest and the newest clone as a measurement (paper §III-G, after
 TLIO).
 
-Windows overlap, so the errors of neighbours are alike, and white noise cannot express that. Where
-`NoiseModel.correlation` is given (ours), with u the true displacement in the yaw frame of the
-window and Σ = L Lᵀ the network's covariance,
+Windows overlap, so the errors of successive windows are correlated, which white noise cannot
+express. If `NoiseModel.correlation` is given (ours), the model is, with the true displacement u in
+the yaw frame of the window and the network's covariance Σ = L Lᵀ,
 
     d = u + L (c b + √(1 − c²) w),   w ~ N(0, I) white,
 
-where b (3) is a first-order Gauss–Markov process of variance 1 and time constant τ, three more
-entries of the state. The covariance of each measurement alone stays Σ, but the information of an
-average of them is bounded. If the error of a window were the sum of independent errors of its W
-strides, its correlation would fall linearly to zero at the window's length; the exponential with
-half that length for τ has the same integral, and so the same error of a long sum, for three entries
-in the place of 3 W.
+where b (3) is a first-order Gauss–Markov process of variance 1 and time constant τ, which adds
+three entries to the state. The covariance of each single measurement remains Σ, but the information
+of their average is bounded. If the error of a window were the sum of independent errors of its W
+strides, its correlation would fall linearly to zero at the window's length; the exponential with τ
+equal to half that length has the same integral, and so the same error of a long sum, with three
+entries in the place of 3 W.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ from gnio_jax.filtering.update import (
 from gnio_jax.types import Array
 
 LEAST_WEIGHT = 1e-6
-"""Smallest weight of a measurement behind a gate with a slope: its covariance grows no further."""
+"""Smallest weight of a measurement behind a gate with a slope, so that its covariance is
+bounded."""
 GIMBAL = 1e-5
 """Below this |cos pitch| the yaw of the oldest clone has no derivative, and a displacement that is
 expressed in a given frame is not used."""
@@ -54,15 +55,16 @@ expressed in a given frame is not used."""
 @dataclass(frozen=True)
 class Displacement:
     """Displacement from the oldest to the newest clone, expressed in the yaw frame of the oldest,
-    or K of them. Finite also where there is none."""
+    or K of them. The numbers are finite even where there is none."""
 
     displacement: Float[Array, "*k 3"]
     """m"""
     covariance: Float[Array, "*k 3 3"]
-    """After scaling, m²; positive definite also where there is none."""
+    """Covariance after scaling, m²; positive definite even where there is no displacement."""
     present: Bool[Array, "*k"]
     frame: YawFrame = field(metadata={"static": True})
-    """Whose attitude of the oldest clone defines the yaw frame: see `FilterConfig`."""
+    """The yaw frame: by the filter's own attitude of the oldest clone, or by another one
+    (`YawFrame`)."""
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """Nothing changes without a measurement, before the ring is full, at gimbal lock, or where
@@ -81,7 +83,7 @@ class Displacement:
             factor = jnp.where(failed, config.mahalanobis_fail_scale, 1.0).astype(weight.dtype)
         elif config.gate_softness > 0:
             factor = 1 / jnp.clip(jnp.where(tested, weight, 1.0), LEAST_WEIGHT)
-        if factor is not None:  # applied all the same
+        if factor is not None:  # applied with a larger covariance
             weaker = linear._replace(covariance=linear.covariance + (factor - 1) * self.covariance)
             _, correction = project(state, weaker, step.oldest)
             accepted = tested
@@ -96,8 +98,8 @@ def scaled_displacement(
     frame: YawFrame,
 ) -> Displacement:
     """A displacement, m, with its covariance, m², scaled by `measurement_scale` and `std_factor`,
-    or K of them. A NaN in either is no measurement; it is kept out of the arithmetic, or the
-    derivatives would be NaN too."""
+    or K of them. A NaN in either means that there is no measurement. NaN is kept out of the
+    arithmetic, because otherwise the derivatives would be NaN too."""
     dtype, shape = covariance.dtype, covariance.shape
     finite = jnp.isfinite(covariance).all((-2, -1))
     present = jnp.isfinite(displacement).all(-1) & finite
@@ -121,17 +123,16 @@ def linearise_displacement(
     its Jacobian is defined (no gimbal lock).
 
     H[p_j − p_i] = R_γᵀ, and H[θ_i] = R_γᵀ hat(p_j − p_i) e_z hᵀ: only the yaw of R_i matters, and h
-    is how it depends on δθ. Where d is expressed in a given frame, it is TLIO's
-    h = (cos y tan q, sin y tan q, 1) with the yaw y and the pitch q of R_i = Rz(y) Ry(q) Rx. At
-    gimbal lock tan q is taken as 0.
+    is its derivative by δθ. For d in a given frame it is TLIO's h = (cos y tan q, sin y tan q, 1)
+    with the yaw y and the pitch q of R_i = Rz(y) Ry(q) Rx. At gimbal lock tan q is taken as 0.
 
     In the filter's own frame h = (0, 0, 1) (ours). The window is cut with the yaw of the estimate
     R̂_i = exp(−δθ) R_i, and the network answers in that frame. If it is equivariant to yaw and a
-    small tilt changes nothing, d = R_γ(R̂_i)ᵀ exp(−δθ_z e_z) (p_j − p_i): however the error turns
-    the frame, it turns d and the prediction alike, and only δθ_z is left in r. The yaw is not
+    small tilt changes nothing, d = R_γ(R̂_i)ᵀ exp(−δθ_z e_z) (p_j − p_i): an error of the frame
+    turns d and the prediction by the same angle, and only δθ_z remains in r. The yaw is not
     differentiated, so there is no gimbal lock.
 
-    With a correlation of share c, c L b of the error is predicted, and R = (1 − c²) Σ.
+    With a correlation of share c, the part c L b of the error is predicted, and R = (1 − c²) Σ.
     """
     rotation = state.clone_rotation[step.oldest]
     to_yaw_frame = geometry.yaw_rotation(rotation).T
@@ -165,7 +166,7 @@ def displacements(
     """Displacements of a known trajectory as `run_filter` takes them, m, e.g. of a reference.
 
     rotation (K + 1, 3, 3) body → world and position (K + 1, 3), m, are those at the start and at
-    the end of each clone interval, every n-th row of a reference at the rate of the IMU. Row k of
+    the end of each clone interval: every n-th row of a reference at the rate of the IMU. Row k of
     the K rows is from clone k − W to clone k, the rows k + 1 − W and k + 1 of the trajectory,
     expressed in the yaw frame of clone k − W; NaN for k < W, before there are W + 1 clones.
     """
@@ -186,8 +187,8 @@ def displacements(
 def gate_activity(
     memory: GateState, config: FilterConfig, now: Array
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether the gate judges at sample `now`, and whether it would but for a last success that is
-    too old."""
+    """Whether the gate is active at sample `now`, and whether it would be active if the last
+    success were not too old."""
     ready = memory.converged & (now >= memory.pause_end)
     old = now - memory.last_success > config.whole_samples(config.success_seconds)
     stale = ready & (memory.last_success >= 0) & old
@@ -204,11 +205,11 @@ def innovation_gate(
     """The gate's memory after clone interval `step`, counted from 1, and the weight of its
     measurement: 1 if it passes as it is and 0 if not.
 
-    Where no measurement is `tested`, an earlier last success moves along (ours): absence is not
-    staleness, or the first second after any hole would pass unchecked. TLIO has a measurement at
-    every clone. Comparisons are strict ("more than", "older"); at the very end of a pause the gate
-    is active again. With `gate_softness` the active gate weighs instead (ours); its memory still
-    takes what is above the threshold for a failure.
+    While no measurement is `tested`, the time of the last success moves along (ours). Otherwise the
+    first second after any hole would pass unchecked, because the last success would be too old.
+    TLIO has a measurement at every clone. Comparisons are strict ("more than", "older"); exactly at
+    the end of a pause the gate is active again. With `gate_softness` the active gate gives a weight
+    instead (ours); its memory still counts what is above the threshold as a failure.
     """
     now = step * config.samples_per_clone
     old_enough = now - config.window > config.whole_samples(config.convergence_seconds)
@@ -220,7 +221,7 @@ def innovation_gate(
         slope = jax.nn.sigmoid((config.gate_threshold - nis) / config.gate_softness)
         weight = jnp.where(tested, jnp.where(active, slope, 1.0), 0.0)
     waited = jnp.where(~tested & (memory.last_success >= 0), config.samples_per_clone, 0)
-    # Until a pause is over, rounded up whatever rounding does to pause / dt.
+    # Samples until a pause is over, rounded up independently of the rounding of pause / dt.
     pause_end = now - int(np.floor(-config.pause_seconds / config.dt + 1e-6))
     memory = memory._replace(
         last_success=jnp.where(passed, now, memory.last_success + waited.astype(jnp.int32)),

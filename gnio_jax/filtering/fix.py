@@ -1,13 +1,14 @@
 """A fix of position as a measurement (ours): from a satellite receiver, a beacon, or a map on which
-somebody taps where he is.
+somebody taps their position.
 
-A fix is at any time t. It is measured at the end of a clone interval, with what it lies before that
-end, a = t_end − t, times the velocity taken off the position there:
+The time t of a fix is arbitrary. The fix is measured at the end of a clone interval, where the
+velocity times a = t_end − t is subtracted from the position:
 
     z = p − a v + w + b v,   w ~ N(0, R),   b ~ N(0, σ_t²),
 
-where b is the error of the time of the fix, e.g. of a tap that comes early or late. With the
-nearest end |a| is at most half an interval, in which acceleration does a few millimetres.
+where b is the error of the time of the fix, e.g. of a tap that comes early or late. At the nearest
+end |a| is at most half an interval, in which an acceleration changes the position by a few
+millimetres.
 """
 
 from __future__ import annotations
@@ -28,25 +29,25 @@ THRESHOLDS = {2: 9.210, 3: 11.345}
 
 
 class Fix(NamedTuple):
-    """A horizontal (m = 2) or a whole position (m = 3), or a row of them for each of K clone
-    intervals: an entry of `measurements` of `run_filter`, `run_odometry` and `smooth`."""
+    """A horizontal (m = 2) or a three-dimensional position (m = 3), or a row for each of K clone
+    intervals. It is an entry of `measurements` of `run_filter`, `run_odometry` and `smooth`."""
 
     position: Float[Array, "*k m"]
     """World frame, m; NaN where there is none."""
     covariance: Float[Array, "*k m m"]
     """R, m²."""
     before_end: Float[Array, "*k"]
-    """a: how long before the end of its clone interval, s; below 0 where it is after the end.
-    Finite also where there is no fix."""
+    """a, the time from the fix to the end of its clone interval, s; negative if the fix is after
+    the end. Finite even where there is no fix."""
     time_std: Float[Array, "*k"]
-    """σ_t, s. Finite also where there is no fix."""
+    """σ_t, s. Finite even where there is no fix."""
     threshold: Float[Array, "*k"]
     """Largest rᵀ S⁻¹ r that passes; inf: every fix does."""
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
-        """Refused where it fails the χ² test against what the filter expects. So a fix that jumps
-        by a kilometre changes nothing; neither does a good one where the covariance of the filter
-        is much too small."""
+        """A fix is refused if it fails the χ² test against the filter's prediction. So a fix that
+        jumps by a kilometre changes nothing. A good fix changes nothing either if the covariance of
+        the filter is much too small."""
         axes = self.position.shape[0]
         by_position = np.eye(3)[:axes]
         velocity = state.velocity[:axes]
@@ -76,9 +77,9 @@ def fixes_on_intervals(
 
     time (f,) s, on the clock on which `start` is the stamp of the first IMU sample; position (f, m)
     m in the world frame, m = 2 or 3; covariance (f, m, m) m²; intervals K; time_std s, one or (f,);
-    threshold of the χ² test, by default 99 %. A fix whose position has a NaN is none. Several in
-    one row become their mean, weighted by the inverse traces of their covariances, with the
-    covariance that this has. Raises `InputError` for another shape, for a covariance that is not
+    threshold of the χ² test, by default 99 %. A fix whose position has a NaN is ignored. Several
+    fixes in one row become their mean, weighted by the inverse traces of their covariances, with
+    the covariance of this mean. Raises `InputError` for another shape, for a covariance that is not
     symmetric and positive definite, for a time_std below 0, and for a fix outside of the recording.
     """
     time, position, covariance = (np.asarray(x, np.float64) for x in (time, position, covariance))

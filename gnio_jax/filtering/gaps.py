@@ -1,10 +1,10 @@
-"""Drop-outs of the IMU: short ones are bridged with the last sample, long ones coasted through, and
-both cost certainty.
+"""Drop-outs of the IMU: the filter holds the last sample through short ones and coasts through long
+ones, and both increase the covariance.
 
-All of this file is ours; the paper and TLIO take a complete stream for granted. A held sample is
-wrong by something that grows with its age and stays of one sign over a gap, so its error is taken
-as fully correlated: a gap's samples get variances that add up to the square of the summed standard
-deviations. Beyond `bridge_seconds` nothing is held: attitude and velocity stay as they are.
+All of this file is ours; the paper and TLIO take a complete stream for granted. The error of a held
+sample grows with its age and keeps its sign over a gap, so it is taken as fully correlated: the
+variances of a gap's samples add up to the square of the summed standard deviations. Beyond
+`bridge_seconds` no sample is held: attitude and velocity stay constant.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gnio_jax.types import Array
 
 
 class Gap(NamedTuple):
-    """How certain n samples are."""
+    """The additional uncertainty of n samples."""
 
     gyro_variance: Float[Array, "*n"]
     """Added to the variance of the white noise, (rad/s)²."""
@@ -55,8 +55,8 @@ def bridge(
     memory: ImuMemory,
     config: FilterConfig,
 ) -> tuple[Imu, Float[Array, "n"], ImuMemory]:
-    """The stream with its holes filled, the age of each held sample in s (0 where a sample is its
-    own), and the memory after it.
+    """The stream with its holes filled, the age of each held sample in s (0 for a sample that is
+    present), and the memory after it.
 
     A sample is missing where `valid` is False or a value is not finite. Without `valid` the stream
     is taken to be complete.
@@ -67,8 +67,8 @@ def bridge(
         after = memory._replace(gyro=gyro[-1], accel=accel[-1], missing=nothing_missing)
         return Imu(gyro, accel, None), jnp.zeros(n, gyro.dtype), after
     valid = valid & jnp.all(jnp.isfinite(gyro), axis=1) & jnp.all(jnp.isfinite(accel), axis=1)
-    # The remembered sample stands before the stream as number 0; `last` is the number of the last
-    # sample that is there.
+    # The remembered sample is number 0, before the stream; `last` is the number of the last sample
+    # that is present.
     number = jnp.arange(1, n + 1)
     last = jax.lax.cummax(jnp.where(valid, number, 0))
     age = jnp.where(last == 0, memory.missing + number, number - last)
@@ -98,15 +98,16 @@ def _held(
     valid: Bool[Array, "n"],
     last: Int[Array, "n"],
 ) -> Float[Array, "n 3"]:
-    """Each sample, or where it is missing the last one that is there."""
+    """Each sample, or the last one that is present where it is missing."""
     clean = jnp.where(valid[:, None], samples, 0.0)
     before = jnp.where(jnp.isfinite(remembered), remembered, 0.0)
     return jnp.concatenate([before[None], clean])[last]
 
 
 def _variance(age: Int[Array, "n"], limit: int) -> Float[Array, "n"]:
-    """Of a sample held for `age` samples, in units of the gap's own, so that sums over a gap have
-    the standard deviation Σ e_j, where e_j = min(j / limit, 1) is the error of the j-th."""
+    """Variance of a sample held for `age` samples, in units of the gap's own variance. Sums over a
+    gap have the standard deviation Σ e_j, where e_j = min(j / limit, 1) is the error of the j-th
+    sample."""
 
     def summed_error(j: Array) -> Array:
         ramp = jnp.minimum(j, limit)

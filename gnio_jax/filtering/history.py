@@ -1,4 +1,4 @@
-"""What a run leaves behind: the filter after each clone interval."""
+"""The result of a run: the filter after each clone interval."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gnio_jax.filtering.update import Outcome
 from gnio_jax.types import Array
 
 VELOCITY, POSITION, GYRO_BIAS = slice(3, 6), slice(6, 9), slice(9, 12)
-"""Where these lie in the history's covariances, which are of θ, v, p, b_g, b_a."""
+"""Rows of these in the history's covariances, which are of θ, v, p, b_g, b_a."""
 
 
 class FilterHistory(NamedTuple):
@@ -52,26 +52,26 @@ class FilterHistory(NamedTuple):
     """1 where an update was applied (also one with scaled covariance), 0 where none was (gate or
     gimbal lock), NaN where no measurement."""
     gate_passed: Float[Array, "k"]
-    """1 where the χ² gate let the measurement through as it is, 0 where it did not, between them
-    its weight (`gate_softness`), NaN where no measurement."""
+    """1 where the χ² gate accepted the measurement unchanged, 0 where it refused it, a weight from
+    0 to 1 with `gate_softness`, NaN where no measurement."""
     nis: Float[Array, "k"]
     """Normalised innovation squared, rᵀ S⁻¹ r; NaN where no measurement."""
     log_likelihood: Float[Array, "k"]
     """ln N(r; 0, S) of the innovation, r in m; NaN where no measurement. Their sum is the evidence
     for the noise model."""
     at_rest: Float[Array, "k"]
-    """1 where the velocity was measured as zero (`zero_velocity_std`), else 0, also where the χ²
-    test refused that."""
+    """1 where the velocity was measured as zero (`zero_velocity_std`), else 0, including where the
+    χ² test refused this."""
     imu_gap: Float[Array, "k"]
     """Age of the oldest held IMU sample of the interval, s; 0 where none was missing. Above
     `bridge_seconds` the filter coasted."""
     healthy: Float[Array, "k"]
-    """0 from the first row on where the state is not finite, a variance is negative or the speed
-    above `FilterConfig.speed_limit`. The input was bad, and all after it is void. The final state
-    remembers it, and a later run from that begins with 0."""
+    """0 from the first row on whose state is not finite, has a negative variance or a speed above
+    `FilterConfig.speed_limit`. The input was bad, and all rows from there on are invalid. The final
+    state remembers this, and a later run from it begins with 0."""
     others: tuple[Outcome, ...]
-    """What became of the measurements beside the displacement, stacked over K: of the velocity at
-    rest where `zero_velocity_std` is above 0, then of the caller's `measurements`."""
+    """The outcomes of the other measurements, stacked over K: the velocity at rest where
+    `zero_velocity_std` is above 0, then the caller's `measurements`."""
     diagnostics: dict[str, Array]
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a
     network."""
@@ -83,8 +83,8 @@ class FilterHistory(NamedTuple):
 
     def given(self, noise: NoiseModel) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
         """Displacements (K, 3), m, and their covariances (K, 3, 3), m², before the scaling of
-        `noise`, which must be the run's: with them `run_filter(..., frame="own")` repeats a run of
-        `run_odometry` without its network."""
+        `noise`, which must be that of the run. With them `run_filter(..., frame="own")` repeats a
+        run of `run_odometry` without its network."""
         factor = jnp.stack([jnp.asarray(value) for value in noise.std_factor])
         scale = noise.measurement_scale * factor[:, None] * factor[None]
         return jnp.asarray(self.displacement), self.measurement_covariance / scale[None]
@@ -95,10 +95,10 @@ class StepRecord(NamedTuple):
 
     mean: Mean
     covariance: Array
-    """Of θ, v, p, b_g, b_a, or its diagonal: see `FilterConfig.history`."""
+    """Covariance of θ, v, p, b_g, b_a, or its diagonal: see `FilterConfig.history`."""
     displacement: Displacement
     outcomes: tuple[Outcome, ...]
-    """Of the displacement, and of the other measurements in their order."""
+    """Outcomes of the displacement and of the other measurements in their order."""
     diagnostics: dict[str, Array]
 
 

@@ -1,4 +1,4 @@
-"""The network in the filter's loop: its window, its prediction, the measurement made of that."""
+"""The network in the filter's loop: its window, its prediction, and the resulting measurement."""
 
 from __future__ import annotations
 

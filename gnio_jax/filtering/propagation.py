@@ -128,8 +128,8 @@ def _interval_noise(
         jnp.concatenate([part.reshape(9, -1) for part in parts], axis=1)
         for parts in ([of_gyro, by_bias], right)
     )
-    # The accelerometer's noise is isotropic, so that its rotations drop out of R Rᵀ: each sample
-    # adds one number for each pair of v and p.
+    # The accelerometer's noise is isotropic, so its rotations cancel in R Rᵀ: each sample adds one
+    # number for each pair of v and p.
     gains = np.stack([np.zeros(n), np.ones(n), (n - 0.5 - np.arange(n)) * dt])
     pairs = dt**2 * np.einsum("il,jl->ijl", gains, gains).astype(dtype)
     of_accel = jnp.kron(pairs @ accel_variance, np.eye(3, dtype=dtype))
@@ -151,7 +151,7 @@ class Transition(NamedTuple):
     """1 where the anchor moved up to the position at the start of the interval, else 0."""
 
     def __call__(self, rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
-        """F rows. Where the anchor moves, a' = a + o and s' = o."""
+        """The product of F and `rows`. Where the anchor moves, a' = a + o and s' = o."""
         moved = self.anchored * rows[OFFSET]
         anchor, move = rows[ANCHOR] + moved, (1 - self.anchored) * rows[MOVE] + moved
         correlated = self.decay[:, None] * rows[CORRELATED]
@@ -162,7 +162,8 @@ class Transition(NamedTuple):
 def core_transition(
     interval: Interval, decay: Float[Array, "e"], anchored: Float[Array, ""]
 ) -> Transition:
-    """F over an interval that starts from the anchor, with o = 0, where that has just moved."""
+    """F over an interval that starts from the anchor, with o = 0, where the anchor has just
+    moved."""
     of_offset = np.isin(np.arange(LOCAL.stop), np.r_[OFFSET]).astype(interval.transition.dtype)
     kept = 1 - anchored * of_offset
     return Transition(interval.transition * kept[None], decay, anchored)
@@ -188,7 +189,8 @@ def propagate(
     errors = len(transition.decay)
     core = core + jnp.pad(interval.noise, (0, len(core) - len(interval.noise)))
     core = core + jnp.pad(jnp.diag(1 - transition.decay**2), (len(core) - errors, 0))
-    # The variance of the position grows, and with it what rounding leaves between the triangles.
+    # The variance of the position grows, and with it the rounding difference between both
+    # triangles.
     core = 0.5 * (core + core.T)
     pose = jnp.concatenate([core[:, THETA], core[:, OFFSET]], axis=1)
     cross = put(transition(state.cross_covariance), pose, 0, CLONE * slot)
@@ -222,7 +224,8 @@ def _replace_clone(
 
 @_replace_clone.defjvp
 def _replace_clone_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """With a mask: the transpose of overwriting would copy the whole matrix for each write."""
+    """The derivative uses a mask: the transpose of overwriting would copy the whole matrix for each
+    write."""
     covariance, _, entry = primals
     d_covariance, d_rows, _ = tangents
     index = np.arange(len(covariance))

@@ -2,16 +2,17 @@
 
 Grid sample k is that of time k·dt after the first stamp. Where the IMU is about as fast as the
 filter, it is interpolated linearly between its two neighbours. Where the IMU is faster, a low-pass
-comes first, or what the filter's rate cannot carry would alias. It is what `data.resample` does to
-a recording: a cubic spline through the samples is read at `factor` points per grid sample, and a
-symmetric FIR makes one sample of them. The FIR of a grid sample reaches beyond it by `delay`, so
-that it is known that much later; its time stays k·dt.
+comes first, because frequencies above half the filter's rate would alias. It is that of
+`data.resample`: a cubic spline through the samples is evaluated at `factor` points per grid sample,
+and a symmetric FIR makes one sample of them. The FIR of a grid sample reaches beyond it by `delay`,
+so the sample is known that much later; its time remains k·dt.
 
 A hole in the stream ends a run of samples, and the grid samples in it are missing. At the start of
-the stream odd reflection stands for what was before it, as in a recording. At the other ends of
-runs the FIR has the weights of what is there, divided by their sum: odd reflection would hand over
-the last sample before a hole as raw as it is, with all its vibration, and the filter would hold
-that. A single lost sample is no hole. All of this happens on the host.
+the stream the samples before it are replaced by odd reflection, as in a recording. At the other
+ends of runs the FIR uses the weights of the samples that exist, divided by their sum. Odd
+reflection would give the last sample before a hole without the low-pass, with all its vibration,
+and the filter would hold this sample. A single lost sample is no hole. All of this happens on the
+host.
 """
 
 from __future__ import annotations
@@ -29,34 +30,35 @@ from gnio_jax.decimation import decimation_factor, low_pass
 from gnio_jax.filtering.checks import check_number
 
 GYRO, ACCEL, VALID = slice(0, 3), slice(3, 6), 6
-"""Columns of grid samples: rad/s, m/s², and 1, or NaN and 0 where the sample is missing."""
+"""Columns of grid samples: gyro in rad/s, accel in m/s², and 1; NaN and 0 where the sample is
+missing."""
 
 LONGEST_GAP = 60.0
-"""A stamp further than this from the one before is a mistake, most often of its unit, s."""
+"""A stamp further than this from the one before is an error, most often of its unit, s."""
 LONGEST_TRUSTED = 1.0
-"""A stamp further than this from the one before counts once a second one agrees with it, s (ours):
-a clock may be wrong for one sample."""
+"""A stamp further than this from the one before is accepted when a second one agrees with it, s
+(ours): a clock may be wrong for one sample."""
 
 # In intervals of the IMU (ours). A sample that comes sooner after another is left out before the
-# low-pass, or noise would make the spline swing. Samples further apart than a line's length are
-# joined by a line: there the spline has no hold. Those no further apart than a lost sample makes
-# them belong to one run.
+# low-pass, because noise would make the spline oscillate. Samples further apart than the second
+# limit are joined by a line, because the spline would be unconstrained there. Samples no further
+# apart than one lost sample makes them belong to one run.
 _CLOSEST, _LINE, _LOST = 0.25, 1.75, 2.5
 
-# In intervals of the grid (ours). A longer interval is a stop of the IMU, which does not count for
-# its rate; a shorter one may be jitter. The rate is known from so many grid samples on.
+# In intervals of the grid (ours). A longer interval is a stop of the IMU and does not count for its
+# rate; a shorter one may be jitter. The rate is known after this number of grid samples.
 _STOP, _RATE_KNOWN = 5.0, 100
 _TOO_FAST = 1.05
-"""Times the fastest rate that the low-pass is made for."""
+"""Factor of the fastest rate for which the low-pass is made."""
 _BEFORE = 4
-"""Samples kept before the FIR's reach, so that the spline's new end is not felt within it."""
+"""Samples kept before the FIR's reach, so that the spline's new end has no effect within it."""
 
 
 class Grid(NamedTuple):
     """The uniform clock of the filter, and how samples are brought onto it."""
 
     dt: float
-    """Between grid samples, s."""
+    """Time between grid samples, s."""
     hole: float
     """Grid samples between stamps further apart are missing, s."""
     imu_rate: float
@@ -64,7 +66,7 @@ class Grid(NamedTuple):
     factor: int
     """Points of the fine grid per grid sample; 1: there is no low-pass."""
     taps: Float[np.ndarray, "taps"]
-    """Of the FIR, on the fine grid; (1,) where there is none."""
+    """Weights of the FIR on the fine grid; (1,) where there is none."""
 
     @property
     def delay(self) -> float:
@@ -78,8 +80,7 @@ class Grid(NamedTuple):
 
 
 def create_grid(dt: float, hole: float | None = None, imu_rate: float | None = None) -> Grid:
-    """For a filter with a sample every `dt` s and an IMU of `imu_rate` Hz, by default 1/dt.
-
+    """The grid of a filter with a sample every `dt` s and an IMU of `imu_rate` Hz, by default 1/dt.
     `hole` is 1.5 dt by default. Raises `ValueError`.
     """
     hole = 1.5 * dt if hole is None else hole
@@ -101,13 +102,13 @@ def grid_rows(
 ) -> Float[np.ndarray, "count 7"]:
     """Grid samples `first` … `first + count − 1`: the FIR about each, run by run of samples.
 
-    `stamps` (s since that of grid sample 0, increasing) and `samples` (gyro, accel) are those that
-    were there, as far as the grid samples depend on them. Stamps closer than `slack` (s) to a time
-    are that time.
+    `stamps` (s since that of grid sample 0, increasing) and `samples` (gyro, accel) are the samples
+    that came and on which the grid samples depend. Stamps closer than `slack` (s) to a time count
+    as that time.
     """
     half, step = len(grid.taps) // 2, grid.dt / grid.factor
     centres = (first + np.arange(count)) * grid.factor
-    # The points of the fine grid that all centres depend on.
+    # The points of the fine grid on which all centres depend.
     lowest, highest = first * grid.factor - half, (first + count - 1) * grid.factor + half
     rows = np.concatenate([np.full((count, 6), np.nan), np.zeros((count, 1))], axis=1)
     for run in numerics.stretches(np.diff(stamps) > grid.longest) if len(stamps) else ():
@@ -118,7 +119,7 @@ def grid_rows(
         if not inside.any():
             continue
         fine = _curve(time, samples[run], np.arange(low, high + 1) * step, grid, slack)
-        if begin == 0:  # the stream's start, as far as there is something to reflect
+        if begin == 0:  # the stream's start, as far as samples can be reflected
             reflected = min(low - lowest, high - low)
             fine = np.concatenate([2 * fine[0] - fine[reflected:0:-1], fine])
             low -= reflected
@@ -128,7 +129,7 @@ def grid_rows(
         )
         windows = np.lib.stride_tricks.sliding_window_view(weighted, len(grid.taps), axis=0)
         sums = (windows[:: grid.factor] @ grid.taps)[inside]
-        # From the centre on to either side the taps never sum to less than half the middle one.
+        # From the centre to either side the sum of the taps is at least half the middle one.
         rows[inside] = sums / sums[:, 6:]
     return rows
 
@@ -136,8 +137,8 @@ def grid_rows(
 def _curve(
     time: np.ndarray, samples: np.ndarray, points: np.ndarray, grid: Grid, slack: float
 ) -> np.ndarray:
-    """A run read at some points of it: lines, and a spline before a low-pass where samples are not
-    far apart."""
+    """A run evaluated at some points: by lines, and before a low-pass by a spline where samples are
+    close together."""
     points = np.clip(points, time[0], time[-1])
     if grid.factor == 1:
         nearest = time[np.minimum(np.searchsorted(time, points - slack), len(time) - 1)]
@@ -151,32 +152,33 @@ def _curve(
 
 
 class Stream:
-    """The samples that have come and are not yet used, and the grid samples that they make."""
+    """The samples that have come and are still needed, and the grid samples that they make."""
 
     def __init__(self, grid: Grid):
         self.grid = grid
         self.origin = math.nan
         """The first stamp, s."""
         self.taken = 0
-        """Grid samples that were taken."""
+        """Number of grid samples that were taken."""
         self._ended = 0
-        """Grid samples, those that were taken included, that no later sample can change."""
+        """Number of grid samples that no later sample can change, including those that were
+        taken."""
         self._newest = 0.0
         """The newest stamp, s since the origin."""
         self._stamps: list[float] = []
-        """Of the samples that were there and are still needed, s since the origin."""
+        """Stamps of the samples that came and are still needed, s since the origin."""
         self._samples: list[tuple[float, ...]] = []
         self._unproven: tuple[float, tuple[float, ...]] | None = None
-        """A sample whose stamp leaps, until another agrees with it."""
+        """A sample whose stamp jumps, until the next one agrees with it."""
         self._intervals, self._covered = 0, 0.0
-        """Between stamps, missing samples included, and their sum in s, without those in which the
-        IMU stopped."""
+        """Number of intervals between stamps, including those of missing samples, and their sum in
+        s, without those in which the IMU stopped."""
 
     def push(self, time: float, sample: tuple[float, ...]) -> None:
         """Take a sample: time s, gyro rad/s, accel m/s²; one that is not finite is missing.
 
-        Raises `ValueError`, and nothing has changed, for a time that does not increase or leaps by
-        more than `LONGEST_GAP`, or for an IMU so fast that it would alias.
+        Raises `ValueError` and changes nothing for a time that does not increase or jumps by more
+        than `LONGEST_GAP`, or for an IMU so fast that it would alias.
         """
         if math.isnan(self.origin):
             self.origin = time
@@ -203,17 +205,18 @@ class Stream:
 
     @property
     def known(self) -> int:
-        """How many of the next grid samples no later sample can change any more."""
+        """Number of the next grid samples that no later sample can change."""
         return self._ended - self.taken
 
     def rows(self, count: int) -> Float[np.ndarray, "count 7"]:
-        """The next grid samples, at most `known`. They are not taken by that."""
+        """The next grid samples, at most `known`. They are read, not taken."""
         stamps, samples = np.array(self._stamps), np.array(self._samples).reshape(-1, 6)
         slack = self._slack(self._newest)
         return grid_rows(stamps, samples, self.taken, count, self.grid, slack)
 
     def take(self, count: int) -> None:
-        """Go on behind the next `count` grid samples, and forget what only they depended on."""
+        """Take the next `count` grid samples, and forget the samples that only these depended
+        on."""
         self.taken += count
         reach = self.taken * self.grid.dt - self.grid.delay
         unneeded = int(np.searchsorted(self._stamps, reach, side="right")) - 1 - _BEFORE
@@ -226,20 +229,20 @@ class Stream:
             self._stamps.append(stamp)
             self._samples.append(sample)
         reached = self._stamps[-1] if self._stamps else -math.inf
-        in_hole = stamp - reached > self.grid.longest  # and all up to now is missing
+        in_hole = stamp - reached > self.grid.longest  # and all grid samples up to now are missing
         last = stamp if in_hole else reached - self.grid.delay
         ended = math.floor((last + self._slack(stamp)) / self.grid.dt) + 1
         self._ended = max(self._ended, ended)
 
     def _slack(self, stamp: float) -> float:
-        """What rounding leaves of the stamps, s: this close is the same time."""
+        """Rounding error of the stamps, s: closer stamps are the same time."""
         largest = max(abs(self.origin), abs(self.origin + stamp))
         return 1e-6 * self.grid.dt + 4 * math.ulp(largest)
 
     def _check_rate(self, stamps: list[float]) -> None:
         """Count the intervals before these stamps. Raises `ValueError` if the samples come so much
-        faster than `imu_rate` that vibrations would alias: by the number of stamps so far, which
-        jitter hardly changes."""
+        faster than `imu_rate` that vibrations would alias. The rate follows from the number of
+        stamps so far, which jitter hardly changes."""
         grid, intervals, covered = self.grid, self._intervals, self._covered
         fastest = 1.5 * grid.imu_rate if grid.factor > 1 else 1 / grid.dt
         for before, stamp in itertools.pairwise([self._newest, *stamps]):

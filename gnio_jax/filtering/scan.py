@@ -53,16 +53,16 @@ def run_filter(
       from clone k − W to clone k, expressed in the yaw frame of clone k − W (`displacements` makes
       such rows from a known trajectory). A row with a NaN, or before there are W + 1 clones, is no
       measurement.
-    - imu_valid: (K·n,) booleans, False where an IMU sample is missing. Missing samples, and where
-      there is a mask also those that are not finite, are bridged (see `gaps`). None: the stream is
+    - imu_valid: (K·n,) booleans, False where an IMU sample is missing. Missing samples are bridged
+      (see `gaps`), and if there is a mask also those that are not finite. None: the stream is
       complete.
-    - frame: whose attitude defines that yaw frame: "given", another than the filter's; "own", the
-      filter's, as for the displacements of `FilterHistory.given`, which repeat a run of
-      `run_odometry` without its network.
-    - measurements: other measurements to be taken after the displacement of each interval; their
-      arrays lead with K (see `update`).
+    - frame: the attitude that defines this yaw frame: "given" is another one than the filter's,
+      "own" is the filter's, as for the displacements of `FilterHistory.given`, which repeat a run
+      of `run_odometry` without its network.
+    - measurements: other measurements, which are taken after the displacement of each interval; the
+      leading axis of their arrays is K (see `update`).
 
-    Returns the final state, from which a later call goes on (clone numbers k then count on, too),
+    Returns the final state, from which a later call continues (and continues the clone numbers k),
     and the history. Works under `jax.jit`, `jax.vmap` and `jax.grad`. Raises `ValueError` naming an
     argument of wrong shape or precision, with values that are not finite, or a covariance that is
     not positive definite. Inside `jit` values are not known; `FilterHistory.healthy` reports bad
@@ -100,12 +100,13 @@ def run_odometry(
     filter's present biases are subtracted and the samples rotated by R_γ(R_i)ᵀ R_m, R_m being the
     present estimate of clone i advanced by integrating gyro − b_g (paper eq. 1; backwards through
     the context), unless `FilterConfig.window_rotation` says otherwise. The displacement is
-    expressed in the filter's own yaw frame, and taken so (`displacement.linearise_displacement`),
-    except with "tlio". Its covariance is diag(exp 2u), u raised to `log_std_min`. The network is
-    not called in the first `FilterConfig.first_measured` intervals, which have no whole window, and
-    a window in which the filter coasted through a gap is no measurement. All else as in
-    `run_filter`. Jit it from outside; it is differentiable in whatever `predict` closes over, too.
-    Raises `ValueError` as `run_filter` does, or for a `predict` that returns something else.
+    expressed in the filter's own yaw frame and linearised accordingly
+    (`displacement.linearise_displacement`), except with "tlio". Its covariance is diag(exp 2u), u
+    raised to `log_std_min`. The network is not called in the first `FilterConfig.first_measured`
+    intervals, which have no whole window, and a window in which the filter coasted through a gap is
+    no measurement. Everything else is as in `run_filter`. Jit it from outside. It is also
+    differentiable in the values that `predict` closes over. Raises `ValueError` as `run_filter`
+    does, or for a `predict` that returns something else.
     """
     inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
     of_window = network_measurement(predict, config, inputs.noise)
@@ -119,8 +120,8 @@ def run_odometry(
                 lambda signal: jax.lax.dynamic_slice_in_dim(signal, first, config.reach), stream
             )
 
-        # The number is the scan's own counter, the same for every sequence of a batch, so that this
-        # stays a branch under vmap.
+        # The number is the scan's own counter and the same for every sequence of a batch, so this
+        # remains a branch under vmap.
         return of_window(number >= config.first_measured, latest, state, oldest)
 
     return _run(measure, inputs, None, config)
@@ -154,7 +155,7 @@ def clone_steps(
     keep: Callable[[Array, FilterState, StepRecord, StepTrace], T],
 ) -> tuple[FilterState, T, Float[Array, "k"]]:
     """Bridge holes of the stream and take a clone step for every interval. Returns the state at the
-    end, whose clones are a ring, what `keep` has made of each step, and the age of the oldest held
+    end, whose clones are a ring, the stacked results of `keep`, and the age of the oldest held
     sample of each interval, s.
 
     measure(number, stream, given, state, oldest) returns the displacement of an interval and the
@@ -191,7 +192,7 @@ diagnostics."""
 
 
 class StepTrace(NamedTuple):
-    """What happened to the error in one clone interval, as smoothing needs it."""
+    """How the error changed in one clone interval, as smoothing needs it."""
 
     transition: Transition
     corrections: tuple[Correction, ...]
@@ -209,8 +210,8 @@ def clone_step(
 ) -> tuple[FilterState, StepRecord, StepTrace]:
     """One clone interval with the samples `imu`: propagate, clone into `slot` of the ring, take the
     displacement and the other measurements."""
-    # A ring of clones: the newest takes the place of the one that has served as oldest, and the
-    # next slot is the oldest now. The anchor moves once in a round of the ring.
+    # A ring of clones: the newest clone replaces the oldest one, and the next slot then holds the
+    # oldest clone. The anchor moves once in a round of the ring.
     dtype, oldest = state.offset.dtype, (slot + 1) % config.clones
     anchored = jnp.where(jnp.asarray(slot) == 0, 1.0, 0.0).astype(dtype)
     state = move_anchor(state, anchored)
@@ -246,12 +247,12 @@ _OTHER_FORMS = {
 
 
 def _keep(primitive: Any, *_: Any, **__: Any) -> bool:
-    """What the backward pass keeps of a step: all but other forms of what it has."""
+    """Whether the backward pass keeps a result: not if it is another form of one that is kept."""
     return primitive.name not in _OTHER_FORMS
 
 
-# To write, and on the way back to read, the numbers that a backward pass keeps costs more than to
-# compute the interval again.
+# Writing and reading the numbers that a backward pass keeps costs more than computing the interval
+# again.
 _integrate = jax.checkpoint(integrate, static_argnums=3, prevent_cse=False)
 _propagate = jax.checkpoint(propagate, policy=_keep, prevent_cse=False)
 
@@ -263,9 +264,10 @@ _propagate = jax.checkpoint(propagate, policy=_keep, prevent_cse=False)
 def blocked_scan(
     step: Callable, carry: Any, inputs: Any, checkpoint_every: int = 0, truncate_every: int = 0
 ) -> tuple[Any, Any]:
-    """`lax.scan` whose backward pass keeps the carry of every `checkpoint_every`-th step only, and
-    computes the steps between them again, and which hands the carry on without gradient after
-    every `truncate_every`-th step. 0: it keeps every carry, and never cuts the gradient."""
+    """`lax.scan` with a bounded backward pass. It keeps only the carry of every
+    `checkpoint_every`-th step and computes the steps between them again. After every
+    `truncate_every`-th step the carry has no gradient. 0: it keeps every carry, or never cuts the
+    gradient."""
     run = within = functools.partial(jax.lax.scan, step)
     rows = len(jax.tree.leaves(inputs)[0])
     if 0 < checkpoint_every < min(truncate_every or rows, rows):

@@ -1,4 +1,4 @@
-"""The filter's settings: what is fixed when it is compiled, what an experiment asks for, and its
+"""The filter's settings: those that are fixed when it is compiled, those of an experiment, and its
 numbers as free parameters."""
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ jax.tree_util.register_dataclass(
 )
 
 YawFrame = Literal["own", "given"]
-"""Whose yaw frame a displacement is expressed in: that of the filter's own attitude of the oldest
-clone, with which the network's window was cut, or that of another attitude."""
+"""The yaw frame in which a displacement is expressed: that of the filter's own attitude of the
+oldest clone, with which the network's window was cut, or that of another attitude."""
 
 
 @no_type_check  # The tests' run-time checker would refuse what __post_init__ converts or names.
@@ -59,7 +59,7 @@ class FilterConfig:
     """Largest rᵀ S⁻¹ r that passes, of a displacement and of a velocity at rest: 99 % of χ² with
     three degrees of freedom."""
     convergence_seconds: NonNegative = 10.0
-    """The gate stays open until the oldest clone is more than this after initialisation, s."""
+    """The gate remains open until the oldest clone is more than this after initialisation, s."""
     success_seconds: NonNegative = 0.5
     """When the last success is older than this, the gate pauses: everything passes, s."""
     pause_seconds: NonNegative = 1.0
@@ -69,8 +69,8 @@ class FilterConfig:
     is weighted by the logistic function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
     zero_velocity_std: NonNegative = 0.0
     """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
-    quiet; 0 for no such update. Where a displacement is tested in the same interval and its gate is
-    active, a rest that does not fit is refused, whatever `mahalanobis_fail_scale` and
+    quiet; 0 for no such update. If a displacement is tested in the same interval and its gate is
+    active, a rest that fails the χ² test is refused, independently of `mahalanobis_fail_scale` and
     `gate_softness`."""
     rest_gyro: NonNegative = 0.05
     """Bound of |gyro − b_g| in every sample of a quiet IMU, rad/s."""
@@ -79,29 +79,30 @@ class FilterConfig:
     rest_seconds: NonNegative = 0.5
     """How long the IMU is quiet before its velocity is measured as zero, s."""
     bridge_seconds: NonNegative = 0.1
-    """Missing IMU samples hold the last one for this long, s; after it attitude and velocity coast,
-    and windows are no measurements."""
+    """For this long, s, the last IMU sample stands in for missing ones; then the filter coasts with
+    constant attitude and velocity, and windows are no measurements."""
     gap_gyro_std: NonNegative = 1.0
     """Standard deviation of the rate that a gap may hide, rad/s. That of a held sample grows with
-    its age to this, at `bridge_seconds`."""
+    its age and reaches this value at `bridge_seconds`."""
     gap_accel_std: NonNegative = 3.0
     """Standard deviation of the acceleration that a gap may hide, m/s²."""
     checkpoint_every: NonNegativeCount = 0
-    """Clone intervals between the states kept for the backward pass, all else being computed again:
-    memory for time. 0 keeps everything."""
+    """Clone intervals between the states kept for the backward pass, which computes everything else
+    again: less memory, more time. 0 keeps everything."""
     truncate_every: NonNegativeCount = 0
-    """Clone intervals after which the state is carried on without gradient, for training on long
-    recordings: values stay as they are. The final state has no gradient then. 0 never."""
+    """Number of clone intervals after which the state continues without gradient, for training on
+    long recordings. Values do not change. The final state then has no gradient. 0: never."""
     window_rotation: Literal["per_sample", "single", "tlio"] = "per_sample"
     """Rotate each sample of the network's window with its own attitude, or all with that of the
     start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
-    earlier, the network's input with the biases that the IMU comes with."""
+    earlier, and without subtracting the biases."""
     speed_limit: Positive = 100.0
-    """No carrier is faster, m/s: an estimate that exceeds it has diverged, and is not `healthy`
+    """Largest plausible speed, m/s: an estimate that exceeds it has diverged, and is not `healthy`
     from then on (ours)."""
     allow_float32: bool = False
-    """Run in float32 where the state is float32: every standard deviation keeps about four digits
-    over an hour. Without this float32 is refused. Smoothing and derivatives want float64 anyway."""
+    """Run in float32 if the state is float32: every standard deviation keeps about four digits over
+    an hour. Without this setting float32 is refused. Smoothing and derivatives need float64 in any
+    case."""
 
     def __post_init__(self) -> None:
         for name, hint in inspect.get_annotations(type(self), eval_str=True).items():
@@ -125,8 +126,8 @@ class FilterConfig:
 
     @property
     def first_measured(self) -> int:
-        """Number of the first clone interval that ends with a measurement: the samples that it
-        depends on are there, and W intervals lie before it, as in TLIO's tracker."""
+        """Number of the first clone interval that ends with a measurement: all samples on which it
+        depends exist, and W intervals come before it, as in TLIO's tracker."""
         before_window = -(-(self.context_samples + self.cut.lead) // self.samples_per_clone)
         return self.clones_per_window + max(before_window - 1, 0)
 
@@ -154,12 +155,12 @@ class FilterConfig:
     def displacement_frame(self) -> YawFrame:
         """Yaw frame of the network's displacement, as the measurement's Jacobian takes it.
 
-        TLIO's Jacobian takes a given frame, though it is the filter's own.
+        TLIO's Jacobian treats the frame as given, although it is the filter's own.
         """
         return "given" if self.window_rotation == "tlio" else "own"
 
     def whole_samples(self, seconds: float) -> int:
-        """t·dt > seconds ⇔ t > this number, whatever rounding does to seconds / dt."""
+        """t·dt > seconds ⇔ t > this number, independently of the rounding of seconds / dt."""
         return int(np.floor(seconds / self.dt + 1e-6))
 
 
@@ -168,15 +169,15 @@ class FilterConfig:
 
 
 class FilterSetup(NamedTuple):
-    """A filter as the settings ask for it."""
+    """The filter that the settings describe."""
 
     config: FilterConfig
     noise: NoiseModel
     initial_std: InitialStd
     considered: ConsideredStd | None = None
-    """Of errors that the filter does not estimate; None: there are none."""
+    """Standard deviations of errors that the filter does not estimate; None: there are none."""
     raw_gyro_bias: float | None = None
-    """Standard deviation of the first bias of a gyro whose phone takes none off, rad/s."""
+    """Standard deviation of the first bias of a gyro whose phone subtracts no bias, rad/s."""
 
 
 def filter_setup(windows: DataConfig, settings: FilterSettings) -> FilterSetup:
@@ -187,7 +188,8 @@ def filter_setup(windows: DataConfig, settings: FilterSettings) -> FilterSetup:
 
 
 def filter_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig:
-    """What is fixed when the filter is compiled. The numbers of the settings may be traced."""
+    """The settings that are fixed when the filter is compiled. The numbers of the settings may be
+    traced."""
     return FilterConfig(
         dt=1.0 / windows.rate,
         samples_per_clone=windows.stride,
@@ -202,15 +204,15 @@ def filter_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig
 SHARE = "noise.correlation.share"
 """The number that lies between 0 and 1; the others are positive."""
 LARGEST_SHARE = 0.9999
-"""Largest share that is written down: rounding must not make it 1."""
+"""Largest share that is written to a file: rounding must not make it 1."""
 
 
 def free_parameters(settings: FilterSettings, paths: Iterable[str]) -> dict[str, float]:
-    """The numbers of some settings without bounds, in which they are fitted and trained: a share's
-    logit, the logarithm of all else.
+    """The numbers of some settings as parameters without bounds, which are fitted and trained: the
+    logit of a share, and the logarithm of every other number.
 
     Each of the `paths` names a number ("noise.gyro_density") or a section of them ("noise"). A
-    number that is 0 is switched off, and has none.
+    number that is 0 is switched off and has no free parameter.
     """
     wanted = tuple(paths)
     return {
@@ -221,7 +223,7 @@ def free_parameters(settings: FilterSettings, paths: Iterable[str]) -> dict[str,
 
 
 def is_below(name: str, path: str) -> bool:
-    """Whether the number `name` is the one of this path, or in the section of this path."""
+    """Whether the number `name` has this path, or is in the section of this path."""
     return f"{name}.".startswith(f"{path}.")
 
 
@@ -237,8 +239,8 @@ def with_free_parameters(settings: FilterSettings, free: Mapping[str, Any]) -> F
 def with_written_parameters(
     settings: FilterSettings, free: Mapping[str, Any], digits: int
 ) -> FilterSettings:
-    """The settings with the values of these free parameters as they are written down, as floats of
-    so many digits."""
+    """The settings with the values of these free parameters as they are written to a file: floats
+    rounded to `digits` digits."""
     names = _numbers(with_free_parameters(settings, free))
     for name in names.keys() & free.keys():
         written = float(f"{float(names[name]):.{digits}g}")

@@ -1,28 +1,27 @@
-"""Fixed-interval smoothing (ours): every estimate of the filter corrected by all that was measured
-after it, for use offline.
+"""Fixed-interval smoothing (ours): every estimate of the filter is corrected by all later
+measurements, for use offline.
 
-A displacement ties the present to a pose of a second ago, so the error that must be smoothed is the
-augmented one, clones and all. Its covariance is singular, because the newest clone duplicates the
-core's pose, and it is never inverted in the modified Bryson–Frazier form (Bierman 1973). With the
-filter's error e ~ N(0, P) after step k,
+A displacement relates the present to the pose one second ago, so the augmented error with all
+clones must be smoothed. Its covariance is singular, because the newest clone duplicates the core's
+pose. The modified Bryson–Frazier form (Bierman 1973) never inverts it. With the filter's error e ~
+N(0, P) after step k,
 
     e | all measurements ~ N(−P λ, P − P Λ P),
 
-where the adjoint λ, Λ runs backwards from zero. Back over an update with S = L Lᵀ, M = L⁻¹ H and
-Y = M P,
+where the adjoint λ, Λ runs backwards from zero. Backwards over an update with S = L Lᵀ, M = L⁻¹ H
+and Y = M P it becomes
 
     λ ← λ − Mᵀ (Y λ + L⁻¹ r),   Λ ← (I − Yᵀ M)ᵀ Λ (I − Yᵀ M) + Mᵀ M,
 
-and over a propagation with the augmented transition F, which puts the core's pose into a slot of
-the ring in the place of the oldest clone,
+and backwards over a propagation with the augmented transition F, which puts the core's pose into
+the slot of the oldest clone,
 
     λ ← Fᵀ λ,   Λ ← Fᵀ Λ F.
 
-An update that was not applied leaves no term, and one that was weighted has that weight.
-
-Everything is linear about the filter's own estimates, as in any extended smoother: Jacobians are
-not taken anew at the smoothed ones, and that R ← exp(δθ) R turns the frame of the rotation's error
-by δθ, a second-order term, is left out as in the filter.
+An update that was not applied has no term, and a weighted update has its weight. Everything is
+linearised at the filter's own estimates, as in any extended smoother: Jacobians are not computed
+again at the smoothed ones. R ← exp(δθ) R turns the frame of the rotation's error by δθ; this
+second-order term is neglected, as in the filter.
 """
 
 from __future__ import annotations
@@ -84,15 +83,15 @@ def smooth(
     """Filter K clone intervals as `run_filter` does, then smooth: each row is the estimate given
     all measurements of the K intervals.
 
-    Arguments and `ValueError`s as of `run_filter`, whose updates are smoothed exactly as they were
-    made. A run of `run_odometry` that left `history` is smoothed without its
-    network by `smooth(state, gyro, accel, *history.given(noise), config, noise,
-    frame=config.displacement_frame)`. `state` is the prior, and what was measured before it is not
-    touched. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
+    Arguments and `ValueError`s are those of `run_filter`, whose updates are smoothed exactly as
+    they were made. A run of `run_odometry` that returned `history` is smoothed without its network
+    by `smooth(state, gyro, accel, *history.given(noise), config, noise,
+    frame=config.displacement_frame)`. `state` is the prior, and earlier measurements are not
+    smoothed. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
 
     Memory: about K · (18 m + 500) numbers, m = 21 + 6 (W + 1): 25 kB for each interval at W = 20,
-    in float64. Smoothed variances are differences: in float32 one that is lowered by many orders of
-    magnitude, as at the start, has few digits left and can come out below zero.
+    in float64. Smoothed variances are differences. In float32 a variance that becomes smaller by
+    many orders of magnitude, as at the start, keeps few digits and can become negative.
     """
     inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
     measured = checked_displacements(displacement, covariance, inputs, config)
@@ -100,16 +99,16 @@ def smooth(
 
 
 class _ForwardStep(NamedTuple):
-    """What the way back needs of one step forward."""
+    """The results of one forward step that the backward pass needs."""
 
     slot: Int[Array, "*k"]
-    """Of the ring, for the clone at the end of the interval."""
+    """Slot of the ring for the clone at the end of the interval."""
     mean: Mean
     """After the step."""
     covariance: Array
-    """Of θ, v, p, b_g, b_a, or its diagonal."""
+    """Covariance of θ, v, p, b_g, b_a, or its diagonal."""
     cross: Float[Array, "*k 15 m"]
-    """P of those against the whole error, core and clones."""
+    """Covariance of θ, v, p, b_g, b_a with the whole error, core and clones."""
     trace: StepTrace
 
 
@@ -161,7 +160,7 @@ class Adjoint(NamedTuple):
 
 
 def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
-    """Back over an update; `oldest` is the slot of the oldest clone."""
+    """The adjoint before an update; `oldest` is the slot of the oldest clone."""
 
     def measured(core: Array, clones: Array) -> dict[str, Array]:
         parts = measurable_errors(core, clones, oldest)
@@ -182,7 +181,7 @@ def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, 
 
 
 def _before_propagation(adjoint: Adjoint, transition: Transition, slot: Int[Array, ""]) -> Adjoint:
-    """Back over the propagation and the cloning into `slot`."""
+    """The adjoint before the propagation and the cloning into `slot`."""
     size, core = len(adjoint.vector), CORE + len(transition.decay)
 
     def step(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:

@@ -1,14 +1,15 @@
-"""Where the filter starts: from a known pose, or level from the first samples at rest.
+"""The start of the filter: from a known pose, or level from the first samples at rest.
 
-What counts as rest depends on what is concluded from it:
+The definition of rest depends on its use:
 
-- The mean of the gyro is its bias where the device lies as on a table: over a second no axis has a
-  standard deviation above `REST_GYRO_STD` and `REST_ACCEL_STD` (`rest_at_start`).
-- The accelerations of a level start are averaged as they are where the standard deviations, summed
-  over the axes in squares, are below `FilterConfig.rest_gyro` and `rest_accel`. This is about the
-  mean, since no bias is known yet; a turn at a constant rate shows in the accelerations.
-- The velocity is zero where no single sample is off the estimated biases by more than those bounds
-  (`zero_velocity.detect_rest`).
+- The mean of the gyro is its bias if the device is as quiet as on a table: over a second no axis
+  has a standard deviation above `REST_GYRO_STD` and `REST_ACCEL_STD` (`rest_at_start`).
+- The accelerations of a level start are averaged without rotation if the standard deviations, added
+  in quadrature over the axes, are below `FilterConfig.rest_gyro` and `rest_accel`. Deviations are
+  taken from the mean, because no bias is known yet; a turn at a constant rate shows in the
+  accelerations.
+- The velocity is zero if no single sample differs from the estimated biases by more than those
+  bounds (`zero_velocity.detect_rest`).
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ from gnio_jax.types import GRAVITY, Array
 
 _SPEED_OF_SPREAD, _STILL_STD, _MOVING_STD = 1.5, 0.05, 1.0
 """Standard deviation of the velocity at a level start (ours): 1.5 s times the spread of the
-accelerations, since walking shakes, between 0.05 and 1 m/s. OxIOD's people who spread theirs by 0.1
-to 0.2 m/s² move at 0.08 m/s, by 0.3 to 0.5 m/s² at 0.6 m/s and by more than 0.8 m/s² at 0.9 m/s."""
+accelerations, which grows with the speed of walking, between 0.05 and 1 m/s. In OxIOD,
+accelerations that spread by 0.1 to 0.2 m/s² come with a speed of 0.08 m/s, those by 0.3 to 0.5 m/s²
+with 0.6 m/s, and those by more than 0.8 m/s² with 0.9 m/s."""
 
 REST_GYRO_STD = 0.01
 """Largest standard deviation of each gyro axis at rest, rad/s: a phone on a table, not in a hand.
@@ -42,13 +44,13 @@ REST_GYRO_STD = 0.01
 REST_ACCEL_STD = 0.1
 """Largest standard deviation of each accelerometer axis at rest, m/s²."""
 REST_SECONDS = 1.0
-"""Shortest rest from which a bias is taken, s; also what the tilt is taken from."""
+"""Shortest rest that gives a bias, s; the tilt is also taken from this time."""
 LEAST_GRAVITY = 0.5 * GRAVITY
-"""A mean acceleration below this does not show where up is, m/s² (ours)."""
+"""A mean acceleration below this does not show the vertical, m/s² (ours)."""
 
 
-# The arguments of the public functions carry no shapes for the run-time checker: a wrong one is the
-# user's mistake and a ValueError.
+# The arguments of the public functions have no shapes for the run-time checker: a wrong shape is
+# the user's mistake and a ValueError.
 def initial_state(
     config: FilterConfig,
     rotation: Any,
@@ -61,8 +63,8 @@ def initial_state(
     """Start of the filter from a known pose, without clones.
 
     rotation (3, 3) body → world; velocity (3,) m/s and position (3,) m in the world frame;
-    gyro_bias rad/s and accel_bias m/s², each (3,) or one number for all axes; std the standard
-    deviations of their errors, independent of each other. Raises `ValueError` naming an argument of
+    gyro_bias rad/s and accel_bias m/s², each (3,) or one number for all axes; std has the standard
+    deviations of their errors, which are independent. Raises `ValueError` naming an argument of
     wrong shape or precision.
     """
     rotation = checked_array("rotation", rotation, (3, 3), config)
@@ -85,17 +87,16 @@ def level_state(
     """Start without a reference: tilt from gravity, yaw, velocity and position zero (ours).
 
     gyro rad/s and accel m/s² (m, 3), raw, are the first samples, of a second or so, in which the
-    device should be still. Where their standard deviations are not below `rest_gyro` and
-    `rest_accel`, the gyro turns the accelerations into the frame of the first sample before they
-    are averaged: a hand that turns the phone takes gravity along. Where a second or more is as
-    quiet as on a table, the bias of the gyro is its mean, as in `rest_at_start`; else it is zero.
+    device should be still. If their standard deviations are not below `rest_gyro` and `rest_accel`,
+    the accelerations are rotated by the gyro into the frame of the first sample before they are
+    averaged, because a hand may turn the phone. If a second or more is as quiet as on a table, the
+    bias of the gyro is its mean, as in `rest_at_start`; otherwise it is zero.
 
-    Of `std`, tilt and velocity are replaced. The tilt's is what the accelerometer's bias and the
-    spread of what is averaged leave of the mean, over half a second to an independent sample. The
-    velocity's is 0.05 m/s where that spread is that of a table, 1 m/s where it is a walker's, and
-    between them in proportion. The yaw is zero by definition, so its own is kept. Raises
-    `ValueError` naming an argument of wrong shape or precision, that is not finite, or that shows
-    no gravity.
+    The `std` of tilt and velocity are replaced. That of the tilt follows from the accelerometer's
+    bias and from the spread of the averaged accelerations, with one independent sample per half
+    second. That of the velocity is proportional to this spread, from 0.05 m/s on a table to 1 m/s
+    for a walker. The yaw is zero by definition, so its `std` is kept. Raises `ValueError` naming an
+    argument of wrong shape or precision, that is not finite, or that shows no gravity.
     """
     samples = jnp.shape(accel)[0] if jnp.ndim(accel) else 0
     gyro = checked_array("gyro", gyro, (samples, 3), config)
@@ -117,8 +118,8 @@ def level_state(
 def _levelled(
     gyro: Array, accel: Array, bias_std: Array, config: FilterConfig
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Attitude from gravity, the gyro's bias, the standard deviations of tilt and velocity, and the
-    mean acceleration, m/s²."""
+    """The attitude from gravity, the gyro's bias, the standard deviations of tilt and velocity, and
+    the mean acceleration, m/s²."""
     of_gyro, of_accel = jnp.var(gyro, axis=0), jnp.var(accel, axis=0)
     on_a_table = jnp.all(of_gyro <= REST_GYRO_STD**2) & jnp.all(of_accel <= REST_ACCEL_STD**2)
     long_enough = len(gyro) >= round(REST_SECONDS / config.dt)
@@ -126,12 +127,12 @@ def _levelled(
     quiet = of_gyro.sum() < config.rest_gyro**2
     quiet = quiet & (of_accel.sum() < config.rest_accel**2)
     attitudes = geometry.integrate_turns(jnp.eye(3, dtype=gyro.dtype), gyro[:-1] * config.dt)
-    # A quiet gyro shows its bias alone.
+    # A gyro at rest measures only its bias.
     accel = jnp.where(quiet, accel, jnp.einsum("ijn,nj->ni", attitudes, accel))
     variance, up = jnp.sum(jnp.var(accel, axis=0)), accel.mean(0)
     independent = max(1.0, 2 * len(gyro) * config.dt)
     mean_error = jnp.sqrt(bias_std**2 + variance / independent)
-    # Bounded before the root, whose slope at zero is infinite.
+    # The value is bounded before the root, whose slope at zero is infinite.
     velocity = jnp.clip(_SPEED_OF_SPREAD**2 * variance, _STILL_STD**2, _MOVING_STD**2)
     return geometry.level(up), gyro_bias, mean_error / GRAVITY, jnp.sqrt(velocity), up
 
@@ -142,14 +143,15 @@ class Rest(NamedTuple):
     gyro_bias: Float[np.ndarray, "3"]
     """Its mean, rad/s; zero where there is no rest."""
     seconds: float
-    """How long it rests, in whole seconds."""
+    """Duration of the rest, in whole seconds."""
 
 
 def rest_at_start(
     gyro: Float[np.ndarray, "m 3"], accel: Float[np.ndarray, "m 3"], dt: float
 ) -> Rest:
     """The whole seconds at the start in which raw gyro (rad/s) and accel (m/s²) are as quiet as on
-    a table (ours). NaN: a sample is missing; a second that lacks more than half of them is not."""
+    a table (ours). NaN means that a sample is missing; a second without more than half of its
+    samples is not quiet."""
     second, rest = round(REST_SECONDS / dt), 0
     there = finite_rows(gyro) & finite_rows(accel)
     while rest + second <= len(gyro):

@@ -7,12 +7,12 @@ R ← exp(δθ) R; everything else adds. b is the temporally correlated part of 
 errors (see `update`): no entries, or 3.
 
 Positions are held as offsets o = p − a from an anchor a, a past position that moves up to the
-present once in a window; s is its last move. A clone keeps the anchor that it was taken with: the
-present one, or the one before. The variance of a position grows without bound, since only
-differences of positions are measured; those of offsets and moves do not. So no update subtracts
-large variances from each other, which is what makes the plain form (θ, v, p, …) diverge in float32.
-The change of variables is linear with constant coefficients (p = a + o for the core), so the filter
-is exactly the plain one.
+present once in a window; s is its last move. The offset of a clone refers to the anchor at the time
+of cloning: the present one, or the one before. The variance of a position grows without bound,
+since only differences of positions are measured; those of offsets and moves do not. So no update
+subtracts large variances from each other. Such differences make the plain form (θ, v, p, …) diverge
+in float32. The change of variables is linear with constant coefficients (p = a + o for the core),
+so the filter is equivalent to the plain one.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.types import Array
 
 CORE, CLONE = 21, 6
-"""Entries of the error state: of the core without b, and of each clone."""
+"""Number of entries of the error state: of the core without b, and of each clone."""
 THETA, VELOCITY, OFFSET, GYRO_BIAS, ACCEL_BIAS, ANCHOR, MOVE = (
     slice(3 * i, 3 * i + 3) for i in range(7)
 )
-"""Where each part of the core's error lies."""
+"""Entries of each part of the core's error."""
 BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
 """b_g, b_a: constant over an interval."""
 LOCAL = slice(THETA.start, ANCHOR.start)
@@ -42,39 +42,38 @@ LOCAL = slice(THETA.start, ANCHOR.start)
 CORRELATED = slice(MOVE.stop, None)
 """b: 0 or 3 entries."""
 CLONE_THETA, CLONE_OFFSET = slice(0, 3), slice(3, 6)
-"""Where each part of a clone's error lies."""
+"""Entries of each part of a clone's error."""
 
 
 class GateState(NamedTuple):
-    """Memory of the χ² gate. Times count IMU samples since initialisation, so that no rounding can
-    move a decision."""
+    """Memory of the χ² gate. Times count IMU samples since initialisation, so that rounding cannot
+    change a decision."""
 
     converged: Bool[Array, ""]
-    """Latched by the first update whose oldest clone is old enough."""
+    """True from the first update on whose oldest clone is old enough."""
     last_success: Int[Array, ""]
-    """Sample of the last measurement that was not rejected, and by as much later as there was none
-    since; −1 before the first."""
+    """Sample of the last measurement that was not rejected, plus the samples since in which there
+    was no measurement; −1 before the first."""
     pause_end: Int[Array, ""]
     """First sample at which the gate may be active again."""
 
 
 class ImuMemory(NamedTuple):
-    """What one clone interval leaves of the IMU to the next."""
+    """The memory of the IMU from one clone interval to the next."""
 
     gyro: Float[Array, "3"]
     """The last sample that was not missing, rad/s, raw; NaN before there was one."""
     accel: Float[Array, "3"]
     """The same, m/s²."""
     missing: Int[Array, ""]
-    """Samples missing since."""
+    """Number of samples missing since."""
     quiet: Int[Array, ""]
-    """Clone intervals in a row in which the IMU was quiet; counted where `zero_velocity_std` is
-    above 0."""
+    """Number of successive clone intervals in which the IMU was quiet; counted if
+    `zero_velocity_std` is above 0."""
 
 
 class Mean(NamedTuple):
-    """Estimates of one time, or stacked over K of them, in the frames and units of
-    `FilterState`."""
+    """Estimates at one time, or stacked over K times, in the frames and units of `FilterState`."""
 
     rotation: Float[Array, "*k 3 3"]
     velocity: Float[Array, "*k 3"]
@@ -85,7 +84,7 @@ class Mean(NamedTuple):
 
 class FilterState(NamedTuple):
     """Mean and covariance. c = W + 1 clones, oldest first between runs; inside a run they are a
-    ring. Those not yet taken are zero (their rotations the identity)."""
+    ring. Clones that do not exist yet are zero (their rotations the identity)."""
 
     rotation: Float[Array, "3 3"]
     """Body → world."""
@@ -102,25 +101,25 @@ class FilterState(NamedTuple):
     move: Float[Array, "3"]
     """From the anchor before it, m."""
     correlated: Float[Array, "e"]
-    """Temporally correlated part of the displacements' errors, in their standard deviations: no
-    entries, or 3."""
+    """Temporally correlated part of the displacements' errors, in units of their standard
+    deviations: no entries, or 3."""
     clone_rotation: Float[Array, "c 3 3"]
     """Cloned rotations."""
     clone_offset: Float[Array, "c 3"]
-    """Cloned positions, from the anchor they were taken with; between runs, from the present one,
-    m."""
+    """Cloned positions, m, from the anchor at the time of cloning; between runs, from the present
+    anchor."""
     core_covariance: Float[Array, "n n"]
     """θ, v, o, b_g, b_a, a, s, b: n = 21, or 24 with a correlated error."""
     cross_covariance: Float[Array, "n 6c"]
-    """Core against the clones' θ, o."""
+    """Covariance of the core with the clones' θ, o."""
     clone_covariance: Float[Array, "6c 6c"]
-    """Among the clones."""
+    """Covariance of the clones' θ, o."""
     step: Int[Array, ""]
     """Clone intervals since initialisation."""
     gate: GateState
     imu: ImuMemory
     healthy: Bool[Array, ""]
-    """False for good once it was False: see `FilterHistory.healthy`."""
+    """Once False, it remains False: see `FilterHistory.healthy`."""
 
     @property
     def position(self) -> Float[Array, "*k 3"]:
@@ -129,20 +128,21 @@ class FilterState(NamedTuple):
 
     @property
     def mean(self) -> Mean:
-        """Of the core, with the position instead of the offset."""
+        """The mean of the core, with the position instead of the offset."""
         return Mean(self.rotation, self.velocity, self.position, self.gyro_bias, self.accel_bias)
 
 
-# One program in place of thirty, which take three times as long when first called.
+# One program in place of thirty, which take three times as long at the first call.
 @functools.partial(jax.jit, static_argnames="clones")
 def without_clones(pose: Mean, std: InitialStd, clones: int) -> FilterState:
     """The state at the start, in the precision of `pose`, with independent errors of `std`.
 
-    The whole uncertainty of the position is in the anchor: there is no offset and no move yet.
+    The whole uncertainty of the position is in the anchor, because there is no offset and no move
+    yet.
     """
     dtype = pose.rotation.dtype
     nothing, unknown = jnp.zeros(3, dtype), jnp.full(3, jnp.nan, dtype)
-    # Of tilt, yaw, v, o, b_g, b_a, a, s.
+    # Standard deviations of tilt, yaw, v, o, b_g, b_a, a, s.
     parts = (*std[:3], 0.0, std.gyro_bias, std.accel_bias, std.position, 0.0)
     each = jnp.stack([jnp.asarray(part, dtype) for part in parts])
     core_std = jnp.repeat(each, np.array([2, 1, 3, 3, 3, 3, 3, 3]), total_repeat_length=CORE)
@@ -206,8 +206,8 @@ def core_covariance(covariance: Float[Array, "n n"]) -> Float[Array, "15 15"]:
 
 
 def move_anchor(state: FilterState, anchored: Float[Array, ""]) -> FilterState:
-    """The mean with the anchor moved up to the present position where `anchored` is 1, as it is
-    where that is 0."""
+    """The state with the anchor moved up to the present position if `anchored` is 1, and unchanged
+    if it is 0."""
     wanted = anchored > 0
     return state._replace(
         anchor=jnp.where(wanted, state.anchor + state.offset, state.anchor),

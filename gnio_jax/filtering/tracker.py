@@ -1,8 +1,9 @@
-"""The filter online: IMU samples as they come, a pose after every clone interval, or at any time.
+"""The filter online: it takes IMU samples as they come and gives a pose after every clone interval,
+or at any time.
 
-The samples reach the filter on its own uniform clock (`resampler.Stream`). Grid sample k, at
-t_0 + k·dt, drives the interval up to t_0 + (k + 1)·dt. It is known when the first stamp at or after
-its own has come, so the latency is at most one sample; the pose is that of the end of its interval.
+The samples reach the filter on its own uniform clock (`resampler.Stream`). Grid sample k, at t_0 +
+k·dt, drives the interval up to t_0 + (k + 1)·dt. It is known when the first stamp at or after its
+own has come, so the latency is at most one sample. The pose is that of the end of its interval.
 Where the IMU is faster than the filter, a low-pass adds its delay to the latency: `Tracker.delay`,
 some 22 samples of the filter, 0.11 s at 200 Hz.
 """
@@ -60,14 +61,15 @@ class Pose(NamedTuple):
     gyro_bias: Float[np.ndarray, "3"]
     accel_bias: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "15 15"]
-    """Of the error in θ (world frame, left), v, p, b_g, b_a, consider covariance included."""
+    """Covariance of the error in θ (world frame, left), v, p, b_g, b_a, including the consider
+    covariance."""
     accepted: float
-    """1 where the last clone step used its measurement, 0 where not, NaN where it had none."""
+    """1 if the last clone step used its measurement, 0 if not, NaN if it had none."""
     nis: float
-    """rᵀ S⁻¹ r of the measurement of the last clone step; NaN where it had none."""
+    """rᵀ S⁻¹ r of the measurement of the last clone step; NaN if it had none."""
     healthy: bool
-    """False once a clone step left a state that is not finite, a negative variance or a speed above
-    `FilterConfig.speed_limit`. All poses since then are void."""
+    """False from the first clone step on whose state is not finite, has a negative variance or a
+    speed above `FilterConfig.speed_limit`. All poses from there on are invalid."""
 
 
 class Estimate(NamedTuple):
@@ -80,16 +82,16 @@ class Estimate(NamedTuple):
 
 
 class Core(NamedTuple):
-    """What lives on the device."""
+    """The arrays on the device."""
 
     filter: FilterState
-    """After the last clone step; its clones are a ring, the next of which to be written is
-    `intervals` mod W + 1."""
+    """The state after the last clone step. Its clones are a ring, whose next slot to be written is
+    `intervals` modulo W + 1."""
     window: Float[Array, "r 7"]
-    """The last `FilterConfig.reach` grid samples before it, holes bridged: gyro rad/s, accel m/s²,
-    raw, and whether the filter used the sample."""
+    """The last `FilterConfig.reach` grid samples before it, with holes bridged: gyro rad/s, accel
+    m/s², raw, and whether the filter used the sample."""
     intervals: Int[Array, ""]
-    """Clone steps so far."""
+    """Number of clone steps so far."""
     tangents: Tangents | None
     """Derivatives of the filter by the errors that it does not estimate; None: there are none."""
 
@@ -98,22 +100,22 @@ class Tracker:
     """The filter with the network in the loop, fed sample by sample.
 
     - predict, config, noise: as `run_odometry` takes them.
-    - state: the start, at the time of the first sample (`initial_state`, `level_state`, or what a
-      run left). None: it is made of the first `rest_seconds`, in which the device must lie still
-      (`level_state`); until then there is no pose, and then these samples are filtered, too. A
-      sample that is missing, or without any acceleration, begins the rest anew.
+    - state: the start, at the time of the first sample (`initial_state`, `level_state`, or the
+      final state of a run). None: it is made of the first `rest_seconds`, in which the device must
+      be still (`level_state`). Until then there is no pose; afterwards these samples are filtered
+      too. A sample that is missing, or without any acceleration, begins the rest anew.
     - rest_seconds, std: length of that rest, s, and the standard deviations of that start.
     - hole: samples further apart than this leave the grid samples between them missing, s; None:
-      1.5 dt. A slower IMU needs more.
+      1.5 dt. A slower IMU needs a larger value.
     - imu_rate: Hz, nominal, of the samples that will come; None: 1/dt. A faster IMU is band-limited
-      as `data.resample` does it, and poses come later by `delay`. The stamps could tell the rate,
-      but no pose could be given before, and jitter would decide on the delay.
+      as in `data.resample`, and poses come later by `delay`. The rate could be estimated from the
+      stamps, but then there would be no pose before, and the delay would depend on jitter.
     - considered: errors that the filter does not estimate, constant since the start, whose consider
       covariance is added to that of the poses (see `consider`). None: there are none.
 
-    Everything is compiled here, so that no sample waits for a compiler. Poses are new arrays, which
-    later samples do not touch. Not for several threads at once. Raises `ValueError` naming an
-    argument that makes no sense.
+    The constructor compiles everything, so that no sample waits for a compiler. Poses are new
+    arrays, which later samples do not change. A tracker must not be used by several threads at
+    once. Raises `ValueError` naming an argument that makes no sense.
     """
 
     def __init__(
@@ -136,7 +138,7 @@ class Tracker:
         dtype = jax.dtypes.canonicalize_dtype(np.float64) if state is None else state.offset.dtype
         self._noise = checked_noise(noise, dtype)
         start = state
-        if start is None:  # Any start will do to compile for.
+        if start is None:  # The programs are compiled for the shapes of any start.
             nothing = jnp.zeros(3, dtype)
             start = initial_state(config, jnp.eye(3, dtype=dtype), nothing, nothing, std=std)
         core = self._start(start)
@@ -147,23 +149,21 @@ class Tracker:
             self._core = None
 
     def expect(self, imu_rate: float, hole: float | None = None) -> None:
-        """Take samples of another `imu_rate` and `hole`, before the first of them. Nothing is
-        compiled again."""
+        """Change `imu_rate` and `hole` before the first sample. Nothing is compiled again."""
         self._stream = Stream(create_grid(self._config.dt, hole, imu_rate))
 
     def push(self, time: Any, gyro: Any, accel: Any) -> Pose | None:
-        """Take one sample: time s, gyro (3,) rad/s, accel (3,) m/s², raw, in the body frame; a
-        value that is not finite: missing.
+        """Take one sample: time s, gyro (3,) rad/s, accel (3,) m/s², raw, in the body frame. A
+        sample with a value that is not finite is missing.
 
-        Returns the pose of a clone step, if one was made (of the last, after a gap), else None:
-        then `pose()` has the newest. A stamp that is more than `LONGEST_TRUSTED` after the one
-        before is believed once that of the next sample agrees with it; until then its sample waits.
-
-        Raises `ValueError` naming the argument if the time does not increase, or by more than
-        `LONGEST_GAP`, or a shape is wrong, or a value is beyond what an IMU measures; then nothing
-        has changed. It raises it, too, from the hundredth grid sample on where the IMU is so much
-        faster than `imu_rate` that it would alias, and for a rest without gravity, whose samples
-        are left out.
+        Returns the pose of a clone step, if one was made (of the last one after a gap), else None:
+        `pose()` gives the newest pose at any time. A stamp that is more than `LONGEST_TRUSTED`
+        after the one before is accepted when that of the next sample agrees with it; until then its
+        sample waits. Raises `ValueError` naming the argument and changes nothing if the time does
+        not increase, if it increases by more than `LONGEST_GAP`, if a shape is wrong, or if a value
+        is beyond the range of an IMU. It also raises `ValueError` from the hundredth grid sample on
+        if the IMU is so much faster than `imu_rate` that it would alias, and for a rest without
+        gravity, whose samples are left out.
         """
         self._stream.push(*_checked_sample(time, gyro, accel))
         if self._core is None:
@@ -177,11 +177,11 @@ class Tracker:
         return self._as_pose() if made else None
 
     def pose(self) -> Pose | None:
-        """The pose after the newest grid sample; between clone steps by integrating the samples
-        since. None while there is no start.
+        """The pose after the newest grid sample; between clone steps the samples since the last
+        step are integrated. None while there is no start.
 
-        Its time is NaN before the first sample on the grid. Costs a dispatch for each sample
-        since it was last asked.
+        Its time is NaN before the first sample on the grid. A call costs a dispatch for each sample
+        since the last call.
         """
         if self._core is None:
             return None
@@ -202,14 +202,14 @@ class Tracker:
 
     @property
     def delay(self) -> float:
-        """By how much the low-pass of a faster IMU delays all poses, s; 0 without one.
+        """Delay of all poses by the low-pass of a faster IMU, s; 0 without one.
 
-        It is latency: the times of the poses are right.
+        It is a latency: the times of the poses are correct.
         """
         return self._stream.grid.delay
 
     def _start_from_rest(self) -> None:
-        """Start, once the next samples are a whole rest; they stay to be filtered."""
+        """Start as soon as the next samples make a whole rest; they are filtered afterwards."""
         while self._core is None and self._stream.known >= self._rest:
             rows = self._stream.rows(self._rest)
             unusable = np.flatnonzero((rows[:, VALID] == 0) | ~rows[:, ACCEL].any(axis=1))
@@ -218,7 +218,7 @@ class Tracker:
                 continue
             try:
                 state = level_state(self._config, rows[:, GYRO], rows[:, ACCEL], self._std)
-            except ValueError:  # It shows no gravity: the next samples may.
+            except ValueError:  # It shows no gravity, but the next samples may.
                 self._stream.take(self._rest)
                 raise
             self._start(state)
@@ -228,14 +228,14 @@ class Tracker:
         state = checked_state(state, self._config, self._noise)
         window = jnp.zeros((self._config.reach, 7), state.offset.dtype)
         tangents = None if self._considered is None else start_tangents(state)
-        # Copies: the compiled step takes the memory of its argument, which may not be shared, not
-        # even between two of its fields.
+        # Copies, because the compiled step takes the memory of its argument, which no other array,
+        # nor two of its fields, may share.
         core = _copied(Core(state, window, jnp.int32(0), tangents))
         flags = jnp.stack([jnp.nan, jnp.nan, state.healthy]).astype(window.dtype)
         self._core: Core | None = core
         estimate = estimated(state, flags, tangents, self._considered)
         self._ahead: tuple[int, Estimate, ImuMemory] = 0, estimate, core.filter.imu
-        """How many known samples `pose` has integrated, and what that gave."""
+        """Number of known samples that `pose` has integrated, and the result."""
         return core
 
     def _as_pose(self) -> Pose:
@@ -274,7 +274,7 @@ def advance(
     considered: ConsideredStd | None,
 ) -> tuple[Core, Estimate]:
     """One clone step, as `run_odometry` makes it, from the n grid samples (gyro, accel, valid) of
-    its interval. Where the window is no measurement the network is not called."""
+    its interval. The network is not called if the window is no measurement."""
     valid = rows[:, VALID] > 0
     imu, age, memory = bridge(rows[:, GYRO], rows[:, ACCEL], valid, core.filter.imu, config)
     assert imu.gap is not None
@@ -326,7 +326,7 @@ def look_ahead(
 ) -> tuple[Estimate, ImuMemory]:
     """The estimate and the memory of the IMU after one more grid sample, by integration alone.
 
-    A consider covariance takes the same transition as the filter's own.
+    A consider covariance is propagated by the same transition as the filter's own.
     """
     mean, covariance, flags = estimate
     imu, _, memory = bridge(row[None, GYRO], row[None, ACCEL], row[None, VALID] > 0, memory, config)
@@ -363,7 +363,7 @@ def _checked_sample(time: Any, gyro: Any, accel: Any) -> tuple[float, tuple[floa
 def _numbers(
     name: str, value: Any, shape: tuple[int, ...], wanted: str, largest: float, unit: str = ""
 ) -> tuple[float, ...]:
-    """The numbers of an array of this shape, which are as small as those of an IMU."""
+    """The numbers of an array of this shape, which must be within the range of an IMU."""
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError):

@@ -4,17 +4,17 @@ A measurement of m = 1 to 3 numbers is linearised at the present estimate to
 
     r = H δ + w,   w ~ N(0, R),
 
-where r is the residual (measured − predicted) and δ the error of the state. H touches few parts of
-the error (`PARTS`), so that H P needs few rows of P. With S = H P Hᵀ + R = L Lᵀ and
-Y = L⁻¹ H P the gain is Yᵀ L⁻¹, the correction of the error Yᵀ L⁻¹ r, and P ← P − Yᵀ Y, symmetric
-to the last bit.
+where r is the residual (measured − predicted) and δ the error of the state. H depends on few parts
+of the error (`PARTS`), so H P needs few rows of P. With S = H P Hᵀ + R = L Lᵀ and Y = L⁻¹ H P the
+gain is Yᵀ L⁻¹, the correction of the error is Yᵀ L⁻¹ r, and P ← P − Yᵀ Y is symmetric to the last
+bit.
 
 A measurement is an object with a method
 
     update(state, step) -> (state, Outcome, Correction),
 
-which linearises it (`linearise`) and takes it (`measure`); see `Displacement`, `ZeroVelocity`, and
-"A measurement of your own" in docs/differentiable_filter.md.
+which linearises it (`linearise`) and applies it (`measure`); see `Displacement`, `ZeroVelocity`,
+and "A measurement of your own" in docs/differentiable_filter.md.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ PARTS = (
     *("rotation", "velocity", "position", "gyro_bias", "accel_bias", "correlated"),
     *("oldest_rotation", "since_oldest"),
 )
-"""The parts of the error that a measurement may depend on, each with 3 entries: of the present the
-rotation δθ (rad, world frame, R ← exp(δθ) R), velocity, position, both biases, and the temporally
-correlated error of the displacements, where there is one; the rotation of the oldest clone; and the
-position since that clone, p_j − p_i."""
+"""The parts of the error on which a measurement may depend, each with 3 entries. Parts of the
+present state are the rotation δθ (rad, world frame, R ← exp(δθ) R), velocity, position, both
+biases, and the temporally correlated error of the displacements, if there is one. The others are
+the rotation of the oldest clone, and the position since that clone, p_j − p_i."""
 
 
 class Linearised(NamedTuple):
@@ -71,27 +71,29 @@ class Linearised(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a measurement."""
+    """The outcome of a measurement."""
 
     present: Bool[Array, ""]
-    """Whether there was one. Without one all that follows is zero or False, but √det S is 1."""
+    """Whether there was a measurement. Without one all following fields are zero or False, except
+    √det S, which is 1."""
     tested: Bool[Array, ""]
     """Whether a χ² test judged it."""
     residual: Float[Array, "m"]
     """r."""
     nis: Float[Array, ""]
-    """Normalised innovation squared, rᵀ S⁻¹ r, with R as it was measured."""
+    """Normalised innovation squared, rᵀ S⁻¹ r, with the covariance R of the measurement before any
+    enlargement."""
     volume: Float[Array, ""]
     """√det S, with the same R."""
     weight: Float[Array, ""]
-    """1 where the test passed, 0 where it failed, between them behind a gate with a slope."""
+    """1 if the test passed, 0 if it failed, between 0 and 1 for a gate with a slope."""
     accepted: Bool[Array, ""]
-    """Whether it was applied, with whatever covariance."""
+    """Whether it was applied, with R or with an enlarged covariance."""
 
 
 class Correction(NamedTuple):
-    """What an update did to the error e: e ← e − Yᵀ L⁻¹ r, where L⁻¹ r = L⁻¹ (H e + w). All entries
-    are zero where no update was made. Smoothing undoes it."""
+    """The change of the error e by an update: e ← e − Yᵀ L⁻¹ r, where L⁻¹ r = L⁻¹ (H e + w). All
+    entries are zero if no update was made. The smoother runs backwards over it."""
 
     residual: Float[Array, "m"]
     """L⁻¹ r."""
@@ -115,7 +117,7 @@ class Step(NamedTuple):
     config: FilterConfig
     noise: NoiseModel
     before: tuple[Outcome, ...] = ()
-    """What became of the measurements of this interval before this one; the first is the
+    """Outcomes of the measurements of this interval before this one; the first is the
     displacement."""
 
 
@@ -131,7 +133,7 @@ def linearise(state: FilterState, residual: Any, covariance: Any, **jacobian: An
     """A measurement with the residual r (m,) and the covariance R (m, m), in the state's precision.
 
     `jacobian` has the blocks (m, 3) of H, the derivative of the predicted value, by the names of
-    `PARTS`; those that are left out are zero. Raises `ValueError` for another name.
+    `PARTS`; blocks that are left out are zero. Raises `ValueError` for another name.
     """
     if unknown := set(jacobian) - set(PARTS):
         raise ValueError(f"linearise: {min(unknown)}: is none of {', '.join(PARTS)}")
@@ -151,8 +153,8 @@ def linearise(state: FilterState, residual: Any, covariance: Any, **jacobian: An
 def measurable_errors(
     core: Float[Array, "n k"], clones: Float[Array, "c k"], oldest: Array | int
 ) -> dict[str, Float[Array, "3 k"]]:
-    """`PARTS` of k errors of core and clones. p = a + o. p_j − p_i = o + s − o_i where the oldest
-    clone still has the anchor before, else it is o − o_i."""
+    """`PARTS` of k errors of core and clones. p = a + o. p_j − p_i is o + s − o_i if the oldest
+    clone refers to the anchor before, else o − o_i."""
     of_oldest = jax.lax.dynamic_slice_in_dim(clones, CLONE * oldest, CLONE)
     present = core[OFFSET] + anchors_apart(oldest, core.dtype) * core[MOVE]
     return {
@@ -168,8 +170,8 @@ def measurable_errors(
 
 
 def anchors_apart(oldest: Array | int, dtype: np.dtype) -> Float[Array, ""]:
-    """Moves of the anchor between the oldest clone and the core: 0 once in a round of the ring,
-    else 1."""
+    """Number of moves of the anchor between the oldest clone and the core: 0 once in a round of the
+    ring, else 1."""
     return jnp.where(jnp.asarray(oldest) == 0, 0.0, 1.0).astype(dtype)
 
 
@@ -182,9 +184,9 @@ def since_oldest(state: FilterState, oldest: Array | int) -> Float[Array, "3"]:
 def measure(
     state: FilterState, linear: Linearised, step: Step, threshold: Array | float = math.inf
 ) -> tuple[FilterState, Outcome, Correction]:
-    """One EKF update. A residual or covariance with a NaN is no measurement, and one whose
-    rᵀ S⁻¹ r is above a finite `threshold` is refused (e.g. a quantile of χ² with m degrees of
-    freedom)."""
+    """One EKF update. A residual or covariance with a NaN means that there is no measurement. A
+    measurement whose rᵀ S⁻¹ r is above a finite `threshold` is refused (e.g. a quantile of χ² with
+    m degrees of freedom)."""
     outcome, correction = project(state, linear, step.oldest)
     tested = outcome.present & jnp.isfinite(threshold)
     accepted = outcome.present & (outcome.nis <= threshold)
@@ -196,8 +198,8 @@ def measure(
 def project(
     state: FilterState, linear: Linearised, oldest: Array | int
 ) -> tuple[Outcome, Correction]:
-    """What becomes of a measurement that is accepted where there is one. Where there is none, r is
-    zero and S the identity: NaN stays out of the arithmetic, and out of the derivatives."""
+    """The outcome of a measurement that is accepted if it exists. If there is none, r is zero and S
+    the identity, so that no NaN enters the arithmetic or the derivatives."""
     present = jnp.isfinite(linear.residual).all() & jnp.isfinite(linear.covariance).all()
     jacobian = jnp.concatenate(list(linear.jacobian.values()), axis=1)
 
@@ -223,11 +225,11 @@ def project(
 def correct(
     state: FilterState, outcome: Outcome, correction: Correction, newest: Array | int
 ) -> tuple[FilterState, Outcome, Correction]:
-    """Mean and covariance after an update, and its correction, which is zero where it was not
-    accepted. `newest` is the slot of the newest clone."""
+    """Mean and covariance after an update, and its correction, which is zero if the measurement was
+    not accepted. `newest` is the slot of the newest clone."""
     correction = jax.tree.map(lambda rows: jnp.where(outcome.accepted, rows, 0.0), correction)
-    # A reduction on purpose: it is kept, where the sum spelt out would be computed anew for every
-    # entry that the correction of the mean reads.
+    # A reduction is used on purpose: its result is kept, but a sum that is written out would be
+    # computed again for every entry that the correction of the mean reads.
     core, clones = (
         jnp.sum(correction.residual[:, None] * rows, axis=0)
         for rows in (correction.core, correction.clones)
@@ -243,8 +245,8 @@ def correct(
 def retract(
     state: FilterState, core: Float[Array, "n"], clones: Float[Array, "c 6"], newest: Array | int
 ) -> FilterState:
-    """Add an error to the mean: R ← exp(δθ) R, the rest adds. The core's pose is that of the newest
-    clone."""
+    """Add an error to the mean: R ← exp(δθ) R, and all other parts are added. The newest clone has
+    the core's pose."""
     turns = jax.vmap(geometry.exp)(clones[:, CLONE_THETA])
     rotations = jax.vmap(matmul)(turns, state.clone_rotation)
     offsets = state.clone_offset + clones[:, CLONE_OFFSET]
@@ -273,8 +275,8 @@ def whiten(
     """L⁻¹ of each of the rows, for a symmetric S = L Lᵀ, and √det S; NaN where S is not positive
     definite.
 
-    Written out number by number: a call to LAPACK costs more than the whole update, and to
-    eliminate S row by row makes a clone step some percent slower.
+    It is written out number by number: a call to LAPACK costs more than the whole update, and
+    eliminating S row by row makes a clone step some percent slower.
     """
     root: list[list[Array]] = []  # the lower triangle of L, row by row
     for i in range(len(s)):
@@ -322,9 +324,9 @@ def downdate(covariance: Float[Array, "c c"], rows: Float[Array, "m c"]) -> Floa
 
 @downdate.defjvp
 def _downdate_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """The signs are with the rows, or the backward pass would turn that of the whole matrix. Two
-    products, as the transpose of one and its mirror image would add a matrix to its own transpose.
-    """
+    """The signs are applied to the rows, because otherwise the backward pass would negate the whole
+    matrix. There are two products, because the transpose of one product and its mirror image would
+    add a matrix to its own transpose. """
     (covariance, rows), (d_covariance, d_rows) = primals, tangents
     change = (-d_rows).T @ rows + (-rows).T @ d_rows
     return downdate(covariance, rows), d_covariance + change

@@ -1,13 +1,13 @@
-"""A walk with waypoints as one with poses (ours): filter and smoother make a reference of positions
-that are known at a few moments, e.g. because somebody tapped on a map where he was.
+"""Poses for a walk with waypoints (ours): filter and smoother make a reference from positions that
+are known at a few moments, e.g. because somebody tapped them on a map.
 
-The world of the filter is level, and its yaw is 0 at the start; how it lies on the map is not
-known. So the filter runs without the waypoints first, and the rotation and shift that lay its path
-over them (`geometry.planar_alignment`) turn its start. From there, with an uncertain yaw and
-position, the smoother takes the waypoints and the displacements of the first run. Somebody may tap
-too early, too late or in the wrong place: a waypoint far off the smoothed path gets a larger
-covariance, as Student's t with `FREEDOM` degrees of freedom weighs it, and it is smoothed again
-from the start that was found.
+The world of the filter is level, and its yaw is 0 at the start; its rotation and shift relative to
+the map are not known. So the filter first runs without the waypoints, and the rotation and shift
+that align its path with them (`geometry.planar_alignment`) are applied to its start. From there,
+with an uncertain yaw and position, the smoother takes the waypoints and the displacements of the
+first run. A tap may be too early, too late or in the wrong place. So a waypoint far from the
+smoothed path gets a larger covariance, with the weight of Student's t with `FREEDOM` degrees of
+freedom, and the path is smoothed again from the start that was found.
 """
 
 from __future__ import annotations
@@ -36,30 +36,31 @@ from gnio_jax.numerics import interpolate, quaternion_from_matrix, rotation_z
 from gnio_jax.types import GRAVITY, Array, Sequence, Waypoints
 
 PLACE_STD, TIME_STD = 0.3, 0.4
-"""Standard deviations of where, m, and of when, s, somebody taps."""
+"""Standard deviations of the place, m, and of the time, s, of a tap."""
 START_STD = {"tilt": 0.1, "yaw": 0.5, "velocity": 1.0, "position": 10.0, "gyro_bias": 2e-3}
-"""Of the start that was turned: rad, rad, m/s, m, rad/s."""
+"""Standard deviations of the aligned start: rad, rad, m/s, m, rad/s."""
 CORRELATION = CorrelatedError(share=0.95, seconds=5.0)
-"""Of the displacements' errors: a network takes a walker for too fast or too slow leg by leg. Their
-standard deviation is that by which the first path misses the legs, beside the network's own."""
+"""Temporal correlation of the displacements' errors: a network overestimates or underestimates a
+walker's speed leg by leg. Their standard deviation is the error of the first path over the legs,
+added to the network's own."""
 FREEDOM, PASSES = 4.0, 4
-"""Of the weights, and how often the path is smoothed."""
+"""Degrees of freedom of the weights, and number of smoothings."""
 START_SECONDS = 1.0
-"""s from which the level start is made."""
+"""Duration of the samples from which the level start is made, s."""
 LONGER = 2.0
 """Recordings are filled up to lengths this factor apart, since each length is a compilation."""
 
 
 class WaypointPoses(NamedTuple):
-    """A walk with its poses, and what is known of them."""
+    """A walk with its poses and their covariances."""
 
     sequence: Sequence
-    """With a pose and a velocity at every sample in the frame of the map, z from the start; valid
-    from the first waypoint to the last, and without waypoints."""
+    """The walk with a pose and a velocity at every sample in the frame of the map, z relative to
+    the start. It is valid from the first waypoint to the last, and has no waypoints."""
     smoothed: SmoothedHistory
     """The same at the end of every clone interval, with covariances."""
     weight: Float[np.ndarray, "f"]
-    """Of each waypoint: above 1 where it is on the path, towards 0 where it is far off."""
+    """Weight of each waypoint: above 1 on the path, towards 0 far from it."""
 
 
 def waypoint_poses(
@@ -83,7 +84,7 @@ def waypoint_poses(
     padded = math.ceil(LONGER ** math.ceil(math.log(count, LONGER)))
     samples = padded * config.samples_per_clone
     signals = [x[0] for x in padded_signals([(sequence.gyro, sequence.accel)], samples)]
-    signals[0][len(sequence.time) :] = 1.0  # rad/s: no rest behind the end is smoothed back into it
+    signals[0][len(sequence.time) :] = 1.0  # rad/s, so that no rest after the end is smoothed into it
     masks = padded_masks([sequence.imu_valid], samples)
     valid = None if masks is None else masks[0]
     time = np.clip(waypoints.time, sequence.time[0], sequence.time[-1])
@@ -91,10 +92,10 @@ def waypoint_poses(
     ends = config.clone_seconds * np.arange(1, padded + 1)
 
     def at_taps(rows: Array) -> np.ndarray:
-        """Horizontal ones of rows at the ends of intervals."""
+        """Horizontal positions at the taps, from rows at the ends of intervals."""
         return interpolate(after, ends, np.asarray(rows)[:, :2])
 
-    # The path without the waypoints, laid over them.
+    # The path without the waypoints, aligned with them.
     first = slice(_first(config))
     level = level_state(config, signals[0][first], signals[1][first], setup.initial_std)
     _, history = _odometry(predict, level, *signals, config, noise, valid)
@@ -103,7 +104,7 @@ def waypoint_poses(
     turn, origin, weight, missed = _aligned(at_taps(history.position), place, after, place_std)
     yaw = np.arctan2(turn[1, 0], turn[0, 0])
 
-    # m/s of the path that the legs lack, in the displacement of a window.
+    # The error of the path over the legs, m/s, as a displacement of a window.
     short = missed * config.clones_per_window * config.clone_seconds
     covariance = covariance + jnp.diag(jnp.array([short, short, 0.0]) ** 2)[None]
     given_noise = {"measurement_scale": 1.0, "std_factor": (1.0, 1.0, 1.0)}
@@ -148,7 +149,7 @@ def _first(config: FilterConfig) -> int:
 
 
 def _checked_waypoints(sequence: Sequence, config: FilterConfig) -> Waypoints:
-    """Those of a sequence that can have poses. Raises `InputError`."""
+    """The waypoints of a sequence that can have poses. Raises `InputError`."""
     waypoints, step = sequence.waypoints, float(np.median(np.diff(sequence.time)))
     if waypoints is None or len(waypoints.time) < 2:
         raise InputError(sequence.name, "has fewer than two waypoints")
@@ -156,7 +157,8 @@ def _checked_waypoints(sequence: Sequence, config: FilterConfig) -> Waypoints:
         found = f"has {len(sequence.time)} samples at {1 / step:.4g} Hz"
         problem = f"{found}, at least {_first(config)} at {1 / config.dt:.4g} Hz are needed"
         raise InputError(sequence.name, problem, "resample it")
-    # A tap beside the first or the last stamp of the phone may be a sample off the uniform clock.
+    # A tap near the first or the last stamp of the phone may be a sample outside of the uniform
+    # clock.
     first, last = sequence.time[0] - config.dt, sequence.time[-1] + config.dt
     if waypoints.time[0] < first or waypoints.time[-1] > last:
         raise InputError(sequence.name, "has waypoints before its start or after its end")
@@ -174,9 +176,9 @@ def _aligned(
     time: Float[np.ndarray, "f"],
     least: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """The turn and shift that lay a path over the waypoints, weights of these (Cauchy's, with the
-    median distance as the scale, or `least` m where that is larger), and by how much the path
-    misses the legs between them (median), m/s."""
+    """The rotation and shift that align a path with the waypoints, the weights of the waypoints
+    (Cauchy's, with the median distance as the scale, or `least` m if that is larger), and the
+    median error of the path over the legs between them, m/s."""
     weight = np.ones(len(place))
     for _ in range(10):
         turn, shift = jax.device_get(_planar_alignment(path, place, weight))
@@ -193,9 +195,9 @@ def _between_clones(
 ) -> tuple[Array, Array, Array]:
     """Rotation, velocity and position at the stamp of every sample.
 
-    The IMU is integrated from the smoothed pose before an interval. What it misses of that at the
-    end is spread over the interval: the turn evenly, the position by the cubic that also mends the
-    velocity.
+    The IMU is integrated from the smoothed pose before an interval. The difference from the
+    smoothed pose at the end is distributed over the interval: the rotation evenly, the position by
+    the cubic that also corrects the velocity.
     """
     n, dt, seconds = config.samples_per_clone, config.dt, config.clone_seconds
     ends = Mean(*(getattr(smoothed, name) for name in Mean._fields))
@@ -226,7 +228,7 @@ def _between_clones(
 
     signals = (gyro, ends.gyro_bias), (accel, ends.accel_bias)
     imu = tuple(signal.reshape(-1, n, 3) - bias[:, None] for signal, bias in signals)
-    # Before the first interval: back over it from its end.
+    # The first interval is integrated backwards from its end.
     first, of_first = jax.tree.map(lambda rows: rows[0], (ends, imu))
     nothing = jnp.zeros(3)
     turned, _, _ = integrated(jnp.eye(3), nothing, nothing, *of_first)

@@ -23,13 +23,13 @@ class ZeroVelocity(NamedTuple):
     """Measures a velocity of zero, with `zero_velocity_std`, while the IMU is quiet."""
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
-        """A quiet IMU may also glide at constant velocity, which a displacement of the same
-        interval shows. So where one was tested and the gate is active, this measurement has to pass
-        the same χ² test. Elsewhere the filter may be wrong about its velocity, and rest can correct
+        """Apply the measurement, after a χ² test where a displacement was tested and the gate is
+        active: a quiet IMU may also move at constant velocity, which a displacement of the same
+        interval shows. In all other cases the filter's velocity may be wrong, and rest can correct
         it: after the start, after a series of rejections, and where there are no displacements.
-        Without them the gate never becomes stale, and a rest refused once would be refused for
-        ever. The gate's memory is that of the displacements alone: a false rest must not open their
-        gate, nor keep it shut.
+        Without displacements no gate would open again, and a rest that was refused once would
+        always be refused. The gate's memory depends on the displacements alone, because a false
+        rest must neither open nor close their gate.
         """
         config = step.config
         state, quiet = detect_rest(state, step.imu, config)
@@ -47,7 +47,7 @@ def detect_rest(
     """Whether the IMU has been quiet for `rest_seconds` (ours), and the state with the count of
     quiet intervals in a row.
 
-    An interval is quiet where no sample is missing and all are those of `quiet_samples`.
+    An interval is quiet if no sample is missing and all are quiet (`quiet_samples`).
     """
     rate, force = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
     quiet = jnp.all(quiet_samples(rate, force, config))
@@ -61,8 +61,8 @@ def detect_rest(
 def quiet_samples(
     rate: Float[Array, "n 3"], force: Float[Array, "n 3"], config: FilterConfig
 ) -> Bool[Array, "n"]:
-    """Which samples are quiet: the turn rate without its bias, rad/s, is below `rest_gyro` and the
-    specific force, m/s², is off gravity by less than `rest_accel`."""
+    """Which samples are quiet: the rate without its bias, rad/s, is below `rest_gyro`, and the
+    specific force, m/s², differs from gravity by less than `rest_accel`."""
     size = jnp.sqrt(jnp.maximum(jnp.sum(force**2, axis=1), 1e-12))
     still = jnp.sum(rate**2, axis=1) < config.rest_gyro**2
     return still & (jnp.abs(size - GRAVITY) < config.rest_accel)
