@@ -81,6 +81,7 @@ class Grid(NamedTuple):
 
 def create_grid(dt: float, hole: float | None = None, imu_rate: float | None = None) -> Grid:
     """The grid of a filter with a sample every `dt` s and an IMU of `imu_rate` Hz, by default 1/dt.
+
     `hole` is 1.5 dt by default. Raises `ValueError`.
     """
     hole = 1.5 * dt if hole is None else hole

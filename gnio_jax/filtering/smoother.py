@@ -18,10 +18,11 @@ the slot of the oldest clone,
 
     λ ← Fᵀ λ,   Λ ← Fᵀ Λ F.
 
-An update that was not applied has no term, and a weighted update has its weight. Everything is
-linearised at the filter's own estimates, as in any extended smoother: Jacobians are not computed
-again at the smoothed ones. R ← exp(δθ) R turns the frame of the rotation's error by δθ; this
-second-order term is neglected, as in the filter.
+An update that was not applied has no term, and a weighted update has its weight.
+
+Everything is linearised at the filter's own estimates, as in any extended smoother: Jacobians are
+not computed again at the smoothed ones. The update R ← exp(δθ) R turns the frame of the rotation's
+error by δθ; this second-order term is neglected, as in the filter.
 """
 
 from __future__ import annotations

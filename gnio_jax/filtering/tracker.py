@@ -159,11 +159,13 @@ class Tracker:
         Returns the pose of a clone step, if one was made (of the last one after a gap), else None:
         `pose()` gives the newest pose at any time. A stamp that is more than `LONGEST_TRUSTED`
         after the one before is accepted when that of the next sample agrees with it; until then its
-        sample waits. Raises `ValueError` naming the argument and changes nothing if the time does
-        not increase, if it increases by more than `LONGEST_GAP`, if a shape is wrong, or if a value
-        is beyond the range of an IMU. It also raises `ValueError` from the hundredth grid sample on
-        if the IMU is so much faster than `imu_rate` that it would alias, and for a rest without
-        gravity, whose samples are left out.
+        sample waits.
+
+        Raises `ValueError` naming the argument, and changes nothing, if the time does not increase,
+        if it increases by more than `LONGEST_GAP`, if a shape is wrong, or if a value is beyond the
+        range of an IMU. It also raises `ValueError` from the hundredth grid sample on if the IMU is
+        so much faster than `imu_rate` that it would alias, and for a rest without gravity, whose
+        samples are left out.
         """
         self._stream.push(*_checked_sample(time, gyro, accel))
         if self._core is None:

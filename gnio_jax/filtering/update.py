@@ -326,7 +326,7 @@ def downdate(covariance: Float[Array, "c c"], rows: Float[Array, "m c"]) -> Floa
 def _downdate_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """The signs are applied to the rows, because otherwise the backward pass would negate the whole
     matrix. There are two products, because the transpose of one product and its mirror image would
-    add a matrix to its own transpose. """
+    add a matrix to its own transpose."""
     (covariance, rows), (d_covariance, d_rows) = primals, tangents
     change = (-d_rows).T @ rows + (-rows).T @ d_rows
     return downdate(covariance, rows), d_covariance + change

@@ -84,7 +84,7 @@ def waypoint_poses(
     padded = math.ceil(LONGER ** math.ceil(math.log(count, LONGER)))
     samples = padded * config.samples_per_clone
     signals = [x[0] for x in padded_signals([(sequence.gyro, sequence.accel)], samples)]
-    signals[0][len(sequence.time) :] = 1.0  # rad/s, so that no rest after the end is smoothed into it
+    signals[0][len(sequence.time) :] = 1.0  # rad/s: no rest after the end affects it
     masks = padded_masks([sequence.imu_valid], samples)
     valid = None if masks is None else masks[0]
     time = np.clip(waypoints.time, sequence.time[0], sequence.time[-1])

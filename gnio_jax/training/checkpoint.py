@@ -1,7 +1,7 @@
 """Checkpoints of a run: `checkpoints/latest` to resume from, `checkpoints/best` to evaluate.
 
-The only importer of Orbax, which writes a checkpoint into a temporary folder and renames it, so a
-killed process leaves the previous one whole.
+Only this module imports Orbax. Orbax writes a checkpoint into a temporary folder and renames it, so
+the previous one remains whole if the process is killed.
 """
 
 from __future__ import annotations
@@ -31,25 +31,26 @@ from gnio_jax.training.task import TrainState
 
 Which = Literal["best", "latest"]
 VERSION = 2
-"""Of what a checkpoint holds besides the network's variables, which every version has alike."""
+"""Version of what a checkpoint holds besides the network's variables, which are the same in every
+version."""
 METADATA = 2**17
-"""Bytes that a checkpoint takes besides its arrays, at most."""
+"""Largest number of bytes that a checkpoint takes besides its arrays."""
 
-# Orbax logs every save there, and each of its failures before it raises them.
+# Orbax logs every save there, and it logs every failure before it raises it.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
-# Parts of a save that failed after the first failure, which is raised.
+# Parts of a save that failed after the first failure. The first one is raised.
 logging.getLogger("asyncio").addFilter(lambda record: "orbax" not in record.getMessage())
 
 
 class Position(NamedTuple):
-    """Where a run stands besides its `TrainState`: kept as JSON with the checkpoint."""
+    """The progress of a run besides its `TrainState`, kept as JSON with the checkpoint."""
 
     epoch: int = 0
     """Epoch in progress, or finished if `step` is a multiple of the steps per epoch."""
     step: int = 0
     best: float | None = None
-    """Smallest value on the validation split, since the last switch of what is trained, of what
-    `optim.best_by` names."""
+    """Smallest value of `optim.best_by` on the validation split since the last change of what is
+    trained."""
     sums: dict[str, float] = {}
     """Figures summed over the steps of the epoch in progress (`task.Progress`)."""
     seconds: float = 0.0
@@ -75,13 +76,13 @@ def exists(workdir: Path, which: Which = "latest") -> bool:
 
 
 def save(workdir: Path, which: Which, state: TrainState, position: Position) -> None:
-    """Write a checkpoint at `position.step`, `latest` with the optimizer's state; one that is
-    already there for this step is the same and stays.
+    """Write a checkpoint at `position.step`, `latest` with the optimizer's state. An existing
+    checkpoint of this step is the same and is kept.
 
-    In several processes, all of which have the same state and see the same folder, all of them call
-    it, and Orbax writes from the first. Arrays are written from the host's memory: a checkpoint
-    does not know on which devices they lay, and fits any. Raises `OSError` naming the folder where
-    it has no room; the checkpoint before stays.
+    Several processes must have the same state and see the same folder. All of them call this
+    function, and Orbax writes in the first. Arrays are written from the host's memory, so a
+    checkpoint does not depend on the devices. Raises `OSError` naming the folder if the disk is
+    full; the previous checkpoint is kept.
     """
     folder, state = _folder(workdir, which), jax.device_get(state)
     shapes = _shapes(state.variables)
@@ -97,7 +98,7 @@ def save(workdir: Path, which: Which, state: TrainState, position: Position) -> 
         with _manager(folder, create=True) as manager:
             if position.step in manager.all_steps():
                 return
-            # Orbax raises where the disk is full, too, but after the tracebacks of many threads.
+            # Orbax also raises if the disk is full, but after the tracebacks of many threads.
             if shutil.disk_usage(folder).free < size + METADATA:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             manager.save(position.step, args=ocp.args.Composite(**items))
@@ -107,8 +108,8 @@ def save(workdir: Path, which: Which, state: TrainState, position: Position) -> 
 
 
 def write_best(workdir: Path, run: Run) -> None:
-    """A checkpoint `best` with the variables of a run, and with the filter of its config where one
-    was trained."""
+    """Write a checkpoint `best` with the variables of a run, and with the filter of its config if
+    one was trained."""
     variables = {"batch_stats": {}, **run.variables}
     if numbers := filter_numbers(run.config):
         variables["filter"] = numbers
@@ -117,7 +118,7 @@ def write_best(workdir: Path, run: Run) -> None:
 
 
 def restore(workdir: Path, template: TrainState) -> tuple[TrainState, Position]:
-    """The latest state, in the structure of `template`, as `parallel.everywhere` places it.
+    """The latest state, in the structure of `template`, placed by `parallel.everywhere`.
 
     Raises `InputError` if it does not fit, or is of an earlier version.
     """
@@ -165,9 +166,9 @@ def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
     """The run that `config.init_from` names, if any, as `load` reads it.
 
     Raises `InputError` for a folder without a run, and for one whose network is not that of
-    `config`; also if training through the filter has none to start from. A calibrated uncertainty
-    may follow a plain head, and an average over headings a network without, or the other way round,
-    since their parameters are the same.
+    `config`; also if training through the filter has none to start from. A plain head and one with
+    a calibrated uncertainty may replace each other, and so may a network with and without an
+    average over headings, since their parameters are the same.
     """
     if config.init_from is None and config.through_filter.learn:
         problem = "needs the weights of a network that has been trained on windows"
@@ -188,12 +189,12 @@ def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
 
 
 def _description(config: TrainConfig) -> dict[str, Any]:
-    """What makes a network the same: its name and options, and the windows that it reads."""
+    """What two runs must share to have the same network: its name and options, and its windows."""
     model: Any = models.from_config(config.model)
-    model = getattr(model, "network", model)  # what an equivariant construction is made around
+    model = getattr(model, "network", model)  # the network inside an equivariant construction
     fields = (field.name for field in dataclasses.fields(model))
     options = {name: getattr(model, name) for name in fields if name not in ("parent", "name")}
-    # The average over headings is taken of any network, and adds no parameters.
+    # Any network can be averaged over headings, which adds no parameters.
     framed = config.model.equivariance == "canonical_frame"
     options = {"name": config.model.name, "canonical_frame": framed, **options}
     of_windows = ("rate", "window_seconds", "context_seconds", "window_rotation")
@@ -218,12 +219,13 @@ def _folder(workdir: Path, which: Which) -> Path:
 
 
 def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
-    """Orbax's view of a series, a context manager: it keeps threads that want closing."""
+    """Orbax's view of a series of checkpoints. It is a context manager, because its threads must be
+    closed."""
     options = ocp.CheckpointManagerOptions(
         max_to_keep=1,
         enable_async_checkpointing=False,
         create=create,
-        cleanup_tmp_directories=create,  # what a killed process has left
+        cleanup_tmp_directories=create,  # left by a killed process
     )
     return ocp.CheckpointManager(folder.absolute(), options=options)
 
@@ -233,9 +235,9 @@ def _read(
 ) -> tuple[Position, dict[str, Any]]:
     """The position of a checkpoint, and the items that these templates name.
 
-    Raises `InputError` where there is none, for a damaged one, for variables of other shapes, and
-    with this remedy for one of an earlier version, if it is asked for the state of an optimizer or
-    numbers of the filter.
+    Raises `InputError` if there is no checkpoint, if it is damaged, or if its variables have other
+    shapes. It raises it with this remedy for a checkpoint of an earlier version, if the state of an
+    optimizer or numbers of the filter are asked for.
     """
     where = _folder(workdir, which)
     if not exists(workdir, which):
@@ -269,7 +271,7 @@ def _read(
         found = restored({n: ocp.args.StandardRestore(tree) for n, tree in templates.items()})
         found = {name: found[name] for name in templates}
     position = meta["position"]
-    if older:  # its weights are as today's
+    if older:  # its weights have today's form
         return Position(position["epoch"], position["step"]), found
     return Position(**position | {"plateau": Plateau(*position["plateau"])}), found
 
@@ -285,8 +287,8 @@ def _shapes(variables: Any) -> dict[str, list[int]]:
 
 
 def learnt_from(workdir: Path, config: TrainConfig, dataset: str) -> set[str]:
-    """Names of the recordings of a dataset that the network of a run was trained on; none where
-    the folder does not say so."""
+    """Names of the recordings of a dataset that the network of a run was trained on; none if the
+    folder does not list them."""
     path = workdir / "splits.yaml"
     try:
         splits = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -302,7 +304,7 @@ def learnt_from(workdir: Path, config: TrainConfig, dataset: str) -> set[str]:
 
 
 def recordings_by_name(recordings: Any) -> dict[str, int | None]:
-    """Recordings and their lengths in samples; None where names alone are known."""
+    """Recordings and their lengths in samples; None if only the names are known."""
     if isinstance(recordings, dict):
         return {str(name): length for name, length in recordings.items()}
     return dict.fromkeys(map(str, recordings)) if isinstance(recordings, list) else {}

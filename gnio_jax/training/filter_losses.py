@@ -23,10 +23,10 @@ from gnio_jax.training.segments import Path, Segment
 from gnio_jax.types import Array
 
 HORIZON_SECONDS = (1.0, 5.0, 10.0, 30.0, 60.0)
-"""Times over which relative errors are taken, as far as a segment reaches."""
+"""Times over which relative errors are taken, s, if the segment is long enough."""
 DISTANCE_FLOOR = 1.0
-"""Added in squares to the distance that an error is divided by, m: standing still is no singular
-point (ours)."""
+"""Added in quadrature to the distance by which an error is divided, m, so that standing still is no
+singular point (ours)."""
 FAR_OFF = 1.5
 """Distance from a waypoint beyond which it counts less and less, m (ours)."""
 VELOCITY_POSITION = slice(VELOCITY.start, POSITION.stop)
@@ -54,7 +54,7 @@ class FilterLosses(NamedTuple):
     nees: Float[Array, ""]
     """Mean normalised error squared of the position over its degrees of freedom, likewise."""
     healthy: Bool[Array, ""]
-    """Whether the filter never diverged."""
+    """True if the filter never diverged."""
 
 
 def filter_losses(
@@ -66,9 +66,10 @@ def filter_losses(
 ) -> FilterLosses:
     """All losses of a segment, and their sum with the weights.
 
-    `estimate` begins with the filter's start; `history` has the whole core covariance. Of a
-    recording with waypoints the reference is interpolated, and is nothing to learn from: the error
-    at the waypoints takes the place of all that need poses, with the weight of displacements.
+    `estimate` begins with the filter's start; `history` has the whole core covariance. The
+    reference of a recording with waypoints is interpolated, and the network must not learn from it:
+    the error at the waypoints replaces all losses that need poses, with the weight of
+    displacements.
     """
     truth = segment.truth
     intervals = len(truth.position) - 1
@@ -119,8 +120,8 @@ def yaw_errors(
 def relative_displacement(estimate: Path, truth: Path, count: int) -> Float[jax.Array, ""]:
     """‖Rz(ψ_i)ᵀ (p̂_j − p̂_i) − (p_j − p_i)‖² / (distance² + floor²), j = i + `count`, mean over i.
 
-    ψ_i is the yaw error at i, so what went wrong before i does not count; distance is that walked
-    from i to j, m.
+    ψ_i is the yaw error at i, so errors before i do not count; distance is the distance walked from
+    i to j, m.
     """
     cosine, sine = (part[:-count] for part in yaw_errors(estimate.rotation, truth.rotation))
     moved = estimate.position[count:] - estimate.position[:-count]
@@ -157,10 +158,11 @@ def waypoint_error(
 
     `position` is that at both ends of the k − 1 clone intervals, between which it is interpolated;
     `waypoint` has a row for each sample, NaN where there is none. The path is compared after the
-    one rotation and shift of the plane that bring it nearest: how the filter's world lies on the
-    map is not known. A square d² above counts as c² ln(1 + d²/c²), c = `FAR_OFF`, because somebody
-    may tap too early, too late or in the wrong place; so a path that never moves has less than 1,
-    and the less the longer the walk. 0 where there are fewer than two.
+    horizontal rotation and shift that bring it nearest, because the filter's position and yaw on
+    the map are not known. A squared distance d² counts as c² ln(1 + d²/c²), c = `FAR_OFF`, because
+    a tap may be too early, too late or in the wrong place. So the error of a path that never moves
+    is below 1, and it decreases with the length of the walk. The error is 0 if there are fewer than
+    two waypoints.
     """
     samples = len(waypoint) // (len(position) - 1)
     share = (jnp.arange(samples) / samples)[None, :, None]
@@ -179,7 +181,8 @@ def waypoint_error(
 
 
 def innovation_nll(log_likelihood: Float[Array, "k"]) -> Float[jax.Array, ""]:
-    """Mean of −ln N(r; 0, S) over the measurements; rows of NaN are none, and 0 if all are."""
+    """Mean of −ln N(r; 0, S) over the measurements. Rows of NaN are no measurements; 0 if there are
+    none."""
     present = jnp.isfinite(log_likelihood)
     total = jnp.sum(jnp.where(present, log_likelihood, 0.0))
     return -total / jnp.maximum(jnp.sum(present), 1)
@@ -205,10 +208,10 @@ def _eliminated(
     error: Float[Array, "k d"], covariance: Float[Array, "k d d"]
 ) -> tuple[Float[jax.Array, "k d"], Float[jax.Array, "k d"]]:
     """Variance of each entry given the entries before it (D of P = L D Lᵀ), NaN where P is not
-    positive definite, and what is left of each entry (L⁻¹ e).
+    positive definite, and the remainder of each entry (L⁻¹ e).
 
-    Gauss's elimination, written out. LAPACK's batched calls wait for workers of XLA's thread pool
-    while they hold one: where each core is a device, all wait for ever.
+    This is Gaussian elimination, written out. LAPACK's batched calls wait for workers of XLA's
+    thread pool while they hold one: if each core is a device, they deadlock.
     """
     variances, remainders = [], []
     for _ in range(error.shape[1]):
@@ -226,17 +229,17 @@ def window_error(
 ) -> Float[jax.Array, ""]:
     """Squared error of the measured displacements, summed over the axes, mean over the windows, m².
 
-    Row k spans from the (k − W)-th clone to the k-th; rows of NaN are none. The network's
-    displacement is expressed in the yaw frame of the filter's own attitude, and the network sees
-    nothing of that attitude's yaw error; so the truth is turned by that error before it is
-    expressed in the same frame.
+    Row k spans from the (k − W)-th clone to the k-th; rows of NaN are no measurements. The
+    network's displacement is expressed in the yaw frame of the filter's own attitude, and the
+    network cannot see the yaw error of this attitude. So the true displacement is turned by this
+    error before it is expressed in the same frame.
     """
     first, last = slice(1, -clones_per_window), slice(1 + clones_per_window, None)
     moved = truth.position[last] - truth.position[first]
     own = jax.lax.stop_gradient(estimate.rotation[first])
     own_cosine, own_sine = jax.vmap(geometry.yaw_direction)(own)
     cosine, sine = yaw_errors(own, truth.rotation[first])
-    # By the yaw error, then into the filter's own yaw frame: one turn about z.
+    # The rotation by the yaw error, then into the filter's own yaw frame, is one rotation about z.
     c, s = own_cosine * cosine + own_sine * sine, own_cosine * sine - own_sine * cosine
     x, y = c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1]
     measured = displacement[clones_per_window:]

@@ -1,7 +1,8 @@
 """Training through the filter: segments of recordings, with the network in the filter's loop
 (ours).
 
-The filter runs in float64 (JAX's x64 must be on); what is trained, and the optimizer, are float32.
+The filter runs in float64 (JAX's x64 must be on); the trained variables and the optimizer are in
+float32.
 """
 
 from __future__ import annotations
@@ -42,17 +43,17 @@ from gnio_jax.types import Sequence
 CHECKPOINT_EVERY = 20
 """Clone intervals between the states that the backward pass keeps."""
 TRUNCATE_SECONDS = 10.0
-"""The filter's state is carried on without gradient after every so many seconds."""
+"""The filter's state continues without gradient after every interval of this length, s."""
 START_SPREAD = 1.0
-"""Each segment starts off the reference by errors drawn from the filter's initial standard
-deviations times this."""
+"""Each segment starts with errors that are drawn from the filter's initial standard deviations
+times this factor."""
 GATE_SOFTNESS = 2.0
-"""Slope of the χ² gate in training (`FilterConfig.gate_softness`); validation has the gate that
-evaluation has."""
+"""Slope of the χ² gate in training (`FilterConfig.gate_softness`); validation has the gate of
+evaluation."""
 
 
 class FilterTask(Task):
-    """Training through the filter, on segments, which a `SegmentSource` holds."""
+    """Training through the filter on the segments of a `SegmentSource`."""
 
     unit = "segments"
     figures = ("loss", "mse", "displacement", "yaw", "innovation", "state", "waypoints")
@@ -93,7 +94,7 @@ class FilterTask(Task):
     def losses(
         self, variables: Any, batch: tuple[Segment, Start], step: Int[jax.Array, ""]
     ) -> BatchLosses:
-        """Means over the segments, those of several horizons over these too."""
+        """Means over the segments, and over the horizons of losses that have several."""
         chex.assert_type([batch[0].gyro, batch[0].accel], jnp.float64)
         found = self.filtered(variables, *batch, self.softened())
         means = {name: jnp.mean(getattr(found, name)) for name in self.figures[2:]}
@@ -112,9 +113,9 @@ class FilterTask(Task):
     def segments(
         self, key: PRNGKeyArray, source: SegmentSource, rows: Int[jax.Array, "b"], turned: bool
     ) -> tuple[Segment, Start]:
-        """The segments that begin at these rows, and where the filter starts in each. `turned`:
-        each by a random yaw; the filter finds the same path but for the turn, and the network sees
-        windows of another heading."""
+        """The segments that begin at these rows, and the start of the filter in each. `turned`:
+        each segment is turned by a random yaw. The filter finds the same path, turned, and the
+        network sees windows of another heading."""
         count, stride = intervals(self.config), self.config.data.stride
         segments = jax.vmap(lambda row: cut_segment(source, row, count, stride))(rows)
         keys = jax.random.split(key, rows.shape[0])
@@ -129,8 +130,8 @@ class FilterTask(Task):
     def filtered(
         self, variables: Any, segments: Segment, starts: Start, ekf: FilterConfig
     ) -> FilterLosses:
-        """The losses of each of a batch of segments, with the network in the filter's loop; they
-        are shared out among the devices."""
+        """The losses of each segment of a batch, with the network in the filter's loop; the
+        segments are divided among the devices."""
         network = {name: tree for name, tree in variables.items() if name != "filter"}
         frozen = models.inference_variables(self.model, network)
 
@@ -154,8 +155,8 @@ class FilterTask(Task):
     def take_steps(self, *given: Any) -> tuple[TrainState, Progress]:
         state, progress = super().take_steps(*given)
         if len(jax.devices()) > 1:
-            # Where the segments were shared out, the state now lies on all devices, and the next
-            # step would be compiled once more for that.
+            # If the segments were divided, the state is now on all devices, and the next step would
+            # be compiled again for this placement.
             state = jax.tree.map(parallel.fresh_copy, state)
         return state, progress
 
@@ -171,7 +172,8 @@ class FilterTask(Task):
             "val_state": float(found.state),
             "val_waypoint_error": math.sqrt(found.waypoints),
         }
-        # Roots of the squared errors of each horizon: shares of the distance, rad per metre.
+        # Roots of the squared errors of each horizon: relative to the distance, and in rad per
+        # metre.
         for name in ("displacement", "yaw"):
             for seconds, square in zip(HORIZON_SECONDS, getattr(found, name), strict=False):
                 row[f"val_{name}_error/{seconds:g}s"] = math.sqrt(square)
@@ -191,8 +193,9 @@ def intervals(config: TrainConfig) -> int:
 def validate(
     state: TrainState, source: SegmentSource, key: PRNGKeyArray, *, task: FilterTask
 ) -> FilterLosses:
-    """Means over the segments of `source`, each at its earliest place, with the gate that
-    evaluation has. The errors of the starts depend on `key` alone. `healthy`: all were."""
+    """Means over the segments of `source`, each at its earliest place, with the gate of evaluation.
+    The errors of the starts depend on `key` alone. `healthy` is True if the filter was healthy in
+    all of them."""
     count = source.earliest.shape[0]
     size = min(task.config.optim.batch_size, count)
     batches = -(-count // size)

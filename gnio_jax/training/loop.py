@@ -1,5 +1,6 @@
-"""The training loop, top to bottom: one run after another; epochs of dispatches, validation, log,
-checkpoints. Below it stands what follows from the figures of an epoch."""
+"""The training loop, from top to bottom: one run after another, with epochs of dispatches,
+validation, log and checkpoints. The functions below it take decisions from the figures of an
+epoch."""
 
 from __future__ import annotations
 
@@ -29,12 +30,13 @@ from gnio_jax.training.task import Progress, Row, Task
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
-"""Steps are dispatched in runs of about this long: few round trips, and still a lively progress bar
+"""Approximate duration of one dispatch of steps, s: few round trips, but a progress bar that moves
 and a quick stop."""
 CHECKPOINT_SECONDS = 600.0
-"""Longest time between checkpoints within an epoch; every epoch ends with one anyway."""
+"""Longest time between checkpoints within an epoch, s; every epoch also ends with one."""
 NO_GRADIENT = 1e-9
-"""Norm of a gradient, mean of an epoch, of which Adam, whose ε is 1e-8, makes next to no step."""
+"""Norm of a gradient, mean over an epoch, below which Adam, whose ε is 1e-8, makes almost no
+step."""
 
 
 class Outcome(NamedTuple):
@@ -42,22 +44,22 @@ class Outcome(NamedTuple):
 
     workdir: Path
     best_loss: float | None
-    """Smallest value on the validation split of what `optim.best_by` names."""
+    """Smallest value of `optim.best_by` on the validation split."""
     stopped_by: int | None
-    """Signal that ended it early, or the seeds after it; its state is saved."""
+    """Signal that ended this run early, or prevented the seeds after it; the state is saved."""
 
 
 def train(config: TrainConfig, resume: bool = False, **options: Any) -> Outcome:
-    """Train the network of `config` and leave checkpoints and logs in its work folder: on windows,
-    or through the filter where `config.through_filter` names what is trained.
+    """Train the network of `config` and write checkpoints and logs to its work folder. Training is
+    on windows, or through the filter if `config.through_filter` names what is trained.
 
-    With `resume` the run goes on from its latest checkpoint as if it had never stopped: parameters,
-    optimizer, order of the windows or segments, and random draws are functions of the seed and the
-    step. Resume rules, in order: the settings must be those of config.yaml; without a checkpoint
-    yet the run starts over; log rows after the checkpoint are dropped. SIGTERM and Ctrl-C save and
-    return; a loss or gradient that is not finite raises `FloatingPointError` naming the step
-    (through the filter such a step is skipped). The other options are those of `train_all`, which
-    says what it raises.
+    With `resume` the run continues from its latest checkpoint as if it had never stopped:
+    parameters, optimizer, order of the windows or segments, and random draws are functions of the
+    seed and the step. A run is resumed by these rules: the settings must be those of config.yaml; a
+    run without a checkpoint starts again; log rows after the checkpoint are removed. After SIGTERM
+    or Ctrl-C the state is saved and the function returns. A loss or gradient that is not finite
+    raises `FloatingPointError` naming the step (through the filter such a step is skipped). The
+    other options and errors are those of `train_all`.
     """
     (outcome,) = train_all([config], resume, **options)
     return outcome
@@ -71,15 +73,15 @@ def train_all(
     devices: int | None = None,
     load: Callable[[str], Run] = load_run,
 ) -> list[Outcome]:
-    """`train` experiments that differ in nothing but their seeds and folders (`config.with_seeds`),
+    """`train` for experiments that differ only in their seeds and folders (`config.with_seeds`),
     one after the other. Recordings are read once and steps are compiled once.
 
-    With `resume` finished runs are skipped, begun ones continue from their latest checkpoint,
-    missing ones start. A signal ends the run that it interrupts, and those after it do not begin:
-    they have no outcome. `workers` processes read recordings that are slow to read. A batch of
-    windows is shared out among `devices` devices of each process (`parallel.sharing`); how many
-    there are changes the results by rounding alone, also in a run that is resumed. `load` reads
-    what `config.init_from` and `config.data.poses_by` name, by default the folder of a run;
+    With `resume` finished runs are skipped, begun ones continue from their latest checkpoint, and
+    missing ones start. A signal ends the run that it interrupts. The runs after it do not begin and
+    have no outcome. `workers` processes read recordings that are slow to read. A batch of windows
+    is divided among `devices` devices of each process (`parallel.sharing`); their number changes
+    the results only by rounding, even in a run that is resumed. `load` reads what
+    `config.init_from` and `config.data.poses_by` name, by default the folder of a run;
     `gnio_jax.load_pretrained` also takes packages of weights. Raises `InputError` where the initial
     run is not of the same network, for settings that do not fit together, for a folder that holds
     another run, and where the devices cannot share a batch evenly.
@@ -98,8 +100,8 @@ def train_all(
         problem = "runs in one process, on all of its devices"
         raise InputError("training through the filter", problem, "start one process")
     outcomes: list[Outcome] = []
-    # Segments are shared out by `filtering.over_sequences`, not as a batch of windows is. Whatever
-    # the process has set: no float64 but for the filter.
+    # Segments are divided by `filtering.over_sequences`, not as a batch of windows is. Only the
+    # filter computes in float64, independently of the settings of the process.
     sharing = parallel.sharing(1 if through_filter else devices)
     with jax.enable_x64(through_filter), sharing, _signals() as received:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
@@ -124,13 +126,14 @@ def _train(
     received: list[int],
     reporter: Reporter,
 ) -> Outcome:
-    """One run, to its end or until a signal."""
+    """Train one run to its end or until a signal."""
     epochs, steps, source = config.optim.epochs, task.steps_per_epoch, recordings.source
     key = jax.random.key(config.seed)
     of_init, of_order, of_steps = jax.random.split(key, 3)
     of_statistics = jax.random.fold_in(key, 3)
     with_statistics = partial(task.with_statistics, source=source, key=of_statistics)
-    # Copies: steps take the memory of their state, and the next seed starts from `start` too.
+    # Copies, because steps take the memory of their state, and the next seed also starts from
+    # `start`.
     state = parallel.everywhere(task.initial_state(of_init, start and start.variables))
     at = Position()
     with run_folder.opened(config, recordings, state.variables, resume) as workdir:
@@ -154,7 +157,7 @@ def _train(
                     at = at._replace(seconds=before.seconds + clock - began)
                     rate = (at.step - before.step) * config.optim.batch_size / (clock - began)
                     wished = round(DISPATCH_SECONDS * count / (clock - tick))
-                    # Clocks differ between processes, and a signal reaches one of them.
+                    # Clocks differ between processes, and a signal may reach only one of them.
                     dispatch, due, signum = parallel.largest(
                         max(1, min(2 * dispatch, wished)),
                         int(clock - saved > CHECKPOINT_SECONDS),
@@ -183,7 +186,8 @@ def _train(
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Note SIGTERM and Ctrl-C behind a first 0 instead of leaving; a second Ctrl-C leaves."""
+    """Append the numbers of SIGTERM and Ctrl-C to a list that begins with 0, instead of ending the
+    process; a second Ctrl-C ends it."""
     received = [0]
 
     def note(signum: int, _: object) -> None:
@@ -206,7 +210,7 @@ def _signals() -> Iterator[list[int]]:
 
 
 def after_steps(at: Position, count: int, progress: Progress, workdir: Path) -> Position:
-    """Where the run in `workdir` stands after `count` more steps. Raises `FloatingPointError` where
+    """The position of the run in `workdir` after `count` more steps. Raises `FloatingPointError` if
     one of them failed."""
     if progress.failed_step >= 0:
         raise FloatingPointError(
@@ -219,12 +223,12 @@ def after_steps(at: Position, count: int, progress: Progress, workdir: Path) -> 
 
 
 def finished(at: Position, task: Task, validation: Row, rate: float) -> tuple[Position, Row, bool]:
-    """Of the epoch that ends at `at`, trained at `rate` windows or segments per second: where the
-    next one starts, the log's row, and whether it is the best one so far.
+    """The end of an epoch at `at`, trained at `rate` windows or segments per second: the position
+    at which the next one starts, the log's row, and whether the epoch is the best one so far.
 
-    The choice of the best begins anew with the epoch that changes what is trained, and again with
-    the first whole one after it: losses before and after do not compare, and what has just begun to
-    learn has learnt little. NaN and infinity are never the best.
+    The choice of the best epoch begins anew with the epoch that changes what is trained, and again
+    with the first whole epoch after it. Losses before and after the change cannot be compared, and
+    a part that has just begun to learn has learnt little. NaN and infinity are never the best.
     """
     optim, means = task.config.optim, mean_figures(at.sums, task.steps_per_epoch)
     norms = {name: means.pop(name) for name in at.sums if name.startswith("gradient_norm/")}
@@ -248,13 +252,13 @@ def finished(at: Position, task: Task, validation: Row, rate: float) -> tuple[Po
 
 
 def learning_rate(at: Position, task: Task) -> float:
-    """The network's, of the step that comes next."""
+    """The network's learning rate at the next step."""
     schedule = optimizer.schedule(task.config.optim, task.steps_per_epoch)
     return float(schedule(at.step)) * at.plateau.factor
 
 
 def mean_figures(sums: dict[str, float], steps: int) -> Row:
-    """Means over the steps that were not skipped, and the number of those that were."""
+    """Means over the steps that were not skipped, and the number of skipped steps."""
     skipped = round(sums.get("skipped", 0))
     means: Row = {name: total / max(1, steps - skipped) for name, total in sums.items()}
     return means | ({"skipped": skipped} if "skipped" in sums else {})
@@ -271,8 +275,8 @@ def _now(at: Position, task: Task, rate: float) -> str:
 
 
 def lines(row: Row, improved: bool, task: Task) -> Iterator[str]:
-    """The line of a finished epoch, with the error of each of several datasets, and a warning where
-    a layer of the head has stopped to learn."""
+    """The line of a finished epoch, with the error of each dataset if there are several, and a
+    warning if a layer of the head no longer learns."""
     names = task.config.datasets
     own = ", ".join(f"{name} {row[f'val_rmse/{name}']:.4f}" for name in names if len(names) > 1)
     yield (
@@ -294,11 +298,11 @@ def _speed(task: Task, rate: float) -> str:
 
 
 def stuck_layers(row: Row) -> list[str]:
-    """Layers of the head that hardly a gradient reached in the epoch of `row`.
+    """Layers of the head that received almost no gradient in the epoch of `row`.
 
-    A training that diverges may leave the network there: where every scale s = softplus(·)
-    underflows to 0, so do the gradients of gate and encoder, and d̂ = 0 for good. A loss of 0 has
-    not begun yet (`LossConfig.nll_from_epoch`).
+    A training that diverges may end in this state: if every scale s = softplus(·) underflows to 0,
+    the gradients of gate and encoder are also 0, and d̂ remains 0. A loss of 0 means that this loss
+    has not begun yet (`LossConfig.nll_from_epoch`).
     """
     prefix = "gradient_norm/"
     return [

@@ -16,8 +16,9 @@ from gnio_jax.types import Prediction, Windows
 
 TASK_LOG_STD_FLOOR = -math.log(2.0)
 """Lower bound of CTIN's trainable log δ_v and log δ_c: no term has a weight above 2 (ours). Without
-it the loss has no lower bound: a likelihood of densities below 0, which a good network reaches,
-draws log δ_c to −∞, and its weight grows until the error of the velocity plays no part."""
+it the loss has no lower bound: a good network has a negative log-likelihood below 0, which drives
+log δ_c to −∞, and the weight of the likelihood grows until the error of the velocity has no
+effect."""
 _NEVER = 2**31 - 1
 
 
@@ -34,12 +35,12 @@ class Losses(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """What of the objective depends on the progress of training."""
+    """The parts of the objective that depend on the progress of training."""
 
     nll_weight: Float[jax.Array, ""]
     """λ_NLL, or zero before `LossConfig.nll_from_epoch`."""
     log_std_learns: Bool[jax.Array, ""]
-    """False before `LossConfig.log_std_from_epoch`, and as long as there is no likelihood."""
+    """False before `LossConfig.log_std_from_epoch`, and while there is no likelihood."""
 
 
 def switches(config: LossConfig, steps_per_epoch: int) -> tuple[int, int]:
@@ -67,7 +68,7 @@ def losses(
 ) -> Losses:
     """The losses of a batch, over the first `axes` axes: 2 for a network without the vertical.
 
-    Raises `ValueError` if the loss wants more than the network predicts (a velocity for every
+    Raises `ValueError` if the loss needs more than the network predicts (a velocity for every
     sample).
     """
     given = (prediction.displacement, prediction.log_std, windows.displacement)
@@ -101,7 +102,7 @@ def _velocity_and_covariance(
             "loss 'velocity_and_covariance' wants a velocity for every sample, "
             "which only the network 'ctin' gives"
         )
-    # Of a context before the window CTIN would predict velocities that the target does not have.
+    # For a context before the window CTIN would predict velocities for which there is no target.
     chex.assert_equal_shape([windows.steps, found["velocity"], found["velocity_log_std"]])
     error = (windows.steps * windows.steps.shape[1] - found["velocity"])[..., :axes]
     position = (windows.displacement - prediction.displacement)[:, :axes]
@@ -122,9 +123,9 @@ def gaussian_nll(
 ) -> Float[jax.Array, ""]:
     """Mean over the windows of ½ (e/σ)² + log σ, summed over the axes (paper §III-F, L_NLL).
 
-    With `outlier_sigmas` = k (ours) (e/σ)² grows only with its logarithm beyond k²: one window with
-    a tiny σ has else a gradient without bound, which Adam's second moment remembers for a thousand
-    steps.
+    With `outlier_sigmas` = k (ours), (e/σ)² beyond k² grows only with its logarithm. Otherwise the
+    gradient of one window with a tiny σ is unbounded, and Adam's second moment remembers it for a
+    thousand steps.
     """
     normalised, log_std = prediction.normalised(error, config.log_std_floor)
     if config.outlier_sigmas is not None:
@@ -135,6 +136,6 @@ def gaussian_nll(
 
 
 def _held(log_std: Float[jax.Array, "*b 3"], stage: Stage) -> Float[jax.Array, "*b 3"]:
-    """The same values, with a gradient only where the stage lets the uncertainty learn."""
+    """The same values, with a gradient only if the uncertainty learns in this stage."""
     held = jax.lax.stop_gradient(log_std)
     return held + jnp.where(stage.log_std_learns, log_std - held, 0.0)

@@ -1,9 +1,10 @@
-"""What is trained, and by which steps: Adam with linear warm-up and cosine decay (paper §IV-A), and
-the schedules of the networks that GNIO is compared with.
+"""The trained variables and their optimizer: Adam with linear warm-up and cosine decay (paper
+§IV-A), and the schedules of the networks that GNIO is compared with.
 
-A learning rate is a function of the step, and the optimizer's state holds Adam's moments alone: a
+A learning rate is a function of the step, and the optimizer's state holds only Adam's moments, so a
 step that is skipped does not shift the schedule. The filter's settings are trained as numbers
-without bounds (`filtering.settings`), beside the network's variables as the collection "filter".
+without bounds (`filtering.settings`); they are the collection "filter" beside the network's
+variables.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from gnio_jax.training.losses import switches
 END_LEARNING_RATE = 1e-6
 """Learning rate at the last step of the cosine, unless its peak is lower."""
 PLATEAU_EPOCHS, PLATEAU_FACTOR = 10, 0.1
-"""The learning rate is multiplied by this factor after more than so many epochs without a smaller
-squared error on the validation split (RoNIN, DeepILS)."""
+"""The learning rate is multiplied by the factor after more than this number of epochs without a
+smaller squared error on the validation split (RoNIN, DeepILS)."""
 UNCERTAINTY = ("uncertainty", "log_std")
-"""Names of the networks' modules from which nothing but the uncertainty comes …"""
+"""Names of the networks' modules that give only the uncertainty …"""
 HEADS = ("head", "displacement")
-"""… and of those from which the displacement comes."""
+"""… and of those that give the displacement."""
 FILTER_PARTS = {
     "noise": (
         "noise.gyro_density",
@@ -41,9 +42,9 @@ FILTER_PARTS = {
     "measurement": ("noise.measurement_scale", "noise.std_factor", "noise.correlation"),
     "start": ("start",),
 }
-"""Numbers of `FilterSettings` that each part of the filter has, by their paths."""
+"""Paths of the numbers of `FilterSettings` that belong to each part of the filter."""
 DIGITS = 5
-"""That float32 keeps of a value whose logarithm it holds."""
+"""Digits of a value that remain if float32 holds its logarithm."""
 
 Trainable = dict[str, dict[str, Any]]
 """Variables that are trained, by collection: "params" and "filter"; none of them empty."""
@@ -53,8 +54,8 @@ Trainable = dict[str, dict[str, Any]]
 
 
 def filter_numbers(config: TrainConfig) -> dict[str, Float[jax.Array, ""]]:
-    """The collection "filter": a number for each setting that is not switched off; none where
-    training is on windows."""
+    """The collection "filter": a number for each setting that is not switched off; none for
+    training on windows."""
     if not config.through_filter.learn:
         return {}
     paths = [path for of_part in FILTER_PARTS.values() for path in of_part]
@@ -62,12 +63,12 @@ def filter_numbers(config: TrainConfig) -> dict[str, Float[jax.Array, ""]]:
 
 
 def trained_settings(settings: FilterSettings, numbers: dict[str, Any]) -> FilterSettings:
-    """The filter's settings with the values that were trained, as five digits."""
+    """The filter's settings with the values that were trained, rounded to five digits."""
     return with_written_parameters(settings, numbers, DIGITS)
 
 
 def trainable(variables: Any, learn: Iterable[str]) -> Trainable:
-    """The variables that the parts `learn` consist of; without any, the network's parameters."""
+    """The variables of the parts `learn`; if there are none, the network's parameters."""
     parts = set(learn)
     if not parts:
         return {"params": variables["params"]}
@@ -108,7 +109,7 @@ def schedule(config: OptimConfig, steps_per_epoch: int, scale: float = 1.0) -> o
         init_value=start,
         peak_value=peak,
         warmup_steps=warmup_steps,
-        decay_steps=config.epochs * steps_per_epoch,  # Optax counts the warm-up in
+        decay_steps=config.epochs * steps_per_epoch,  # in Optax this includes the warm-up
         end_value=min(scale * END_LEARNING_RATE, peak),
     )
 
@@ -116,14 +117,14 @@ def schedule(config: OptimConfig, steps_per_epoch: int, scale: float = 1.0) -> o
 def adam(
     config: OptimConfig, loss: LossConfig, steps_per_epoch: int
 ) -> optax.GradientTransformationExtraArgs:
-    """Adam's direction, β = (0.9, 0.999): an update is −(learning rate) times it. Before it, where
-    that is asked for, the gradient's global norm is clipped and the parameters decay. `update`
-    takes `log_std_learns` (see `losses.Stage`).
+    """Adam's direction, β = (0.9, 0.999): an update is −(learning rate) times it. Before that, if
+    the settings ask for it, the gradient's global norm is clipped and weight decay is added.
+    `update` takes `log_std_learns` (see `losses.Stage`).
 
-    Where the uncertainty is held at first, it has a state of its own that does not count those
-    steps, as PyTorch's Adam does not count steps without a gradient. In one state the zero
-    gradients would be counted: at the release the bias correction of the moments would be gone, and
-    the first steps 3.7 times as long as the learning rate allows.
+    If the uncertainty is held fixed at first, it has a state of its own that does not count those
+    steps, as PyTorch's Adam does not count steps without a gradient. A common state would count the
+    zero gradients: when the uncertainty begins to learn, the moments would no longer be corrected
+    for their bias, and the first steps would be 3.7 times as long as the learning rate allows.
     """
     moments = optax.scale_by_adam(b1=0.9, b2=0.999)
     parts = [moments]
@@ -141,9 +142,9 @@ def adam(
 
 
 def create(config: TrainConfig, steps_per_epoch: int) -> optax.GradientTransformationExtraArgs:
-    """The optimizer of what is trained, by collection: `adam` for the network's parameters, and
-    through the filter one for the filter's numbers, which do not decay. The gradient of each is
-    clipped apart."""
+    """The optimizer of each trained collection: `adam` for the network's parameters, and for
+    training through the filter another one for the filter's numbers, without weight decay. Each
+    gradient is clipped separately."""
     if not config.through_filter.learn:
         return adam(config.optim, config.loss, steps_per_epoch)
     each = {
@@ -168,19 +169,19 @@ def _by_path(label: Callable[[tuple], Any]) -> Callable[[Any], Any]:
 
 
 class Plateau(NamedTuple):
-    """How the validation error has fared (RoNIN, DeepILS: PyTorch's ReduceLROnPlateau)."""
+    """The history of the validation error (RoNIN, DeepILS: PyTorch's ReduceLROnPlateau)."""
 
     factor: float = 1.0
-    """Share of the schedule's learning rate that is in force."""
+    """Current factor of the schedule's learning rate."""
     best: float | None = None
-    """Smallest squared error so far, m²; NaN is none."""
+    """Smallest squared error so far, m²; NaN if there is none."""
     idle_epochs: int = 0
-    """Epochs since it, or since the learning rate fell."""
+    """Epochs since the smallest error, or since the learning rate was reduced."""
 
 
 def watch(plateau: Plateau, mse: float, config: OptimConfig) -> Plateau:
-    """After an epoch with this squared error on the validation split. Better means by a
-    ten-thousandth, as in PyTorch."""
+    """The plateau after an epoch with this squared error on the validation split. An error counts
+    as smaller if it is smaller by a ten-thousandth, as in PyTorch."""
     if config.schedule != "plateau":
         return plateau
     if not math.isnan(mse) and (plateau.best is None or mse < plateau.best * (1 - 1e-4)):

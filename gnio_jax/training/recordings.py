@@ -1,5 +1,5 @@
-"""What a network learns from: the recordings of two splits at its rate, with poses, as windows or
-segments.
+"""The training and validation data of a network: the recordings of two splits at its rate, with
+poses, as windows or segments.
 
 A walk with waypoints has no poses. They are interpolated between the waypoints
 (`data.with_poses`), or made by the smoother from the displacements of an earlier run
@@ -32,20 +32,20 @@ from gnio_jax.training.task import Task, visits
 from gnio_jax.types import Sequence
 
 Load = Callable[[str], Run]
-"""Reads the run, or the package of weights, of this name; a function of a module, since other
-processes call it too."""
+"""A function that reads the run, or the package of weights, of this name. It must be a function of
+a module, because other processes call it too."""
 
 
 class Recordings(NamedTuple):
-    """What a task is trained on and validated with."""
+    """The data on which a task is trained and validated."""
 
     source: Any
     """Windows or segments of the training split, on the devices."""
     held_out: dict[str, Any]
-    """Those of the validation split of each dataset by its name, likewise."""
+    """Windows or segments of the validation split of each dataset, by its name, on the devices."""
     splits: dict[str, dict[str, int] | list[str]]
-    """Names of the recordings of each split, of several datasets with theirs before them, and their
-    lengths in samples. Where a run has made poses, its digest stands there too, as
+    """Names of the recordings of each split and their lengths in samples. With several datasets the
+    name of the dataset comes first. If a run has made poses, its digest is there too, as
     `data.poses_by`."""
 
 
@@ -55,7 +55,7 @@ class PosesBy(NamedTuple):
     run: str
     load: Load
     digest: str
-    """Of its weights and settings."""
+    """Digest of its weights and settings."""
 
 
 def set_up(
@@ -72,7 +72,7 @@ def set_up(
     evenly. `workers` processes read recordings that are slow to read, and make smoothed poses with
     the run that `load` reads.
     """
-    model = models.from_config(config.model)  # a mistake in its options does not wait for the data
+    model = models.from_config(config.model)  # finds mistakes in its options before reading data
     size, devices = config.optim.batch_size, parallel.count()
     if size % devices:
         problem = f"is {size}, which {devices} devices cannot share evenly"
@@ -117,8 +117,8 @@ def set_up(
 
 
 def _poses_by(config: TrainConfig, reporter: Reporter, load: Load) -> PosesBy | None:
-    """What `data.poses_by` names. Raises `InputError` where that is slower than the network that is
-    trained: its poses come with the IMU at its own rate."""
+    """The network that `data.poses_by` names. Raises `InputError` if its rate is lower than that of
+    the trained network, because its poses come with the IMU at its own rate."""
     name = config.data.poses_by
     if name is None:
         return None
@@ -144,10 +144,10 @@ def read_split(
     samples: dict[str, int],
     poses: PosesBy | None = None,
 ) -> Iterator[Sequence]:
-    """The recordings of a split of a dataset at the network's rate, one after another, with poses
-    where they come with waypoints: those that `poses` makes, else interpolated ones. The number of
-    samples of each is noted in `samples` by its name. A walk that can have no poses is left out
-    with a warning."""
+    """The recordings of a split of a dataset at the network's rate, one after another. Recordings
+    with waypoints get the poses that `poses` makes, or else interpolated ones. The number of
+    samples of each recording is written into `samples` by its name. A walk that can have no poses
+    is left out with a warning."""
     progress = functools.partial(reporter.progress, f"reading {split}")
     read: Iterable[Sequence] = data.load_each(dataset, config.data_root, split, workers, progress)
     if poses is not None:
@@ -167,9 +167,9 @@ def read_split(
 def _with_smoothed_poses(
     read: Iterable[Sequence], by: PosesBy, split: str, reporter: Reporter, workers: int
 ) -> Iterator[Sequence]:
-    """The recordings, with smoothed poses where they have waypoints. These take seconds a walk, so
-    `workers` processes make them, and they are kept in the cache of recordings."""
-    held: list[Sequence] = []  # from the first walk with waypoints on
+    """The recordings, with smoothed poses for those with waypoints. These take seconds per walk, so
+    `workers` processes make them, and the cache of recordings keeps them."""
+    held: list[Sequence] = []  # recordings from the first walk with waypoints on
     for sequence in read:
         if sequence.waypoints is None and not held:
             yield sequence
@@ -194,17 +194,18 @@ def _with_smoothed_poses(
 
 
 def _poses_on_cpu(walk: Sequence, by: PosesBy) -> Reading:
-    """`smoothed_poses` in a process of its own: the GPU is the first process's."""
+    """`smoothed_poses` in a process of its own, on the CPU, because the first process uses the
+    GPU."""
     jax.config.update("jax_platforms", "cpu")
     return smoothed_poses(walk, by)
 
 
 def smoothed_poses(walk: Sequence, by: PosesBy) -> Reading:
-    """A walk with waypoints as one with smoothed poses at the rate of the network that makes them,
-    or why it has none.
+    """The walk with smoothed poses at the rate of the network that makes them, or the reason why it
+    has none.
 
-    Valid are the legs on which interpolation is: where nobody carried the phone ahead, the taps may
-    be another's.
+    The valid legs are those on which interpolated poses are valid: on other legs the phone does not
+    point ahead, and the taps may belong to another walk.
     """
     with jax.enable_x64(True):
         rate, predict, setup = _labeller(by)
@@ -219,8 +220,8 @@ def smoothed_poses(walk: Sequence, by: PosesBy) -> Reading:
 
 @functools.cache
 def _labeller(by: PosesBy) -> tuple[float, Predict, filtering.FilterSetup]:
-    """A network's rate (Hz), the network and its filter: made once, since programs are compiled for
-    the network that they are given. Raises `InputError` where the run is no longer the same."""
+    """A network's rate (Hz), the network and its filter. They are made once, because programs are
+    compiled for each network object. Raises `InputError` if the run has changed."""
     run = by.load(by.run)
     if _digest_of_run(run) != by.digest:
         raise InputError(by.run, "has changed while it made poses", "begin the training anew")
@@ -230,14 +231,14 @@ def _labeller(by: PosesBy) -> tuple[float, Predict, filtering.FilterSetup]:
 
 
 def _digest_of_run(run: Run) -> str:
-    """Of its settings, wherever it lies, and its weights."""
+    """Digest of the settings, without the places of folders, and of the weights of a run."""
     settings = configuration.flat(configuration.without_places(run.config))
     return _digest(sorted(settings.items()), run.variables)
 
 
 def _cache_entry(walk: Sequence, by: PosesBy) -> Path:
-    """The file that keeps the smoothed poses of a walk: of the walk, the run, and the sources that
-    make poses of them."""
+    """The file that keeps the smoothed poses of a walk. Its name is a digest of the walk, the run,
+    and the sources that make the poses."""
     arrays = [walk.time, walk.gyro, walk.accel, walk.imu_valid, walk.waypoints]
     name = _digest([walk.name, sorted(walk.attributes.items()), by.digest], arrays)
     return cache_entry(name, _sources())
@@ -245,7 +246,7 @@ def _cache_entry(walk: Sequence, by: PosesBy) -> Path:
 
 @functools.cache
 def _sources() -> list[Path]:
-    """The files that decide what poses a walk gets, beside those of `data`."""
+    """The source files on which the poses of a walk depend, besides those of `data`."""
     package = Path(__file__).parents[1]
     rooms = [path for room in ("filtering", "models") for path in (package / room).rglob("*.py")]
     return sorted([*package.glob("*.py"), *rooms, Path(__file__)])

@@ -39,8 +39,8 @@ _Event, _SessionLog = (getattr(event_pb2, name) for name in ("Event", "SessionLo
 def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     """The work folder of a run that `config` may start or continue; nothing is written.
 
-    Raises `InputError` for a folder that holds a run already, and with `resume` for one that holds
-    none, or one with other settings. Of several processes the first one alone looks.
+    Raises `InputError` for a folder that already holds a run, and with `resume` for one that holds
+    none, or one with other settings. Of several processes only the first one checks this.
     """
     workdir = configuration.default_workdir(config)
     kept = workdir / "config.yaml"
@@ -69,12 +69,12 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
 def opened(
     config: TrainConfig, recordings: Recordings, variables: Any, resume: bool
 ) -> Iterator[Path]:
-    """The work folder, with the config.yaml and splits.yaml of a new run, for one training at a
-    time: the folder is locked as long as the context lasts, or the process.
+    """The work folder, with the config.yaml and splits.yaml of a new run. It is for one training at
+    a time: the folder is locked until the context or the process ends.
 
-    Raises `InputError` where another process trains in it, for a resumed run that was begun with
-    other recordings, and as `compare_processes` does for the variables at step 0. Of several
-    processes the first one writes.
+    Raises `InputError` if another process trains in it, for a resumed run that was begun with other
+    recordings, and as `compare_processes` does for the variables at step 0. Of several processes
+    the first one writes.
     """
     compare_processes(config, recordings, variables)
     workdir = configuration.default_workdir(config)
@@ -89,7 +89,7 @@ def opened(
         except BlockingIOError:
             problem = "another process is training in it"
             raise InputError(workdir, problem, "choose another --workdir") from None
-        refuse_other_run(config, resume)  # another one may have begun while the data was read
+        refuse_other_run(config, resume)  # another run may have begun while the data were read
         if not resume:
             configuration.save(workdir / "config.yaml", config)
         path = workdir / "splits.yaml"
@@ -104,8 +104,9 @@ def opened(
 
 
 def _refuse_other_recordings(path: Path, splits: dict[str, dict[str, int] | list[str]]) -> None:
-    """Hold-outs are drawn from the recordings that a copy of the data holds: those may differ, and
-    so may recordings of one name. An earlier version kept the names alone."""
+    """Refuse recordings other than those with which the run was begun. Hold-outs are drawn from the
+    recordings of a copy of the data, which may differ between copies, and so may recordings with
+    the same name. An earlier version kept only the names."""
     try:
         before = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -131,7 +132,8 @@ def _refuse_other_recordings(path: Path, splits: dict[str, dict[str, int] | list
 
 def compare_processes(config: TrainConfig, recordings: Recordings, variables: Any) -> None:
     """Raise `InputError` in every process unless all have the same settings, recordings and weights
-    to begin with: other ones would compute something else, or wait for each other for ever.
+    to begin with. Otherwise they would compute different results, or wait for each other without
+    end.
 
     Trees of arrays are compared by their shapes and a sample of their rows.
     """
@@ -165,11 +167,11 @@ def compare_processes(config: TrainConfig, recordings: Recordings, variables: An
 
 class Log:
     """A row of figures for each finished epoch, in metrics.jsonl and TensorBoard. A resumed run
-    drops those after its checkpoint and writes them again. Of several processes the first one
-    writes them.
+    removes the rows after its checkpoint and writes them again. Of several processes the first one
+    writes.
 
-    tensorboardX's own SummaryWriter writes in a thread, which dies where the disk is full; then
-    the run would wait for it for ever. So its events are written here, one by one.
+    tensorboardX's own SummaryWriter writes in a thread, which ends when the disk is full, and then
+    the run would wait for it without end. So the events are written here, one by one.
     """
 
     def __init__(self, workdir: Path, epoch: int, step: int):
@@ -181,7 +183,7 @@ class Log:
             self._rows = [row for row in map(json.loads, lines) if row["epoch"] < epoch]
             self._board.mkdir(parents=True, exist_ok=True)
             self._events = EventsWriter(str(self._board / "events"))
-            # Events of other files from this step on are void.
+            # Events of other files from this step on are invalid.
             start = _SessionLog(status=_SessionLog.START)
             self._events.write_event(_Event(wall_time=time.time(), step=step, session_log=start))
 
@@ -190,7 +192,7 @@ class Log:
 
     def __exit__(self, *_: object) -> None:
         if self._events is not None:
-            with suppress(OSError):  # `add` has raised it, or something worse has happened
+            with suppress(OSError):  # `add` has raised it, or a worse error is under way
                 self._events.close()
 
     def add(self, row: Row) -> None:

@@ -1,7 +1,7 @@
-"""Segments of recordings for training through the filter: where they begin, their reference, and
-how wrong the filter's start is.
+"""Segments of recordings for training through the filter: their beginnings, their reference, and
+the errors of the filter's start.
 
-The recordings lie on the device once, end to end, and segments are cut inside the jitted step.
+The recordings are on the device once, end to end, and segments are cut inside the jitted step.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ class SegmentSource(NamedTuple):
     accel: Float[Array, "t 3"]
     """m/s², raw."""
     rotation: Float[Array, "t 3 3"]
-    """Reference, body → world; anything where it cannot be trusted, as the next two."""
+    """Reference, body → world. It has arbitrary values where it cannot be trusted, and so have the
+    next two fields."""
     velocity: Float[Array, "t 3"]
     """Reference, m/s."""
     position: Float[Array, "t 3"]
@@ -76,13 +77,12 @@ rad/s and accelerometer bias m/s² (3,)."""
 
 
 def segment_source(sequences: Iterable[Sequence], samples: int) -> SegmentSource:
-    """Recordings (all at one rate) and the segments of `samples` samples that fit in them.
+    """The source for recordings (all at one rate) and for segments of `samples` samples.
 
     A segment needs a trusted reference at each of its samples and at the one after them. A stretch
-    of L such samples has as many segments as fit in it side by side. They may overlap: segment j of
-    m begins anywhere in the j-th of m equal shares of the rows at which a segment can begin, so
-    that every epoch meets the whole stretch, cut elsewhere. Raises `InputError` when not a single
-    segment fits.
+    of such samples has as many segments as fit in it side by side. They may overlap: segment j of m
+    begins anywhere in the j-th of m equal shares of the rows at which a segment can begin, so every
+    epoch covers the whole stretch, cut at other rows. Raises `InputError` if no segment fits.
     """
     parts = [_source_of(sequence, samples) for sequence in sequences]
     parts = [part for part in parts if part.earliest.size]
@@ -93,7 +93,7 @@ def segment_source(sequences: Iterable[Sequence], samples: int) -> SegmentSource
 
 
 def joined(sources: list[SegmentSource]) -> SegmentSource:
-    """The recordings of each after those of the one before, as host arrays."""
+    """The recordings of all sources, one source after the other, as host arrays."""
     parts: list[SegmentSource] = []
     rows = 0
     for source in sources:
@@ -106,7 +106,7 @@ def joined(sources: list[SegmentSource]) -> SegmentSource:
 def _source_of(sequence: Sequence, samples: int) -> SegmentSource:
     """One recording's segments, rows counted from 0."""
     known = sequence.valid & finite_rows(sequence.velocity)
-    if sequence.imu_valid is not None:  # a line across a gap is nothing to learn from
+    if sequence.imu_valid is not None:  # not from samples that are interpolated across a gap
         known = known & sequence.imu_valid
     earliest: list[np.ndarray] = []
     latest: list[np.ndarray] = []
@@ -175,8 +175,8 @@ def turned_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
 
 
 def draw_start(key: PRNGKeyArray, truth: Path, std: InitialStd, spread: float) -> Start:
-    """First estimates that are off the truth, and the biases off zero, by errors as uncertain as
-    `spread` times `std`. The attitude is exp(θ) R, with θ in the world frame. Jittable."""
+    """First estimates with errors drawn from `spread` times `std`, from the truth and from zero
+    biases. The attitude is exp(θ) R, with θ in the world frame. Jittable."""
     draws = spread * jax.random.normal(key, (5, 3), jnp.float64)
     tilt_tilt_yaw = jnp.stack([jnp.asarray(each) for each in (std.tilt, std.tilt, std.yaw)])
     return (

@@ -1,7 +1,7 @@
-"""What training on windows and training through the filter have in common: state, step, set-up.
+"""The common part of training on windows and training through the filter: state, step, set-up.
 
-A `Task` says what is trained, draws its batches and gives their losses. `train_steps` is the one
-jitted step: gradient, guard, update, all on the device.
+A `Task` defines what is trained, draws its batches and computes their losses. `train_steps` is the
+one jitted step: gradient, check, update, all on the device.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gnio_jax.training.optimizer import Trainable
 from gnio_jax.types import Sequence
 
 Row = dict[str, int | float]
-"""Figures of an epoch by name, as the log keeps them."""
+"""Figures of an epoch by their names in the log."""
 
 
 class TrainState(NamedTuple):
@@ -38,54 +38,58 @@ class TrainState(NamedTuple):
 
     step: Int[jax.Array, ""]
     variables: dict[str, Any]
-    """By collection: the network's "params" and "batch_stats", and through the filter its numbers
-    that may be trained, "filter" (`optimizer.filter_numbers`)."""
+    """Variables by collection: the network's "params" and "batch_stats", and for training through
+    the filter its numbers, "filter" (`optimizer.filter_numbers`)."""
     opt_state: Any
 
 
 class BatchLosses(NamedTuple):
-    """What a task says of a batch."""
+    """The losses of a batch and their side results."""
 
     figures: dict[str, Float[jax.Array, ""]]
-    """`loss`, which is minimised, and its parts by the names of the log."""
+    """`loss`, which is minimised, and its parts by their names in the log."""
     batch_stats: Any
     """Statistics of batch normalisation after the batch."""
     healthy: Bool[jax.Array, ""]
-    """False where the filter diverged: the loss then says nothing."""
+    """False if the filter diverged: the loss is then meaningless."""
 
 
 class Progress(NamedTuple):
     """Figures of the steps of one dispatch."""
 
     sums: dict[str, Float[jax.Array, ""]]
-    """Summed over the steps: `loss` and its parts, and `gradient_norm/<part>` (`gradient_norms`);
-    of a task that skips steps, their number `skipped`, and no figures of them."""
+    """Sums over the steps of `loss`, its parts and `gradient_norm/<part>` (`gradient_norms`). A
+    task that skips steps also has their number, `skipped`, and skipped steps have no part in the
+    sums."""
     failed_step: Int[jax.Array, ""]
-    """First step whose loss or gradient was not finite, and was not skipped; −1: none."""
+    """First step whose loss or gradient was not finite and that was not skipped; −1 if there is
+    none."""
 
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """What is trained, and by which losses. It is compiled into the jitted functions, and equal for
-    runs that differ in their seeds and folders."""
+    """The definition of what is trained, and by which losses. It is compiled into the jitted
+    functions, and it is equal for runs that differ in their seeds and folders."""
 
     model: nn.Module
     config: TrainConfig
     """Settings without seed and folders."""
     steps_per_epoch: int
     parts: tuple[int, ...] = ()
-    """How many windows or segments of training each dataset has."""
+    """Number of training windows or segments of each dataset."""
 
     unit: ClassVar[str]
-    """What a batch consists of, in the plural."""
+    """The items of a batch, in the plural: "windows" or "segments"."""
     figures: ClassVar[tuple[str, ...]]
     """Names of the losses of a batch."""
     skip_above: ClassVar[float | None] = None
-    """Norm of the gradient above which a step is skipped, as is one whose loss or gradient is not
-    finite, or for which the filter diverged. None: the first step that is not finite ends the run.
+    """Norm of the gradient above which a step is skipped. A step is also skipped if its loss or
+    gradient is not finite, or if the filter diverged. None: the first step that is not finite ends
+    the run.
     """
     joined: ClassVar[Callable[[list[Any]], Any]]
-    """The windows or segments of several datasets one after the other, on the host."""
+    """A function that joins the windows or segments of several datasets, one after the other, on
+    the host."""
 
     @staticmethod
     @abstractmethod
@@ -95,36 +99,38 @@ class Task(ABC):
     @staticmethod
     @abstractmethod
     def count(source: Any) -> int:
-        """How many of them an epoch visits, unless datasets have weights."""
+        """Number of windows or segments that an epoch visits, unless datasets have weights."""
 
     @abstractmethod
     def description(self, state: TrainState, workdir: Path) -> Iterator[str]:
-        """Lines about what will be trained, and a warning where a part of it never will be."""
+        """Lines about what will be trained, and a warning if a part of it is never trained."""
 
     @property
     def changes(self) -> tuple[int, ...]:
-        """Steps at which what is trained changes: losses before and after do not compare."""
+        """Steps at which the trained parts change: losses before and after cannot be compared."""
         return ()
 
     @abstractmethod
     def order(self, key: PRNGKeyArray, epoch: int, source: Any) -> Int[jax.Array, "m"]:
-        """What an epoch visits, in order: a function of `key` and the epoch."""
+        """The windows or segments that an epoch visits, in order: a function of `key` and the
+        epoch."""
 
     @abstractmethod
     def draw(self, key: PRNGKeyArray, source: Any, which: Int[jax.Array, "b"]) -> Any:
-        """A batch of training: those entries `which` of an order, changed by draws from `key`."""
+        """A training batch: the entries `which` of an order, with random changes drawn from
+        `key`."""
 
     @abstractmethod
     def losses(self, variables: Any, batch: Any, step: Int[jax.Array, ""]) -> BatchLosses:
         """The losses of a batch in a step of training."""
 
     def with_statistics(self, state: TrainState, source: Any, key: PRNGKeyArray) -> TrainState:
-        """The state as it is validated and kept: with the statistics of its batch normalisations
-        estimated anew, if asked for."""
+        """The state that is validated and kept: with the statistics of its batch normalisations
+        estimated anew, if the settings ask for it."""
         return state
 
     def calibrated(self, state: TrainState, held_out: dict[str, Any]) -> TrainState:
-        """The state with its uncertainty calibrated, where it has constants for that."""
+        """The state with its uncertainty calibrated, if it has constants for that."""
         return state
 
     @abstractmethod
@@ -133,17 +139,17 @@ class Task(ABC):
 
     @abstractmethod
     def remark(self, row: Row) -> str:
-        """What the line of an epoch says besides loss, speed and rate."""
+        """Text in the line of an epoch besides loss, speed and learning rate."""
 
     def trainable(self, variables: Any) -> Trainable:
-        """Those of the variables that are trained."""
+        """The trained variables."""
         return optimizer.trainable(variables, self.config.through_filter.learn)
 
     def validate(
         self, state: TrainState, held_out: dict[str, Any], key: PRNGKeyArray
     ) -> tuple[TrainState, Row]:
-        """The state as it is kept, calibrated, and its figures on the validation split. Of several
-        datasets these are means over them, beside the losses and errors of each."""
+        """The state that is kept, calibrated, and its figures on the validation split. For several
+        datasets these are means over the datasets, and the losses and errors of each are added."""
         state = self.calibrated(state, held_out)
         rows = {name: self.figures_of(state, each, key) for name, each in held_out.items()}
         first, *others = rows.values()
@@ -155,9 +161,9 @@ class Task(ABC):
         return state, row
 
     def weighted(self, key: PRNGKeyArray, entries: Int[jax.Array, "m"]) -> Int[jax.Array, "n"]:
-        """Those of `entries`, one for each window or segment, that an epoch visits: of each dataset
-        as many as its weight says, in no order. Which of them, where it is not all of them alike,
-        depends on `key`."""
+        """The part of `entries`, one for each window or segment, that an epoch visits: for each
+        dataset the number that its weight gives, in no order. If an epoch does not visit all of
+        them equally often, `key` decides which ones it visits."""
         weights, found = self.config.data.weights, []
         if not weights:
             return entries
@@ -171,7 +177,7 @@ class Task(ABC):
 
     def initial_state(self, key: PRNGKeyArray, start: Any | None) -> TrainState:
         """The state at step 0: with drawn parameters, or with the variables `start` of a run. The
-        filter's numbers are those of the settings, whatever run training starts from."""
+        filter's numbers are always those of the settings, even if training starts from a run."""
         variables = {"batch_stats": {}, **models.initialise(self.model, key, self.config.data.seen)}
         if start is not None:
             variables = overlaid(variables, start)
@@ -206,8 +212,9 @@ def train_steps(
     """Take `count` steps of an epoch, from its step number `first` on, in one dispatch.
 
     order: what the epoch visits of `source`; factor: scales the scheduled learning rate
-    (`optimizer.Plateau`). `count` is traced: however an epoch is cut into dispatches it is the same
-    compiled program, so a run that was interrupted and resumed has the same parameters to the bit.
+    (`optimizer.Plateau`). `count` is traced, so the compiled program is the same for every division
+    of an epoch into dispatches, and a run that was interrupted and resumed has the same parameters
+    to the bit.
     """
     size = task.config.optim.batch_size
     chex.assert_rank(order, 1)
@@ -234,8 +241,8 @@ def train_steps(
         variables["batch_stats"] = found.batch_stats
         new = TrainState(state.step, variables, opt_state)
 
-        # Loss and gradient are looked at before the update is kept: a gradient that is not finite
-        # must not reach a checkpoint, though its loss is.
+        # Loss and gradient are checked before the update is kept: a gradient that is not finite
+        # must not reach a checkpoint, even if its loss is finite.
         figures = found.figures | gradient_norms(gradient)
         sound = found.healthy & jnp.isfinite(jnp.stack(list(figures.values()))).all()
         failed_step = progress.failed_step
@@ -259,7 +266,7 @@ def train_steps(
 def gradient_of(
     trained: Trainable, variables: Any, batch: Any, step: Int[jax.Array, ""], task: Task
 ) -> tuple[Trainable, BatchLosses]:
-    """Gradient of the loss of a batch by what is trained, and the losses."""
+    """Gradient of the loss of a batch by the trained variables, and the losses."""
 
     def objective(trained: Trainable) -> tuple[jax.Array, BatchLosses]:
         found = task.losses(merged(variables, trained), batch, step)
@@ -271,7 +278,7 @@ def gradient_of(
 
 
 def merged(variables: Any, trained: Trainable) -> Any:
-    """All variables, with those that are trained in their places."""
+    """All variables, with the trained ones in their places."""
     return {name: {**tree, **trained.get(name, {})} for name, tree in variables.items()}
 
 
@@ -289,7 +296,7 @@ def gradient_norms(gradient: Trainable) -> dict[str, Float[jax.Array, ""]]:
 
 
 def visits(count: int, weight: float) -> int:
-    """How many windows or segments an epoch visits of a dataset that has `count`."""
+    """Number of windows or segments that an epoch visits of a dataset with `count` of them."""
     return round(weight * count)
 
 

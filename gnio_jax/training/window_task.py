@@ -1,7 +1,7 @@
 """Training on windows: each window against the displacement of the reference (paper §III-F).
 
-The task, its batches, the statistics of batch normalisation, validation. The step is
-`task.train_steps`.
+This module has the task, its batches, the statistics of batch normalisation, and validation. The
+step is `task.train_steps`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from gnio_jax.types import Prediction, Sequence, Windows
 
 
 class WindowTask(Task):
-    """Training on windows, which a `WindowSource` holds."""
+    """Training on the windows of a `WindowSource`."""
 
     unit = "windows"
     figures = ("loss", "mse", "nll")
@@ -88,7 +88,7 @@ class WindowTask(Task):
         self, key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"]
     ) -> tuple[Windows, PRNGKeyArray]:
         """The windows `which`, shifted, low-passed and augmented, and a key for the network's
-        dropout. Each device cuts its share of them."""
+        dropout. Each device cuts its share of the windows."""
         chex.assert_equal_shape_prefix([source.start, source.rotation, source.displacement], 1)
         augment_key, dropout_key, shift_key = jax.random.split(key, 3)
         data, changes = self.config.data, self.config.augment
@@ -136,7 +136,7 @@ class WindowTask(Task):
         return loss_stage(self.config.loss, state.step - 1, self.steps_per_epoch)
 
     def remark(self, row: Row) -> str:
-        """The parts of both losses, which compare between networks where the losses do not."""
+        """The parts of both losses, which can be compared between networks, unlike the losses."""
         return (
             f"mse {row['mse']:.4g} nll {row['nll']:.4g}  "
             f"val mse {row['val_mse']:.4g} nll {row['val_nll']:.4g}  "
@@ -158,7 +158,7 @@ def apply_training(
 
 def predicted_axes(model: nn.Module) -> int:
     """How many axes of the displacement a network predicts: 2 where the vertical is always 0."""
-    network = getattr(model, "network", model)  # what an equivariant construction is made around
+    network = getattr(model, "network", model)  # the network inside an equivariant construction
     return getattr(network, "output_dim", 3)
 
 
@@ -176,8 +176,8 @@ def has_statistics(state: TrainState, *names: str) -> bool:
 def statistics_order(
     key: PRNGKeyArray, source: WindowSource, task: WindowTask
 ) -> Int[jax.Array, "m"]:
-    """The windows of `estimate_statistics`: whole batches for `optim.statistics_windows`, but no
-    more than an epoch has, drawn from `key` alone."""
+    """The windows of `estimate_statistics`: whole batches for `optim.statistics_windows`, at most
+    those of an epoch, drawn from `key` alone."""
     optim = task.config.optim
     order_key, _ = jax.random.split(key)
     visited = task.weighted(order_key, jnp.asarray(source.visited))
@@ -197,16 +197,16 @@ def estimate_statistics(
 ) -> TrainState:
     """The state with the statistics of every batch normalisation estimated anew for its parameters.
 
-    Means over batches of augmented training windows, in training mode: those of `order`, as
-    `statistics_order` draws them from the same `key`. The running averages remember ten steps, and
-    what those miss is an offset of the displacement (ours; Wu and Johnson 2021, "Rethinking 'Batch'
-    in BatchNorm"). Nothing else of `batch_stats` changes.
+    The statistics are means over batches of augmented training windows, in training mode: those of
+    `order`, which `statistics_order` draws from the same `key`. Running averages remember only ten
+    steps, and their error is an offset of the displacement (ours; Wu and Johnson 2021, "Rethinking
+    'Batch' in BatchNorm"). Nothing else of `batch_stats` changes.
     """
     size, before = task.config.optim.batch_size, state.variables["batch_stats"]
     batches = order.shape[0] // size
     _, draw_key = jax.random.split(key)
-    # A normalisation adds 1 − MOMENTUM of the batch's statistics to the MOMENTUM-fold of its own:
-    # of zeros, that alone is left.
+    # A normalisation adds the batch's statistics times 1 − MOMENTUM to its own times MOMENTUM. If
+    # its own are zero, only the first term remains.
     zeros = jax.tree.map(jnp.zeros_like, before)
     variables = state.variables | {"batch_stats": zeros}
 
@@ -239,7 +239,7 @@ class Validation(NamedTuple):
     axis_mse: Float[jax.Array, "3"]
     """Squared error of each axis, m²."""
     axis_normalised: Float[jax.Array, "3"]
-    """(e/σ)² of each axis: 1 where the standard deviations are those of the errors."""
+    """(e/σ)² of each axis: 1 if the standard deviations are those of the errors."""
 
 
 @functools.partial(jax.jit, static_argnames="task")
@@ -250,8 +250,8 @@ def validate(
     mode."""
     config, model = task.config, task.model
     count = source.visited.shape[0]
-    # Whole batches, of which each device has the same share: the last one is filled up with windows
-    # of weight zero.
+    # Batches are whole, so that each device has the same share: the last one is filled up with
+    # windows of weight zero.
     size = -(-min(config.optim.batch_size, count) // parallel.count()) * parallel.count()
     batches = -(-count // size)
     which = source.visited[
@@ -282,9 +282,9 @@ def calibrated(state: TrainState, found: Validation, isotropic: bool = False) ->
     """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that
     validation found with it.
 
-    `isotropic`: the horizontal axes share the mean of both, since constants of an equivariant
-    network cannot tell one from the other. Errors below 0.1 mm count as 0.1 mm, and a σ changes by
-    no more than a factor of 1000 at once: nothing becomes infinite.
+    `isotropic`: both horizontal axes get their mean, because constants of an equivariant network
+    cannot distinguish them. Errors below 0.1 mm count as 0.1 mm, and a σ changes at most by a
+    factor of 1000 at once, so that nothing becomes infinite.
     """
     mse, normalised = (
         axes.at[:2].set(axes[:2].mean()) if isotropic else axes
