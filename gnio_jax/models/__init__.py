@@ -1,4 +1,4 @@
-"""Networks: windows of IMU samples in, `Prediction` out."""
+"""Networks, which map windows of IMU samples to a `Prediction`."""
 
 from gnio_jax.models.inference import Inference, InferenceVariables, Network, inference_variables
 from gnio_jax.models.registry import (

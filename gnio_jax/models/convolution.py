@@ -1,8 +1,8 @@
-"""How the networks convolve, fast on CPUs: the numbers are those of `lax.conv_general_dilated`, to
-rounding.
+"""Convolutions of the networks that are fast on CPUs: the results are those of
+`lax.conv_general_dilated`, to rounding.
 
-Each `convolve...` takes the place of that function in `flax.linen.Conv` and has its arguments. XLA
-runs the gradients of strided, depthwise and grouped convolutions through a generic loop on CPUs;
+Each `convolve...` takes the place of that function in `flax.linen.Conv` and has its arguments. On
+CPUs XLA computes the gradients of strided, depthwise and grouped convolutions in a generic loop;
 the gradients of products are products again.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 WINOGRAD_CHANNELS = 64
-"""With fewer channels than these the products that Winograd's algorithm saves cost less than its
+"""Number of channels below which the products that Winograd's algorithm saves cost less than its
 sums."""
 
 
@@ -43,8 +43,8 @@ def convolve_forward(
     padding: list[tuple[int, int]],
     **_: object,
 ) -> Float[Array, "b m d"]:
-    """The same convolution by XLA's own, which takes half the time for a single window. Its
-    derivatives, of any order and mode, are those of the product."""
+    """The same convolution by XLA's own implementation, which takes half the time for a single
+    window. Its derivatives, of any order and mode, are those of the product."""
 
     @jax.custom_jvp
     def native(x: Any, kernel: Any) -> Array:
@@ -91,14 +91,14 @@ def convolve_groups(
 
 
 def neighbours(x: Float[Array, "b n c"], span: int) -> Float[Array, "b n s c"]:
-    """For every sample the `span` samples around it, with zeros beyond the ends."""
+    """The `span` samples around every sample, with zeros beyond the ends."""
     return jnp.stack(_shifted(x, span, 1, (span // 2, span // 2)), axis=2)
 
 
 def _shifted(
     x: Float[Array, "b n c"], size: int, stride: int, padding: tuple[int, int]
 ) -> list[Float[Array, "b m c"]]:
-    """For each of the `size` samples of a kernel the inputs, padded by zeros, that it meets."""
+    """The inputs, padded by zeros, that each of the `size` samples of a kernel multiplies."""
     x = jnp.pad(x, ((0, 0), padding, (0, 0)))
     length = (x.shape[1] - size) // stride + 1
     return [x[:, i : i + stride * (length - 1) + 1 : stride] for i in range(size)]
@@ -120,16 +120,16 @@ def max_pool(x: Float[Array, "b n c"]) -> Float[Array, "b m c"]:
 # Winograd's F(4, 3): a convolution of three samples with half the multiplications.
 #
 # Four outputs y of one channel are yᵀ = Aᵀ (G g ⊙ Bᵀ d), with the kernel g of three samples and the
-# six inputs d that it meets: 6 multiplications where the definition has 12 (Winograd 1980; the
+# six inputs d that it covers: 6 multiplications where the definition has 12 (Winograd 1980; the
 # matrices are those of Lavin and Gray 2016, §4.3). Over channels each of the six is a matrix
-# product. The sums before and after cost at most a digit of float32: results differ from the
-# definition by some 2e-6 of the largest of the six inputs. An input that is not finite makes all
+# product. The sums before and after lose at most a digit of float32: results differ from the
+# definition by about 2e-6 of the largest of the six inputs. An input that is not finite makes all
 # outputs that share a sum with it not finite.
 
 TILE = 4
-"""Outputs that are computed together."""
+"""Number of outputs that are computed together."""
 POINTS = 6
-"""Products for them, and inputs that they depend on."""
+"""Number of products for them, and of inputs on which they depend."""
 
 _INPUT = np.array(
     [
@@ -151,12 +151,12 @@ _OUTPUT = np.array(
 
 
 def winograd_pays() -> bool:
-    """Whether a network that is made here should train by Winograd's algorithm: on a CPU, in one
+    """Whether a network should train by Winograd's algorithm on this machine: on a CPU, in one
     process.
 
-    Other devices may round products to fewer digits (TF32), which Winograd's sums would magnify.
-    Processes that share a batch would send six matrices to each other where the product's gradient
-    has three.
+    Other devices may round products to fewer digits (TF32), and Winograd's sums would enlarge this
+    error. Processes that share a batch would exchange six matrices, but three for the product's
+    gradient.
     """
     return jax.default_backend() == "cpu" and jax.process_count() == 1
 
@@ -168,8 +168,9 @@ def convolve_winograd(
     padding: list[tuple[int, int]],
     **_: object,
 ) -> Float[Array, "b m d"]:
-    """The same convolution as `convolve`, with half the multiplications where that is quicker:
-    three samples at stride 1 and many channels. Of one or two samples most of a tile is padding."""
+    """The same convolution as `convolve`, with half the multiplications where that is quicker: for
+    three samples at stride 1 and many channels. For inputs of one or two samples most of a tile is
+    padding."""
     fits = kernel.shape[0] == 3 and window_strides[0] == 1 and padding[0] == (1, 1)
     if fits and kernel.shape[1] >= WINOGRAD_CHANNELS and x.shape[1] > 2:
         return convolve_three(x, kernel)
@@ -183,8 +184,8 @@ def convolve_three(
     """The correlation of `x`, padded by a zero on both sides, with `kernel`, at every sample, in
     the type of `x`.
 
-    It has a gradient, and no derivative in forward mode. The gradient is written out: that of the
-    strided slices below would be sums of six padded arrays.
+    It has a gradient, but no derivative in forward mode. The gradient is written out, because that
+    of the strided slices below would be sums of six padded arrays.
     """
     return _three_forward(x, kernel)[0]
 

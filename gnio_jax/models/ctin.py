@@ -26,36 +26,38 @@ from gnio_jax.types import Prediction
 SPAN = 3
 """Samples that the local attention sees."""
 KEY_GROUPS = 4
-"""Groups of the convolution that makes its keys (ours, from the contextual transformer block that
-it resembles)."""
+"""Groups of the convolution that makes the keys of the local attention (ours, from the contextual
+transformer block that it resembles)."""
 SQUEEZE = 4
-"""Channels per hidden unit where the local attention weighs (ours, from there too)."""
+"""Channels per hidden unit in the layers that make the weights of the local attention (ours, from
+the same block)."""
 
 
 class CTIN(nn.Module):
     """Windows [accel, gyro] in the gravity-aligned frame to a velocity and its log standard
     deviation at every sample.
 
-    A spatial encoder looks over the whole window, a temporal embedding (BiLSTM and trainable
-    positions) goes through a decoder whose self-attention is causal and which attends to the
-    encoder. The publication gives the parts and 0.56 M parameters in all, not the sizes; ours are
-    96 features, 64 in the encoder, 192 in the feed-forward parts, 48 LSTM units a direction and 8
-    heads: 555,364 with `output_dim = 2`, as published, for windows of 200 samples (the positions
-    follow the window), and two for the loss below. A third axis costs 98. Training needs the random
-    stream `dropout`.
+    A spatial encoder sees the whole window. A temporal embedding (BiLSTM and trainable positions)
+    goes through a decoder whose self-attention is causal and which attends to the encoder. The
+    publication gives the parts and the total of 0.56 M parameters, but not the sizes. Ours are 96
+    features, 64 in the encoder, 192 in the feed-forward parts, 48 LSTM units a direction and 8
+    heads: 555,364 with `output_dim = 2`, as published, for windows of 200 samples (the number of
+    positions is that of the samples), and two for the loss below. A third axis adds 98. Training
+    needs the random stream `dropout`.
 
     Velocities are in metres per duration of the window, m/s for the publication's 1 s. The window's
     displacement is their mean, m. Ours: its standard deviation per axis is the root mean square of
-    the steps', as if their errors were one, since those of neighbours all but are. With two axes
-    the vertical velocity is 0 and so is its log standard deviation, 1 m per window.
+    those of the steps, as if all steps had the same error, because the errors of neighbouring steps
+    are almost equal. With two axes the vertical velocity is 0, and its log standard deviation is 0
+    too, which is 1 m per window.
 
     Diagnostics: `velocity` and `velocity_log_std` (b, n, 3); `task_log_std` (b, 2), the trained log
     δ_v and log δ_c with which the loss L_v / 2δ_v² + L_c / 2δ_c² + log δ_v δ_c balances the errors
     of the velocity and its likelihood.
 
-    Ours, beyond the sizes: ReLU where an activation is not named; post-normalised layers as in the
-    first transformer; dropout of the encoder after its global attention, of the decoder before
-    every sum.
+    Ours, besides the sizes: ReLU where no activation is named; post-normalised layers as in the
+    first transformer; dropout after the global attention of the encoder, and before every sum of
+    the decoder.
     """
 
     width: Count = 96
@@ -89,7 +91,8 @@ class CTIN(nn.Module):
         sizes = self.heads, self.ffn, self.decoder_dropout
         for layer in range(self.decoder_layers):
             x = DecoderLayer(*sizes, name=f"decoder_{layer + 1}")(x, memory, train)
-        # The uncertainty starts at σ = 1 (ours), as in `heads.UncertaintyHead` and for its reason.
+        # The uncertainty starts at σ = 1 (ours), as in `heads.UncertaintyHead` and for the same
+        # reason.
         starts = {"velocity": nn.initializers.lecun_normal(), "log_std": nn.initializers.zeros}
         velocity, log_std = (
             jax.vmap(to_axes)(SampleHead(self.output_dim, start, name=name)(x))
@@ -132,14 +135,14 @@ class SpatialEncoder(nn.Module):
 
 
 class LocalAttention(nn.Module):
-    """Every channel of every sample attends to three samples, with weights from the sample and the
-    context that its key holds.
+    """Every channel of every sample attends to three samples, with weights that depend on the
+    sample and on the context in its key.
 
-    Keys: a convolution of groups over 3 samples, the static context; queries: the samples
-    themselves; values: a 1×1 convolution. Two 1×1 convolutions make the weights from [query, key]
-    (ours: softmax over the three samples; beyond the window the values are 0), which give the local
-    context. An attention over the two, from their sum's mean over time, fuses the local context and
-    the keys.
+    The keys are a grouped convolution over 3 samples, the static context. The queries are the
+    samples themselves, and the values are a 1×1 convolution. Two 1×1 convolutions make the weights
+    from [query, key] (ours: softmax over the three samples; beyond the window the values are 0),
+    and the weighted values are the local context. An attention computed from the mean over time of
+    the sum of local context and keys fuses these two.
     """
 
     @nn.compact
@@ -205,8 +208,8 @@ class DecoderLayer(nn.Module):
 class SampleHead(nn.Module):
     """Linear, layer normalisation, linear, at every sample.
 
-    The publication's text can be read as normalising the output itself, which would take its scale
-    away. Ours: half the features between.
+    The publication's text can be read as normalising the output itself, which would remove its
+    scale. Ours: half the features between.
     """
 
     outputs: int

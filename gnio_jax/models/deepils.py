@@ -24,13 +24,14 @@ class DeepILS(DisplacementRegressor):
     Published: the horizontal velocity over a window of 1 s, `output_dim = 2`, 2,290,226 parameters
     for windows of 200 samples. Ours: the displacement over the window, which is that velocity in a
     window of 1 s, along three axes (2,290,739) unless two are asked for; then the vertical one is
-    0. Ours too: the shortcut where the shape changes is an ordinary 1×1 convolution with
-    normalisation (the count leaves no other), and the linear layers start as in TLIO's head. Widths
+    0. Also ours: the shortcut where the shape changes is an ordinary 1×1 convolution with
+       normalisation (the number of parameters allows no other), and the linear layers start as in
+       TLIO's head. Widths
     other than 64 scale every layer, for machines without an accelerator.
     """
 
     def features(self, windows: Float[Array, "b n 6"], train: bool) -> Array:
-        padded = jnp.pad(windows, ((0, 0), (1, 1), (0, 0)))  # one more than its kernel asks for
+        padded = jnp.pad(windows, ((0, 0), (1, 1), (0, 0)))  # one more than its kernel needs
         x = max_pool(nn.relu(conv_norm(padded, self.width, 5, 2, train, "stem_conv")))
         return residual_groups(AttentiveBlock, self.width, x, train)
 
@@ -76,19 +77,19 @@ class TimeAttention(nn.Module):
 
 
 def _maximum(x: Float[Array, "b n c"], axis: int) -> Float[Array, "b k"]:
-    """The maximum, whose gradient goes to the first place that holds it, as in PyTorch.
+    """The maximum, whose gradient goes to the first place that has this value, as in PyTorch.
 
-    That of `jnp.max` is shared by all values equal to the maximum; compilers may compute x a second
-    time for the comparison and round differently, and a maximum that no value equals has the
-    gradient 0/0.
+    The gradient of `jnp.max` is divided among all values that equal the maximum. Compilers may
+    compute x a second time for the comparison and round differently, and if no value equals the
+    maximum, the gradient is 0/0.
     """
     places = jax.lax.broadcasted_iota(jnp.int32, x.shape, axis)
     return jnp.sum(jnp.where(places == jnp.argmax(x, axis=axis, keepdims=True), x, 0), axis=axis)
 
 
 def _depthwise(channels: int, stride: int, train: bool, name: str) -> nn.Conv:
-    """Three samples of every channel by itself. Ours: He's normal start over the three samples that
-    a channel sees."""
+    """A depthwise convolution over three samples. Ours: He's normal initialisation for the three
+    samples that a channel sees."""
     options = {
         "feature_group_count": channels,
         "kernel_init": nn.initializers.variance_scaling(2.0, "fan_in", "normal"),

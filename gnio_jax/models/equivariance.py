@@ -1,5 +1,5 @@
-"""Yaw equivariance around any network: a window turned about the vertical gives the displacement
-turned alike.
+"""Yaw equivariance around any network: a window that is turned about the vertical gives a
+displacement that is turned by the same angle.
 
 A heading is (cos, sin) of an angle about z. The parameters of the wrapped network keep their names,
 so weights of the network alone fit `FourHeadings`.
@@ -25,11 +25,11 @@ QUARTER_TURNS = np.float32([[1, 0], [0, 1], [-1, 0], [0, -1]])
 FRAME_FEATURES = 16
 """Features of the frame network's convolutions (ours)."""
 FRAME_SPAN = 7
-"""Samples that each of them sees (ours)."""
+"""Samples that each of these convolutions sees (ours)."""
 
 
 class Equivariant(nn.Module):
-    """A network whose parts lie beside those that make it equivariant."""
+    """A network whose parts are on the same level as those that make it equivariant."""
 
     network: nn.Module
 
@@ -44,12 +44,12 @@ class Equivariant(nn.Module):
 
 
 class FourHeadings(Equivariant):
-    """Inference: the mean over the window turned by 0, 90, 180 and 270°, each displacement turned
-    back. Exact for quarter turns.
+    """At inference, the mean over the window turned by 0, 90, 180 and 270°, with each displacement
+    turned back. This is exact for quarter turns.
 
-    The variance is the mean of the four variances, turned back too. Diagnostics are those of the
-    window as it is, but for the velocities of CTIN, which are averaged alike. Training applies the
-    network once: augmentation draws the heading.
+    The variance is the mean of the four variances, also turned back. Diagnostics are those of the
+    window without a turn, except CTIN's velocities, which are averaged too. Training applies the
+    network once, because augmentation draws the heading.
     """
 
     def __call__(
@@ -85,8 +85,8 @@ class CanonicalFrame(Equivariant):
     part, details ours). Exact for every angle.
 
     The network's variances are along the axes of the frame. Turned back they are a covariance, of
-    which the diagonal is returned. Diagnostics are in the frame, but for the velocities of CTIN,
-    from which its loss learns: those are turned back.
+    which the diagonal is returned. Diagnostics are expressed in the frame, except CTIN's
+    velocities, which its loss needs: they are turned back.
     """
 
     def setup(self) -> None:
@@ -107,8 +107,8 @@ class FrameNetwork(nn.Module):
     horizontal vectors of its samples.
 
     The vectors are acceleration, angular rate and the quarter turns of both. A small convolutional
-    network finds the weights from quantities that do not turn. The sum points anywhere in the
-    plane. Where it is 0, as in a window without horizontal vectors, the heading is (1, 0), without
+    network finds the weights from invariant quantities. The sum can have any direction in the
+    plane. If it is 0, as in a window without horizontal vectors, the heading is (1, 0), without
     gradient.
     """
 
@@ -125,8 +125,8 @@ class FrameNetwork(nn.Module):
 
 
 def invariants(windows: Float[Array, "b n 6"]) -> Float[Array, "b n 6"]:
-    """What a turn about z leaves of every sample: |a|, |ω|, a · ω and a × ω of the horizontal
-    parts, the vertical acceleration without gravity and the vertical rate."""
+    """The invariants of every sample under a turn about z: |a|, |ω|, a · ω and a × ω of the
+    horizontal parts, the vertical acceleration without gravity and the vertical rate."""
     accel, gyro = windows[..., 0:2], windows[..., 3:5]
     values = (
         length(accel),
@@ -176,7 +176,7 @@ def turn_log_std(
     """The diagonal of the covariance diag(exp 2u) turned about z, as log standard deviations.
 
     It is computed in logarithms, where nothing overflows. The squares of cosine and sine are kept
-    from 0, so that the derivative is finite.
+    above 0, so that the derivative is finite.
     """
     squared = jnp.maximum(heading**2, jnp.float32(1e-30))
     log_cosine, log_sine = _components(jnp.log(squared), log_std.ndim - 2)
@@ -205,6 +205,6 @@ def turn_prediction(prediction: Prediction, heading: Float[Array, "b 2"]) -> Pre
 def _components(
     heading: Float[Array, "b 2"], axes: int
 ) -> tuple[Float[Array, "b *n"], Float[Array, "b *n"]]:
-    """Both columns, with so many axes of length 1 behind the batch."""
+    """Both columns, with `axes` axes of length 1 after the batch."""
     columns = heading.reshape(-1, *[1] * axes, 2)
     return columns[..., 0], columns[..., 1]

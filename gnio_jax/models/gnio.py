@@ -1,5 +1,5 @@
-"""GNIO: encoder, Motion Bank and gated head put together (paper §III, fig. 2), with the paper's
-ablations as options."""
+"""GNIO: encoder, Motion Bank and gated head (paper §III, fig. 2), with the paper's ablations as
+options."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class GNIO(nn.Module):
     The defaults are the paper's: 4,934,153 parameters, 32,768 of them the bank. `bank_size = 0`
     leaves the bank out (h = f). Widths other than 64 scale every layer, for machines without an
     accelerator. Two choices of `uncertainty` are ours: "calibrated" multiplies the head's standard
-    deviation by one factor per axis, "constant" puts one standard deviation per axis in its place;
-    both make it fit the errors on the validation split.
+    deviation by one factor per axis, "constant" uses one standard deviation per axis in its place.
+    Both are fitted to the errors on the validation split.
 
     A network with a head of its own overrides `displacement_head` or `uncertainty_head`.
     """

@@ -50,8 +50,8 @@ class LinearHead(nn.Module):
 class UncertaintyHead(nn.Module):
     """u = W_u h + b_u, the log standard deviation per axis: Σ̂ = diag(exp 2u).
 
-    Ours: kernel and bias start at zero, σ = 1 m. The likelihood's gradient holds e² exp(−2u), which
-    no bound limits where a random kernel gives a small σ; one such step stays in Adam's second
+    Ours: kernel and bias start at zero, σ = 1 m. The likelihood's gradient contains e² exp(−2u),
+    which is unbounded if a random kernel gives a small σ; one such step remains in Adam's second
     moment for thousands of steps.
     """
 
@@ -61,12 +61,11 @@ class UncertaintyHead(nn.Module):
 
 
 class CalibratedUncertainty(nn.Module):
-    """The head's standard deviation times one factor per axis, which inference applies and training
-    does not see.
+    """The head's standard deviation times one factor per axis.
 
-    The factor (ours) lies among the `batch_stats` as its logarithm. It is set after every
-    validation, so that the squared errors on the validation split agree with the predicted
-    standard deviations.
+    Inference applies the factor, and training does not. The factor (ours) is one of the
+    `batch_stats`, as its logarithm. It is set after every validation, so that the squared errors on
+    the validation split agree with the predicted standard deviations.
     """
 
     @nn.compact
@@ -77,11 +76,11 @@ class CalibratedUncertainty(nn.Module):
 
 
 class ConstantUncertainty(nn.Module):
-    """The log standard deviation of a network that has none of its own: one constant per axis, the
-    same for every window.
+    """The log standard deviation of a network that predicts none: one constant per axis, the same
+    for every window.
 
-    Not a parameter: it lies among the `batch_stats` and is set after every validation, so that it
-    agrees with the squared errors on the validation split.
+    It is not a parameter: it is one of the `batch_stats` and is set after every validation, so that
+    it agrees with the squared errors on the validation split.
     """
 
     @nn.compact

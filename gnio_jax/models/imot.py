@@ -22,35 +22,35 @@ from gnio_jax.models.layers import (
 from gnio_jax.types import Prediction
 
 TREND_SPANS = (9, 3)
-"""Samples of the moving averages, one after the other, that make the trend."""
+"""Numbers of samples of the two successive moving averages that make the trend."""
 MODALITIES = 2
 """Acceleration and angular rate, three channels each."""
 PARTS = 3
-"""Of every channel: itself, its trend, its season."""
+"""Tokens of every channel: itself, its trend, its season."""
 
 
 class IMoT(nn.Module):
     """Windows [accel, gyro] in the gravity-aligned frame to displacement, the weighted sum of
     particles; the uncertainty is a constant.
 
-    A token is the whole series of a channel, T samples in a window of T. The encoder lets the six
-    channels, their trends and their seasons attend to one another; the decoder moves particles,
-    velocities that start as parameters, by what they find there. Published: horizontal velocities,
-    `output_dim = 2`. Ours: velocities are in metres per duration of the window (m/s for the
-    publication's 1 s), so that their sum is the displacement, m, along three axes unless two are
-    asked for; then the vertical one is 0.
+    A token is the whole series of a channel: T samples in a window of T. In the encoder the six
+    channels, their trends and their seasons attend to one another. The decoder moves particles,
+    which are velocities that start as parameters, by attention to these tokens. Published:
+    horizontal velocities, `output_dim = 2`. Ours: velocities are in metres per duration of the
+    window (m/s for the publication's 1 s), so that their sum is the displacement, m, along three
+    axes unless two are asked for; then the vertical one is 0.
 
-    The publication's 14.49 M parameters and its two encoder and two decoder layers cannot both
-    hold: this class has four and four, with 4.58 T hidden units in the feed-forward parts, which is
-    14,492,810 for T = 200 and two axes; `IMoTText` has the layers of the text and 7,137,482. Three
-    axes cost 329 more at T = 200, which is what the particles and their last layer hold.
+    The publication's 14.49 M parameters contradict its two encoder and two decoder layers. This
+    class has four and four, with 4.58 T hidden units in the feed-forward parts, which gives
+    14,492,810 parameters for T = 200 and two axes. `IMoTText` has the layers of the text and
+    7,137,482 parameters. A third axis adds 329 at T = 200, in the particles and their last layer.
 
-    Ours, where the publication is silent, chosen among what gives these numbers: T features
+    Ours, where the publication gives no details, and chosen to give these numbers: T features
     everywhere, 2 T inside the attentions to the tokens; GELU in the spatial blocks, else ReLU; sums
     normalised after every part; dropout 0.1 before every sum; positions by sinusoids over the
-    tokens' numbers, or over a particle's coordinates. `heads` is the most that there may be: the
-    largest number up to it that divides T is taken, 8 for 200 samples and 5 for 100. Training needs
-    the random stream `dropout`.
+    tokens' numbers, or over a particle's coordinates. `heads` is the largest number of heads: the
+    largest divisor of T up to it is taken, 8 for 200 samples and 5 for 100. Training needs the
+    random stream `dropout`.
 
     Diagnostics: `particles` (b, p, output_dim), metres per duration of the window, and
     `particle_weights` (b, p), which sum to 1.
@@ -73,8 +73,8 @@ class IMoT(nn.Module):
         for layer in range(self.encoder_layers):
             encoder = EncoderLayer(heads, ffn, self.dropout, name=f"encoder_{layer + 1}")
             tokens, positions = encoder(channels, train)
-            # The three parts of a channel become one series again, which a layer that changes
-            # nothing leaves as it was.
+            # The three parts of a channel become one series again. A layer that changes nothing
+            # would leave this series as it was.
             parts = tokens.reshape(batch, MODALITIES, PARTS, 3, samples)
             channels = parts.sum(axis=2).reshape(batch, 6, samples) / 2
 
@@ -98,8 +98,8 @@ class IMoT(nn.Module):
 
 
 class IMoTText(IMoT):
-    """iMoT by its text: two encoder and two decoder layers, 4 T hidden units. 7,137,482 parameters
-    for T = 200 and two axes."""
+    """iMoT as its text describes it: two encoder and two decoder layers, 4 T hidden units.
+    7,137,482 parameters for T = 200 and two axes."""
 
     encoder_layers: Count = 2
     decoder_layers: Count = 2
@@ -110,8 +110,8 @@ class EncoderLayer(nn.Module):
     """Six channels to their eighteen tokens, acceleration's nine first, and the tokens' adaptive
     positions.
 
-    Attention with queries and keys x + e and values x, then a feed-forward part; what each is added
-    to passes a spatial block first.
+    Attention with queries and keys x + e and values x, then a feed-forward part. The input to which
+    each is added passes a spatial block first.
     """
 
     heads: int
@@ -139,8 +139,8 @@ class SpatialBlock(nn.Module):
     """Acceleration's and angular rate's tokens side by side in time, mixed over three neighbouring
     tokens, gated, and mixed again.
 
-    k3 convolution over the tokens with 2 T channels, times the sigmoid of its mean over the tokens,
-    1×1 convolution, GELU.
+    A convolution over three tokens with 2 T channels, times the sigmoid of its mean over the
+    tokens, then a 1×1 convolution and GELU.
     """
 
     @nn.compact
@@ -159,9 +159,9 @@ class DecoderLayer(nn.Module):
     """Content of the particles: attention to one another, to acceleration's tokens and to angular
     rate's, both fused, feed-forward.
 
-    Among themselves queries and keys are the sum of a projected content and a projected position;
-    towards the tokens they are content and position side by side (conditional attention), while
-    values are contents alone.
+    In the attention among particles, queries and keys are the sum of a projected content and a
+    projected position. In the attention to the tokens they are content and position side by side
+    (conditional attention), and values are contents alone.
     """
 
     heads: int
@@ -217,8 +217,8 @@ class ParticleAttention(nn.Module):
 
 
 class AttentionScores(nn.Module):
-    """Weights of the particles: for every feature two linear layers from all particles to all, the
-    mean over features, softmax."""
+    """Weights of the particles: for every feature two linear layers from all particles to all
+    particles, then the mean over features and a softmax."""
 
     @nn.compact
     def __call__(self, content: Float[Array, "b p n"]) -> Float[Array, "b p"]:
@@ -240,8 +240,8 @@ class Perceptron(nn.Module):
 
 
 def decouple(channels: Float[Array, "b c n"]) -> Float[Array, "b k n"]:
-    """Per modality its three channels, their trends MA3(MA9(x)) and their seasons x − trend: (b, 6,
-    n) to (b, 18, n)."""
+    """For each modality its three channels, their trends MA3(MA9(x)) and their seasons x − trend:
+    (b, 6, n) to (b, 18, n)."""
     trend = channels
     for span in TREND_SPANS:
         trend = moving_average(trend, span)
@@ -252,16 +252,16 @@ def decouple(channels: Float[Array, "b c n"]) -> Float[Array, "b k n"]:
 
 
 def moving_average(x: Float[Array, "b c n"], span: int) -> Float[Array, "b c n"]:
-    """Centred mean over an odd number of samples; the first and the last sample go on beyond the
-    ends (ours)."""
+    """Centred mean over an odd number of samples; the first and the last sample are repeated beyond
+    the ends (ours)."""
     padded = jnp.pad(x, ((0, 0), (0, 0), (span // 2, span // 2)), mode="edge")
     terms = [padded[..., i : i + x.shape[-1]] for i in range(span)]
     return sum(terms[1:], terms[0]) / span
 
 
 def sinusoids(x: Float[Array, "*b"], features: int) -> Float[Array, "*b d"]:
-    """sin(x ω_i), then cos(x ω_i), ω from 1 down towards 1e-4 in equal ratios; an odd last feature
-    is 0."""
+    """sin(x ω_i), then cos(x ω_i), with ω from 1 down towards 1e-4 in equal ratios; an odd last
+    feature is 0."""
     half = features // 2
     frequencies = jnp.exp(-jnp.log(jnp.float32(1e4)) * jnp.arange(half, dtype=jnp.float32) / half)
     angles = jnp.einsum("...,i->...i", x, frequencies)
@@ -269,8 +269,8 @@ def sinusoids(x: Float[Array, "*b"], features: int) -> Float[Array, "*b d"]:
 
 
 def sinusoids_of(points: Float[Array, "b p k"], features: int) -> Float[Array, "b p d"]:
-    """Every coordinate's sinusoids side by side, 2π times the coordinate; features that do not
-    divide evenly are 0."""
+    """The sinusoids of 2π times every coordinate, side by side; features that do not divide evenly
+    are 0."""
     each = 2 * (features // (2 * points.shape[-1]))
     values = sinusoids(2 * jnp.pi * points, each)
     return _padded(values.reshape(*points.shape[:2], -1), features)

@@ -1,7 +1,7 @@
-"""Variables made ready for inference: what depends on the parameters alone is computed once per run
-instead of once per window.
+"""Variables prepared for inference: quantities that depend only on the parameters are computed once
+per run instead of once per window.
 
-With one window per call, as in the filter's loop, the Motion Bank's keys and values cost as many
+With one window per call, as in the filter's loop, the Motion Bank's keys and values need as many
 products as the whole encoder.
 """
 
@@ -30,8 +30,8 @@ class InferenceVariables(NamedTuple):
 
 @dataclass(frozen=True)
 class Inference:
-    """`Inference(model)(ready, windows)` is `model.apply(variables, windows)` to rounding.
-    Hashable, so a static argument of `jit`."""
+    """`Inference(model)(ready, windows)` is `model.apply(variables, windows)` to rounding. It is
+    hashable, so it can be a static argument of `jit`."""
 
     model: nn.Module
 
@@ -49,15 +49,15 @@ class Network(NamedTuple):
 
     @classmethod
     def of(cls, model: nn.Module, variables: Any) -> Network:
-        """A network made ready for inference: what depends on its parameters alone is computed
-        here, once."""
+        """A network prepared for inference: quantities that depend only on its parameters are
+        computed here, once."""
         return cls(Inference(model), inference_variables(model, variables))
 
 
 @functools.partial(jax.jit, static_argnames="model")
 def inference_variables(model: nn.Module, variables: Any) -> InferenceVariables:
-    """Variables with every batch normalisation folded into its convolution, and what
-    `model.constants` makes of them, if it has that."""
+    """Variables with every batch normalisation folded into its convolution, and the result of
+    `model.constants`, if the model has it."""
     folded = {**variables, **_folded(variables["params"], variables.get("batch_stats", {}))}
     constants = getattr(model, "constants", None)
     return InferenceVariables(folded, constants(folded) if constants else {})

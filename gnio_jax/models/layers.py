@@ -24,7 +24,7 @@ he_normal_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
 def checked_windows(windows: Array) -> Float[Array, "b n 6"]:
     """The windows in float32. Raises `AssertionError` for another shape than (b, n, 6), which would
-    show itself deep in a convolution otherwise."""
+    otherwise fail deep inside a convolution."""
     chex.assert_shape(windows, (None, None, 6))
     return windows.astype(jnp.float32)
 
@@ -44,7 +44,7 @@ def conv_norm(
     **options: Any,
 ) -> Float[Array, "b m d"]:
     """A convolution, called `name`, and its batch normalisation, whose name has "bn" in the place
-    of "conv": so `models.inference` finds them. To be called from within a module."""
+    of "conv", by which `models.inference` finds them. Call it within a module."""
     x = conv(features, size, stride, train, name, **options)(x)
     norm = nn.BatchNorm(
         use_running_average=not train,
@@ -79,11 +79,11 @@ def attend(
     mask: Bool[Array, "1 1 n m"] | None = None,
     **_: object,
 ) -> Float[Array, "b n h d"]:
-    """Scaled dot-product attention in the place of Flax's, with fewer passes over the scores: with
-    few features a head they cost more than the products.
+    """Scaled dot-product attention in the place of Flax's, with fewer passes over the scores, which
+    cost more than the products if a head has few features.
 
-    The softmax divides by its sum after the product with the values, and heads are windows of the
-    batch.
+    The division by the softmax's sum comes after the product with the values, and heads are part of
+    the batch axis.
     """
     batch, samples, heads, size = query.shape
     query, key, value = (
@@ -100,7 +100,7 @@ def attend(
 def attention(
     heads: int, name: str, features: int | None = None
 ) -> nn.MultiHeadDotProductAttention:
-    """Multi-head attention by `attend`. It is as wide inside as its query and has `features`
+    """Multi-head attention by `attend`. Its inner width is that of the query. It has `features`
     outputs, by default as many as the query."""
     return nn.MultiHeadDotProductAttention(
         heads, out_features=features, attention_fn=attend, name=name, **FLOAT32

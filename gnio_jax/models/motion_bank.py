@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 
 from gnio_jax.models.layers import FLOAT32
 
-# PyTorch's `MultiheadAttention`: query, key and value are one (3d, d) matrix to its Xavier-uniform
-# start, so that their bound is √(6 / 4d) = √(3 · 0.5 / d), and the output is a linear layer with
-# its usual bound 1/√d.
+# PyTorch's `MultiheadAttention` initialises query, key and value as one Xavier-uniform (3d, d)
+# matrix, so their bound is √(6 / 4d) = √(3 · 0.5 / d). The output is a linear layer with its usual
+# bound 1/√d.
 stacked_xavier = nn.initializers.variance_scaling(0.5, "fan_in", "uniform")
 fan_in_uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 
@@ -22,9 +22,9 @@ class MotionBank(nn.Module):
     left to the caller.
 
     The bank is the same for every window, so its keys and values are projected once per call and
-    not once per window. Ours, where the paper is silent: 8 heads, projections with bias that start
-    as PyTorch's attention starts them, and M ~ N(0, std²), std = 1. Prototypes that start near each
-    other (std = 1/√d) are attended to alike, and stay so.
+    not once per window. Ours, where the paper gives no details: 8 heads, projections with bias that
+    are initialised as in PyTorch's attention, and M ~ N(0, std²), std = 1. Prototypes that start
+    near each other (std = 1/√d) receive equal attention, and training does not change this.
     """
 
     size: int = 64
@@ -49,8 +49,8 @@ class MotionBank(nn.Module):
         feature: Float[Array, "b d"],
         memory: tuple[Float[Array, "h m k"], Float[Array, "h k m"]] | None = None,
     ) -> tuple[Float[Array, "b d"], Float[Array, "b h m"]]:
-        """Context (b, d) and attention weights (b, heads, m) of each feature; `memory` is that of
-        an earlier call, if there was one."""
+        """Context (b, d) and attention weights (b, heads, m) of each feature; `memory` is the
+        result of an earlier call of `memory()`, if there was one."""
         chex.assert_shape(feature, (None, self.width))
         query, (key, value) = self.query(feature), self.memory() if memory is None else memory
         size = jnp.float32(self.width // self.heads)
@@ -59,7 +59,7 @@ class MotionBank(nn.Module):
         return self.output(jnp.einsum("bhm,hkm->bhk", attention, value)), attention
 
     def memory(self) -> tuple[Float[Array, "h m k"], Float[Array, "h k m"]]:
-        """Keys (heads, m, d / heads) and values (heads, d / heads, m) of the prototypes: as the
-        products with one window read them."""
+        """Keys (heads, m, d / heads) and values (heads, d / heads, m) of the prototypes, in the
+        order that the products with one window need."""
         keys = self.key(self.prototypes).transpose(1, 0, 2)
         return keys, self.value(self.prototypes).transpose(1, 2, 0)

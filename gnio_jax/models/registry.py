@@ -47,12 +47,12 @@ _EQUIVARIANT: dict[str, type[nn.Module]] = {
 
 
 def names() -> list[str]:
-    """The networks `create` knows."""
+    """Names of the networks that `create` knows."""
     return sorted(_MODELS)
 
 
 def register(name: str, network: type[nn.Module]) -> None:
-    """Make a network of one's own known to `create`, and so to configurations and command lines.
+    """Make your own network known to `create`, and so to configurations and command lines.
 
     `network(**options).apply(variables, windows, train=False)` must give a `Prediction`. Its fields
     are its options. A second registration replaces the first. Raises `InputError` for the name of a
@@ -75,7 +75,8 @@ def options(name: str) -> dict[str, Any]:
 
 
 def from_config(config: ModelConfig) -> nn.Module:
-    """The network that these settings describe; what they leave open is the network's own."""
+    """The network that these settings describe; options that are not set take the network's own
+    defaults."""
     return create(**{option: value for option, value in vars(config).items() if value is not None})
 
 
@@ -84,10 +85,10 @@ def create(name: str, **given: Any) -> nn.Module:
     `Prediction`.
 
     `equivariance` is an option of all: "none", "four_headings" or "canonical_frame"
-    (`models.equivariance`). `winograd`, how convolutions are computed in training, is chosen for
-    the machine that this runs on unless it is given (`models.convolution`). Raises `InputError` for
-    an unknown name or option, naming the known ones, a value that is not one of an option's choices
-    or beyond its bounds, or options that do not fit together.
+    (`models.equivariance`). `winograd`, the way of computing convolutions in training, is chosen
+    for this machine unless it is given (`models.convolution`). Raises `InputError` for an unknown
+    name or option, naming the known ones, a value that is not one of an option's choices or beyond
+    its bounds, or options that do not fit together.
     """
     place, known = f"model '{name}'", options(name)
     for option, value in given.items():
@@ -107,7 +108,7 @@ def create(name: str, **given: Any) -> nn.Module:
 def _known(
     word: str, known: Iterable[str], place: str, problem: str, title: str, more: str = ""
 ) -> str:
-    """The word, if it is one of the known ones. Raises `InputError` that names them, the closest
+    """The word, if it is known. Raises `InputError` that names the known words, the closest
     first."""
     if word not in known:
         remedy = f"{did_you_mean(word, known)}known {title}: {', '.join(known)}{more}"
@@ -118,8 +119,8 @@ def _known(
 def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
     """Fresh variables of `model` for windows of `window` samples.
 
-    `model.init` gives the same to rounding. Here the network itself is never run, and one small
-    program draws all parameters of one shape: compiling `model.init` takes many times as long.
+    `model.init` gives the same to rounding, but compiling it takes many times as long. Here the
+    network is never run, and one small program draws all parameters of one shape.
     """
     return model.lazy_init(key, _windows(window))
 
@@ -131,7 +132,7 @@ def variable_shapes(model: nn.Module, window: int = 200) -> Any:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _initialised(model: nn.Module, key: PRNGKeyArray, windows: Any) -> Any:
-    """`model.init`, whose traces JAX keeps: a run is loaded many times in one process."""
+    """`model.init`, whose traces JAX keeps, because a run is loaded many times in one process."""
     return model.init(key, windows)
 
 

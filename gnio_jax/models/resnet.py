@@ -1,5 +1,5 @@
-"""The encoder: a 1-D ResNet-18 over a window of IMU samples (paper §III-B; the shape that TLIO and
-RoNIN share)."""
+"""The encoder: a 1-D ResNet-18 over a window of IMU samples (paper §III-B), which TLIO and RoNIN
+share."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def residual_groups(
     block: Callable[..., nn.Module], width: int, x: Float[Array, "b n c"], train: bool
 ) -> Float[Array, "b m d"]:
     """Four groups of two blocks. Each group has twice the features of the one before it, and all
-    but the first halve the length. To be called from within a module."""
+    but the first halve the length. Call it within a module."""
     for group, stride in enumerate(GROUP_STRIDES):
         for number in range(BLOCKS_PER_GROUP):
             name = f"group{group + 1}_block{number + 1}"
@@ -66,8 +66,8 @@ class BasicBlock(nn.Module):
 def shortcut(
     x: Float[Array, "b n c"], features: int, stride: int, train: bool
 ) -> Float[Array, "b m d"]:
-    """The input of a block as its output's shape asks for: projected by a 1×1 convolution where the
-    shape changes. To be called from within a module."""
+    """The input of a block in the shape of its output: projected by a 1×1 convolution if the shape
+    changes. Call it within a module."""
     if stride == 1 and x.shape[-1] == features:
         return x
     return conv_norm(x, features, 1, stride, train, "shortcut_conv")

@@ -17,8 +17,8 @@ from gnio_jax.types import Prediction
 
 
 class DisplacementRegressor(nn.Module):
-    """Features of a window to its displacement by TLIO's fully connected head; the uncertainty is a
-    constant. Each such network has its own `features`.
+    """A network that maps features of a window to its displacement by TLIO's fully connected head;
+    the uncertainty is a constant. Each such network has its own `features`.
 
     `width` scales every layer. Training needs the random stream `dropout`.
     """
@@ -43,10 +43,10 @@ class RoNINResNet(DisplacementRegressor):
     """Windows [accel, gyro] in the gravity-aligned frame to displacement; the uncertainty is a
     constant.
 
-    Encoder and head as TLIO's, which took them from here. Published: the mean horizontal velocity
-    over the window, `output_dim = 2` (4,634,882 parameters for windows of 200 samples), from [gyro,
-    accel]. Ours: the displacement, which is that velocity in a window of 1 s, along three axes
-    (4,635,395) unless two are asked for; then the vertical one is 0.
+    Encoder and head are those of TLIO, which took them from RoNIN. Published: the mean horizontal
+    velocity over the window, `output_dim = 2` (4,634,882 parameters for windows of 200 samples),
+    from [gyro, accel]. Ours: the displacement, which is that velocity in a window of 1 s, along
+    three axes (4,635,395) unless two are asked for; then the vertical one is 0.
     """
 
     winograd: bool = False

@@ -18,9 +18,9 @@ class TLIO(nn.Module):
     """Windows [accel, gyro] in the gravity-aligned frame to displacement and log standard
     deviation, each by a head of its own.
 
-    The encoder of `gnio_jax.models.resnet`, not pooled. 5,424,646 parameters for windows of 200
-    samples, 5,031,430 for 100. Training needs the random stream `dropout`. TLIO's own channel order
-    is [gyro, accel]; `gnio_jax.interop` reads its weights.
+    It has the encoder of `gnio_jax.models.resnet`, without pooling, and 5,424,646 parameters for
+    windows of 200 samples, 5,031,430 for 100. Training needs the random stream `dropout`. TLIO's
+    own channel order is [gyro, accel]; `gnio_jax.interop` reads its weights.
     """
 
     width: Count = 64
@@ -39,13 +39,13 @@ class TLIO(nn.Module):
 
 
 class FullyConnectedHead(nn.Module):
-    """Feature maps (b, m, 8·width) to `outputs` numbers a window: 1×1 convolution and
-    normalisation, flattened, three linear layers.
+    """Feature maps (b, m, 8·width) to `outputs` numbers per window: 1×1 convolution and
+    normalisation, flattening, three linear layers.
 
-    TLIO's and RoNIN's, whose sizes (128 channels, 512 features) the papers leave to their code;
-    other widths than 64 scale both, for small machines. Flattened channel by channel, as PyTorch
-    does, so that weights trained there fit. Linear kernels start at N(0, 0.01), biases at 0. The
-    number of parameters depends on m, and so on the length of the window.
+    This is the head of TLIO and RoNIN. Its sizes (128 channels, 512 features) are given only in
+    their code; other widths than 64 scale both, for small machines. The maps are flattened channel
+    by channel, as in PyTorch, so that weights trained there fit. Linear kernels start at N(0,
+    0.01), biases at 0. The number of parameters depends on m, and so on the length of the window.
     """
 
     width: int
