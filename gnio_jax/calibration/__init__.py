@@ -1,5 +1,5 @@
-"""What a trained run does not know of its own errors, fitted on recordings that it did not learn
-from."""
+"""The fit of a trained run's uncertainty to its errors on recordings that were not used for
+training."""
 
 from gnio_jax.calibration.run import Calibration, calibrate
 

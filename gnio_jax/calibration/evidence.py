@@ -1,5 +1,5 @@
-"""What a calibration is fitted to: recordings, and the displacements that a network which was not
-trained on them predicts."""
+"""The data of a calibration: recordings, and the displacements that a network predicts for them
+which was not trained on them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ OnStage = Callable[[str, float], None]
 
 
 class Evidence(NamedTuple):
-    """Recordings and the estimates of a network for each, in one order."""
+    """Recordings and the estimates of a network for each, in the same order."""
 
     recordings: list[Recording]
     estimates: list[Estimate]
 
 
 class Source(NamedTuple):
-    """A network and the recordings that it is asked about."""
+    """A network and the recordings for which it predicts displacements."""
 
     run: Run
     fold: data.Fold | None
@@ -37,8 +37,8 @@ class Source(NamedTuple):
 
 
 def load_run(workdir: Path, config: CalibrateConfig) -> Run:
-    """A run with its network as it is to be calibrated. Raises `InputError` as
-    `checkpoint.load_run` and `checkpoint.averaged_over_headings` do."""
+    """A run with the network that is to be calibrated. Raises `InputError` as `checkpoint.load_run`
+    and `checkpoint.averaged_over_headings` do."""
     run = checkpoint.load_run(workdir)
     if not config.average_headings:
         return run
@@ -46,7 +46,8 @@ def load_run(workdir: Path, config: CalibrateConfig) -> Run:
 
 
 def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
-    """The split, and the networks that are asked about it: the run's own, or one for each fold.
+    """The split, and the networks that predict its displacements: the run's own, or one for each
+    fold.
 
     Raises `InputError` for a split that is neither the run's validation nor its training split, and
     for runs that are not the folds of one experiment.
@@ -75,7 +76,7 @@ def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
 
 
 def _check_alike(folder: str, fold_run: TrainConfig, run: TrainConfig) -> None:
-    """A fold has the experiment of the run, but for its share of the recordings."""
+    """Check that a fold has the experiment of the run, except for its share of the recordings."""
     own = dataclasses.replace(fold_run.data, train_split=run.data.train_split)
     for name, found, expected in (
         ("dataset", fold_run.dataset, run.dataset),
@@ -97,7 +98,8 @@ def gather(
     """The predictions of each network for its recordings of the split. Raises `InputError` for
     missing data.
 
-    The network runs in the loop of the filter with `settings`, whose attitude turns the windows.
+    The network runs in the loop of the filter with `settings`, and the filter's attitude rotates
+    the windows.
     """
     own = asked[0].run.config
     names = ", ".join(own.datasets)

@@ -1,5 +1,5 @@
-"""What a calibration fits: the factors of the axes, the filter's noises to the likelihood of its
-innovations, and its consider covariance to the errors of its positions."""
+"""The fits of a calibration: the factors of the axes, the filter's noises by the likelihood of its
+innovations, and its consider covariance by the errors of its positions."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ GROUPS = {
     "start": ("start.gyro_bias", "start.accel_bias"),
     "window": ("noise.correlation",),
 }
-"""The settings that each group of `--fit` has."""
+"""The settings in each group of `--fit`."""
 CONSIDERED = ConsideredStd(gyro_bias=1e-3, scale=0.05, heading=math.radians(5.0), slope=0.02)
-"""Where the fit of the consider covariance begins (ours)."""
+"""The start of the fit of the consider covariance (ours)."""
 PHYSICAL = {
     "noise.gyro_density": (1e-6, 0.1),
     "noise.accel_density": (1e-5, 1.0),
@@ -62,39 +62,40 @@ PHYSICAL = {
     "start.gyro_bias": (0.0, 0.2),
     "start.accel_bias": (0.0, 2.0),
 }
-"""Between which values the sensors of phones and headsets and the errors of networks lie, with room
-on both sides (ours). The recordings did not determine a fitted value that is outside."""
+"""Smallest and largest plausible values for sensors of phones and headsets and for errors of
+networks, with a margin on both sides (ours). A fitted value outside was not determined by the
+recordings."""
 PRIOR_STD = 2.0
-"""Standard deviation of each fitted number about its start, in its own logarithm or logit (ours).
-The recordings outweigh it by far in all that they determine; what they do not determine stays where
-it was."""
+"""Prior standard deviation of each fitted number about its start, in its logarithm or logit (ours).
+For numbers that the recordings determine it has almost no effect; other numbers keep their
+start."""
 DIGITS = 4
-"""As many are written down."""
+"""Number of digits that are written to the settings."""
 CHECKPOINT_EVERY = 50
 """Clone intervals between the states that the backward pass keeps."""
 LEAST_GAIN = 1e-4
-"""Of the negative log-likelihood of an innovation, below which a search is not begun anew."""
+"""Gain of the negative log-likelihood per innovation below which no new search is begun."""
 FAILED = 1e6
-"""The objective where the filter fails: the search turns back from there."""
+"""The objective where the filter fails, so that the search turns back."""
 NO_GATE = 1e9
-"""Threshold of a χ² gate that lets everything through: one that rejects would reward a noise so
-small that everything is rejected."""
+"""Threshold of a χ² gate that accepts everything: a gate that rejects would favour a noise so small
+that everything is rejected."""
 INDEPENDENT_SECONDS = 10.0
-"""Errors of the position this far apart count as independent beside the prior (ours)."""
+"""Time between errors of the position that count as independent relative to the prior, s (ours)."""
 LEAST_WINDOWS = 100
-"""Below this many windows with a reference no factors of the axes are fitted (ours)."""
+"""Smallest number of windows with a reference for which factors of the axes are fitted (ours)."""
 LEAST_FACTOR = 1e-3
-"""The factor of no axis is below this (ours)."""
+"""Smallest factor of an axis (ours)."""
 
 
 def std_factors(
     estimates: list[Estimate], truths: list[Float[np.ndarray, "m 3"]]
 ) -> Float[np.ndarray, "3"]:
-    """Root mean square of error over standard deviation, of each axis, over all windows.
+    """Root mean square of error over standard deviation, for each axis, over all windows.
 
     `truths` are the true displacements of the windows, in the yaw frame of the reference at their
-    starts; the network's are in the filter's own, which is the frame that it answers in.
-    Raises `ValueError` where too few windows have both.
+    starts. Those of the network are expressed in the filter's own yaw frame. Raises `ValueError` if
+    too few windows have both.
     """
     found = []
     for estimate, truth in zip(estimates, truths, strict=True):
@@ -110,7 +111,7 @@ def std_factors(
 
 
 class Fit(NamedTuple):
-    """Where the likelihood of the innovations is largest."""
+    """The settings with the largest likelihood of the innovations."""
 
     settings: FilterSettings
     before: float
@@ -119,13 +120,13 @@ class Fit(NamedTuple):
     """The same with `settings`."""
     steps: int
     warnings: tuple[str, ...] = ()
-    """Why the settings may not be the best ones, each in one sentence."""
+    """Reasons why the settings may not be the best ones, each in one sentence."""
 
 
 def start_of_fit(settings: FilterSettings, paths: Sequence[str]) -> FilterSettings:
-    """The settings from which those of these paths are fitted: with a correlation where it was off.
+    """The start of the fit of these paths: the settings, with a correlation if it was off.
 
-    Raises `InputError` for a number that is 0: it has no logarithm, and the fit would not leave it.
+    Raises `InputError` for a number that is 0, because it has no logarithm.
     """
     correlation = settings.noise.correlation
     if "noise.correlation" in paths and not (correlation and correlation.share):
@@ -150,15 +151,15 @@ def fit_innovations(
     """The settings that make the innovations most likely, by L-BFGS from `settings`; `paths` names
     those that are fitted.
 
-    A step to where the filter fails counts as very unlikely, and the search turns back. Raises
-    `InputError` where it fails with `settings`.
+    A step to values at which the filter fails counts as very unlikely, and the search turns back.
+    Raises `InputError` if the filter fails with `settings`.
     """
     free = free_parameters(settings, paths)
     names, start = tuple(free), np.array(list(free.values()))
     given = jax.device_put((walks, start, settings))
     config = innovation_config(windows, settings)
     evidences: list[float] = []
-    """Of every call, the first of which is at the start."""
+    """Values of every call, the first of which is at the start."""
 
     def evaluate(vector: np.ndarray) -> tuple[float, np.ndarray]:
         call = _value_and_gradient(vector, *given, names=names, config=config)
@@ -171,9 +172,9 @@ def fit_innovations(
         return float(value), np.asarray(gradient, float)
 
     at, reached, steps, converged = start, math.inf, 0, False
-    # A trial step to where the gradient explodes (4e126 was met, of a value of 0.4) leaves the line
-    # search with a step of next to nothing, which passes for convergence. A search that begins anew
-    # from there goes on, if there is anything to gain.
+    # After a trial step to a point with an exploding gradient (4e126 occurred, for a value of 0.4)
+    # the step of the line search becomes almost zero, which counts as convergence. A new search
+    # from there continues, if the objective can still decrease.
     while True:
         limits = {"maxiter": most_steps - steps, "ftol": 1e-7}
         found = minimize(evaluate, at, jac=True, method="L-BFGS-B", options=limits)
@@ -204,7 +205,7 @@ def fit_innovations(
 
 
 def unphysical(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
-    """A sentence for each of these numbers that is outside what is physical."""
+    """A sentence for each of these numbers that is outside the plausible range."""
     values, found = flat(settings), []
     for name in (name for name in names if name in PHYSICAL):
         low, high = PHYSICAL[name]
@@ -217,7 +218,7 @@ def unphysical(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
 
 
 def innovation_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig:
-    """The filter whose innovations are judged: its gate lets everything through."""
+    """The filter whose innovations are evaluated: its gate accepts everything."""
     return dataclasses.replace(
         filter_config(windows, settings),
         gate_threshold=NO_GATE,
@@ -235,15 +236,15 @@ def innovation_objective(
     names: tuple[str, ...],
     config: FilterConfig,
 ) -> tuple[Array, Array]:
-    """What is to be made small, as a function of the free parameters `names` of the settings, and
-    the part of it that is −log-likelihood of all innovations over their number. The rest is the
-    prior about `start`, which keeps those in place that the walks do not determine."""
+    """The objective to be minimised, as a function of the free parameters `names` of the settings,
+    and its part that is the −log-likelihood of all innovations divided by their number. The rest is
+    the prior about `start`, which holds parameters that the walks do not determine."""
     chex.assert_equal_shape([free, start])
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> Array:
         run, state, displacement = _repeated(walk, settings, config)
         history = run(state, displacement)
-        # What the walk is filled up with comes after its last displacement, and may run away.
+        # The padding of the walk comes after its last displacement, where the filter may diverge.
         present = jnp.isfinite(displacement).all(axis=1)
         healthy = jnp.all((history.healthy > 0) | ~present)
         return jnp.where(healthy, jnp.nansum(history.log_likelihood), jnp.nan)
@@ -263,10 +264,10 @@ _value_and_gradient = jax.jit(
 def _repeated(
     walk: Inputs, settings: FilterSettings, config: FilterConfig
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], FilterState, Array]:
-    """The run over one walk without the network, from a start and the displacements; its start and
-    its displacements."""
+    """The run over one walk without the network, as a function of a start and displacements, with
+    the start and the displacements of the walk."""
     std = settings.start
-    if settings.raw_gyro_bias is not None:  # as the walk was prepared
+    if settings.raw_gyro_bias is not None:  # the walk was prepared with it
         own = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, std.gyro_bias)
         std = std._replace(gyro_bias=own)
     state = initial_state(config, *walk.start[:4], std=std)
@@ -290,18 +291,18 @@ class Considered(NamedTuple):
 
     settings: FilterSettings
     before: float
-    """Mean over all positions of eᵀ P⁻¹ e / 3 with none."""
+    """Mean over all positions of eᵀ P⁻¹ e / 3 without them."""
     after: float
     """The same with `settings`."""
 
 
 class Positions(NamedTuple):
-    """Of all recordings, where there is a reference; axis 0: the rows."""
+    """Positions of all recordings that have a reference, as rows."""
 
     error: Float[np.ndarray, "k 3"]
     """Truth − estimate, m."""
     covariance: Float[np.ndarray, "k 3 3"]
-    """Of the filter, m²."""
+    """The filter's covariance, m²."""
     sensitivity: Float[np.ndarray, "k 3 6"]
     """S of the position."""
 
@@ -309,11 +310,11 @@ class Positions(NamedTuple):
 def fit_considered(
     positions: Positions, stride_seconds: float, settings: FilterSettings
 ) -> Considered:
-    """The standard deviations of the errors that the filter leaves out, which make the errors of
-    its positions most likely; there is one every `stride_seconds`.
+    """The standard deviations of the errors that the filter does not estimate which make the errors
+    of its positions most likely; there is a position every `stride_seconds`.
 
-    The search begins at `CONSIDERED`, whatever the settings have. Raises `InputError` where there
-    is no position with a reference, or no likelihood.
+    The search always begins at `CONSIDERED`. Raises `InputError` if no position has a reference, or
+    if there is no likelihood.
     """
     if not len(positions.error):
         raise InputError("the filter", "is not healthy where these recordings have a reference")
@@ -348,9 +349,9 @@ def filtered_positions(
 ) -> Positions:
     """The positions of a filter over the walks, where it is healthy.
 
-    `truth` has the true ones after each stride, m; NaN where there is none. Walks with a raw gyro
-    are left out, unless all have one: such a gyro loses the yaw, which would pass for an error of
-    the network's headings (ours).
+    `truth` has the true positions after each stride, m; NaN where there is none. Walks with a raw
+    gyro are left out, unless all have one: the yaw of such a gyro drifts, which would be attributed
+    to the network's headings (ours).
     """
     healthy, position, covariance, of_position = jax.device_get(
         _filtered(walks, settings, config=filter_config(windows, settings))
@@ -366,7 +367,7 @@ def filtered_positions(
 def _filtered(
     walks: Inputs, settings: FilterSettings, *, config: FilterConfig
 ) -> tuple[Array, Array, Array, Array]:
-    """Of every walk: where the filter is healthy, its positions, their covariances and S."""
+    """For every walk: where the filter is healthy, its positions, their covariances and S."""
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
         run, state, displacement = _repeated(walk, settings, config)

@@ -1,4 +1,4 @@
-"""One calibration from its options to a run of its own."""
+"""One calibration, from its options to the calibrated run."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from gnio_jax.numerics import filled_up
 from gnio_jax.training import checkpoint
 
 MOST_STEPS = 60
-"""Of the search for the settings (L-BFGS)."""
+"""Largest number of steps of the search for the settings (L-BFGS)."""
 ABOUT = "calibration.json"
-"""What was fitted to what: the mark of a calibrated run."""
+"""File that records the fit and its data, by which a calibrated run is recognised."""
 
 
 class Calibration(NamedTuple):
-    """What `calibrate` found and where it is."""
+    """The result of `calibrate` and its folder."""
 
     before: FilterSettings
     fit: Fit
     considered: Considered
-    """Its settings are those of the calibrated run."""
+    """The fit, with the settings of the calibrated run."""
     recordings: int
     folder: Path
 
@@ -53,18 +53,19 @@ def calibrate(
     config: CalibrateConfig, progress: OnStage = lambda stage, share: None, workers: int = 1
 ) -> Calibration:
     """Fit the filter's settings of a run to recordings that its network was not trained on, and
-    write a run that differs in them alone, and in the average over headings if that is asked for.
+    write a run that differs only in them, and in the average over headings if the options ask for
+    it.
 
-    Three steps (ours). First each axis gets the factor that makes the network's standard deviations
-    those of its errors, window by window against the reference. Then the settings of `config.fit`
-    are those that make the innovations of the filter most likely, in which the reference has no
-    part but the start. Last, the consider covariance is the one that makes the errors of the
-    filter's positions most likely; it changes no trajectory. Recordings with a raw gyro
-    have no part in this step, unless all have one.
+    There are three steps (ours). First each axis gets the factor that makes the network's standard
+    deviations those of its errors, which are compared with the reference window by window. Then the
+    settings of `config.fit` are chosen so that the innovations of the filter are most likely; here
+    the reference gives only the start. Last, the consider covariance is chosen so that the errors
+    of the filter's positions are most likely; it changes no trajectory. Recordings with a raw gyro
+    are not used in this step, unless all have one.
 
     The recordings are those of the validation split, or those of the training split, each with the
-    displacements of a network whose training left it out. Raises `InputError` for a split that is
-    neither, an output folder that is there already, and missing data.
+    displacements of a network that was not trained on it. Raises `InputError` for another split,
+    for an output folder that exists already, and for missing data.
     """
     if not config.fit:
         raise InputError("--fit", "names nothing", f"name some of {', '.join(GROUPS)}")
@@ -75,15 +76,15 @@ def calibrate(
     split, asked = sources(run, config)
     windows = run.config.data
     noise = run.config.filter.noise._replace(measurement_scale=1.0, std_factor=(1.0, 1.0, 1.0))
-    nothing = ConsideredStd()  # it changes no estimate, and is found last
+    nothing = ConsideredStd()  # it changes no estimate, and is fitted last
     uncalibrated = dataclasses.replace(run.config.filter, noise=noise, considered=nothing)
-    start_of_fit(uncalibrated, paths)  # its mistakes do not wait for the data
+    start_of_fit(uncalibrated, paths)  # finds mistakes before reading data
     recordings, estimates = gather(split, asked, config, uncalibrated, progress, workers)
     try:
         factors = std_factors(estimates, [each.displacement for each in recordings])
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
-    x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as they are written down
+    x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as written to the settings
     noise = noise._replace(std_factor=(x, y, z))
     settings = start_of_fit(dataclasses.replace(uncalibrated, noise=noise), paths)
     strides = max(each.strides for each in recordings)
