@@ -1,8 +1,7 @@
 """Static configuration: frozen dataclasses, strict YAML, checked once before anything is loaded.
 
 One experiment is one YAML file of a `TrainConfig`; a run keeps its own as `config.yaml`. Options on
-the command line win over the file, the file wins over the defaults, and the defaults are the
-paper's.
+the command line override the file, and the file overrides the defaults, which are the paper's.
 """
 
 from gnio_jax.config.files import (

@@ -1,5 +1,5 @@
-"""Settings in files and on the command line: strict YAML, the checks of values, and where runs and
-the experiments that come with the package lie."""
+"""Settings in files and on the command line: strict YAML, the checks of values, and the places of
+runs and of the experiments that come with the package."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ def names() -> list[str]:
 def find(config: str | Path) -> Path:
     """The file of `config`: a path, the folder of a run, or a name of `names()`.
 
-    Raises `InputError` that suggests the closest name when it is neither.
+    Raises `InputError` that suggests the closest name if it is none of these.
     """
     path, packaged = Path(config), _packaged()
     if path.is_file():
         return path
     if str(config) in packaged:
         return packaged[str(config)]
-    if path.exists():  # a pipe is read, and a folder that is no run is refused as one
+    if path.exists():  # a pipe is read; a folder without a run is refused later
         return path / "config.yaml" if (path / "config.yaml").is_file() else path
     by_stem = {Path(name).stem: name for name in packaged}
     known = f"give a file, or one of the package's own: {', '.join(packaged)}"
@@ -68,8 +68,8 @@ def find(config: str | Path) -> Path:
 
 
 def _packaged() -> dict[str, Path]:
-    """Files of the package's experiments by name: in an installed package beside the modules, in a
-    checkout at its top."""
+    """Files of the package's experiments by name: beside the modules of an installed package, or at
+    the top of a checkout."""
     package = Path(__file__).parents[1]
     folders = (package / "configs", package.parent / "configs")
     folder = next((folder for folder in folders if folder.is_dir()), folders[0])
@@ -78,13 +78,13 @@ def _packaged() -> dict[str, Path]:
 
 
 def default_workdir(config: TrainConfig) -> Path:
-    """Where a run goes: its `workdir`, else runs/<dataset>_<model>."""
+    """The folder of a run: its `workdir`, else runs/<dataset>_<model>."""
     return Path(config.workdir or f"runs/{'_'.join(config.datasets)}_{config.model.name}")
 
 
 def with_seeds(config: TrainConfig, seeds: Sequence[int]) -> list[TrainConfig]:
     """The experiment with each of these seeds: ordinary runs, in the work folders WORKDIR_s0,
-    WORKDIR_s1, ... Raises `InputError` for no seed, and for one that is named twice."""
+    WORKDIR_s1, ... Raises `InputError` if there is no seed, or if one is named twice."""
     if not seeds:
         raise InputError("--seeds", "names no seed", "give some, e.g. 0 1 2")
     twice = [seed for seed in seeds if seeds.count(seed) > 1]
@@ -95,8 +95,8 @@ def with_seeds(config: TrainConfig, seeds: Sequence[int]) -> list[TrainConfig]:
 
 
 def without_places(config: TrainConfig) -> TrainConfig:
-    """The experiment but for where its folders and the runs that it begins with lie: a run that is
-    resumed may have other ones, and a package has none."""
+    """The experiment without the paths of its folders and of the runs that it begins with: a
+    resumed run may have other paths, and a package has none."""
     windows = dataclasses.replace(config.data, poses_by=None)
     nowhere: dict[str, Any] = {"workdir": None, "data_root": None, "init_from": None}
     return dataclasses.replace(config, data=windows, **nowhere)
@@ -104,7 +104,7 @@ def without_places(config: TrainConfig) -> TrainConfig:
 
 def newest_run(folder: str | Path = "runs") -> Path:
     """The run below `folder` that was trained last; calibrated copies of a run do not count. Raises
-    `InputError` when there is none."""
+    `InputError` if there is none."""
     found = [path.parent for path in Path(folder).glob("*/config.yaml")]
     runs = [run for run in found if not (run / "calibration.json").exists()]
     if not runs:
@@ -123,7 +123,7 @@ def newest_run(folder: str | Path = "runs") -> Path:
 
 
 def read(path: str | Path) -> str:
-    """The text of a file of settings. A pipe gives it once. Raises `InputError`."""
+    """The text of a file of settings. A pipe can be read only once. Raises `InputError`."""
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -131,8 +131,8 @@ def read(path: str | Path) -> str:
 
 
 def load(path: str | Path, base: TrainConfig | None = None) -> TrainConfig:
-    """Read a `TrainConfig` from a YAML file, or from the experiment of that name. What it leaves
-    out is as in `base`, or by default.
+    """Read a `TrainConfig` from a YAML file, or from the experiment of that name. Settings that it
+    leaves out are those of `base`, or the defaults.
 
     Raises `InputError` on a missing or empty file, an unknown key or a wrong type.
     """
@@ -169,9 +169,9 @@ def assign(config: Section, assignments: Sequence[str]) -> Section:
 
 
 def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
-    """The value of a field of the type `hint` from the words of a command line behind the option
-    `name`, one or as many as a tuple has values. Texts are the words as they are, numbers are as in
-    YAML, and null is none.
+    """The value of a field of the type `hint` from the words after the option `name` on a command
+    line: one word, or as many as a tuple has values. Texts are the words themselves, numbers are
+    read as in YAML, and null is None.
 
     Raises `InputError` that names the option.
     """
@@ -187,7 +187,7 @@ def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
 
 
 def _section(base: Any, content: Any, place: Place) -> Any:
-    """The section `base` with the fields of a mapping in it."""
+    """The section `base` with the fields of a mapping."""
     if not isinstance(content, dict):
         problem = f"{place.field or 'the file'} must be a mapping of fields"
         raise InputError(place.source, f"{problem}, found {_shown(content)}")
@@ -208,8 +208,8 @@ def _section(base: Any, content: Any, place: Place) -> Any:
 
 
 def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> Any:
-    """The value of a field of the type `hint`, if it has this type and is within its bounds; a
-    section takes what is not in `content` from `base`. Raises `InputError`."""
+    """The value of a field of the type `hint`, if it has this type and is within its bounds. A
+    section takes fields that are not in `content` from `base`. Raises `InputError`."""
     kinds, is_list = kinds_of(hint), isinstance(content, list | tuple)
     if content is None and type(None) in kinds:
         return None
@@ -246,7 +246,7 @@ def _check_bounds(hint: Any, value: Any, place: Place) -> None:
 
 
 def _shown(value: Any) -> str:
-    """A value in a message, however long or deep it is."""
+    """A value as text for a message, shortened if it is long or deeply nested."""
     if isinstance(value, tuple | Path):
         value = list(value) if isinstance(value, tuple) else str(value)
     return "null" if value is None else reprlib.repr(value)
@@ -265,7 +265,7 @@ def _spelled(kind: Any) -> str:
 
 
 def kinds_of(hint: Any) -> list[Any]:
-    """The types that the value of a field may have, without what is annotated to them."""
+    """The types that the value of a field may have, without their annotations."""
     if typing.get_origin(hint) is Annotated:
         return kinds_of(typing.get_args(hint)[0])
     # `Literal[...] | None` is a typing.Union, `int | None` is a types.UnionType.
@@ -275,8 +275,8 @@ def kinds_of(hint: Any) -> list[Any]:
 
 
 def kind_of(hint: Any) -> Any:
-    """The type of a field's value where it has one; of what may be one or several, that of
-    several."""
+    """The type of a field's value if it has one. For a field with one or several values, the type
+    of several."""
     kinds = [kind for kind in kinds_of(hint) if kind is not type(None)]
     return next((kind for kind in kinds if typing.get_origin(kind) is tuple), kinds[0])
 
@@ -287,7 +287,7 @@ def is_section(kind: Any) -> bool:
 
 
 def bounds(hint: Any) -> Iterator[Bound]:
-    """The bounds in a type, also in those of a union's members."""
+    """The bounds in a type, including those of a union's members."""
     for argument in typing.get_args(hint):
         if isinstance(argument, Bound):
             yield argument
@@ -313,7 +313,7 @@ def flat(section: Any) -> dict[str, Any]:
 def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     """Return `config` if its values make sense together.
 
-    Raises `InputError` naming `source` and the first field that does not.
+    Raises `InputError` naming `source` and the first field that makes no sense.
     """
     place = Place(source)
     for name, hint, value in named(config):
@@ -351,7 +351,7 @@ def plain(value: Any) -> Any:
 
 class _Loader(yaml.SafeLoader):
     """The core schema of YAML 1.2: 1e-3 is a number, and the older 010, 1:30, 0b1, yes and
-    2020-01-01 are text, as is infinity. Repeated keys and aliases are refused."""
+    2020-01-01 are text, and so is infinity. Repeated keys and aliases are refused."""
 
     yaml_implicit_resolvers: ClassVar[dict] = {}
 
@@ -374,7 +374,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """It writes what `_Loader` reads: text that would be taken for a number is quoted."""
+    """A dumper whose output `_Loader` reads: text that would be read as a number is quoted."""
 
     yaml_implicit_resolvers: ClassVar[dict] = {}
 
@@ -385,7 +385,7 @@ for _tag, _form in {
     "bool": "true|True|TRUE|false|False|FALSE",
     "int": f"[-+]?{_WHOLE}",
     "float": rf"[-+]?({_WHOLE}?\.[0-9]+|{_WHOLE}\.?)([eE][-+]?[0-9]+)?",
-}.items():  # which plain words are not text; the first that fits
+}.items():  # plain words that are not text; the first pattern that fits counts
     for _kind in (_Loader, _Dumper):
         _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^({_form})$"), None)
 
@@ -398,8 +398,8 @@ def _yaml(content: str, source: str) -> Any:
         problem = "it is nested too deeply"
     except (yaml.YAMLError, ValueError) as error:  # ValueError: too many digits, wrong tags
         problem = " ".join(str(error).split())
-    except (AttributeError, LookupError, TypeError):  # of PyYAML, for a tag on other content
-        problem = "a tag does not fit what stands behind it"
+    except (AttributeError, LookupError, TypeError):  # from PyYAML, if a tag has other content
+        problem = "a tag does not fit its value"
     raise InputError(source, f"is not YAML ({problem})")
 
 
@@ -411,7 +411,7 @@ _MOVED: dict[str, str] = {
     **{f"{name}_std": f"start.{name}" for name in InitialStd._fields},
     **{f"considered_{name}_std": f"considered.{name}" for name in ConsideredStd._fields},
 }
-"""Settings of the filter, which was one flat section with angles in degrees."""
+"""Settings of the filter, which was a flat section with angles in degrees."""
 _GONE = {
     "data.residency": ...,
     "model.dtype": "float32",
@@ -430,11 +430,11 @@ _GONE = {
     "through_filter.gate_softness": 2.0,
     "through_filter.skip_above": 1000.0,
 }
-"""Settings that are no more, and the value with which each changed nothing; `...` is any."""
+"""Settings that no longer exist, and for each the value without effect; `...` is any value."""
 
 
 def _is_of_earlier_version(fields: Any) -> bool:
-    """Whether it is the config.yaml that an earlier version left: a whole one."""
+    """Whether it is a complete config.yaml that an earlier version wrote."""
     if not isinstance(fields, dict) or "checkpoint_every_seconds" not in fields:
         return False
     sections = (name for name, value in vars(TrainConfig()).items() if is_section(type(value)))
@@ -443,7 +443,7 @@ def _is_of_earlier_version(fields: Any) -> bool:
 
 def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
     """The settings of an earlier version's config.yaml in this version's names. Raises `InputError`
-    where they ask for what there is no more."""
+    if they ask for something that no longer exists."""
     new = {name: dict(each) if isinstance(each, dict) else each for name, each in old.items()}
     del new["checkpoint_every_seconds"]
     for path, neutral in _GONE.items():
@@ -457,7 +457,7 @@ def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
     if count != 1:
         data["train_split"] = f"{data.get('train_split', 'train')}-{left_out}of{count}"
     augment["noise"] = [augment.pop("gyro_noise", 0.0), augment.pop("accel_noise", 0.0)]
-    new["loss"]["outlier_sigmas"] = 10.0  # which the likelihood always had
+    new["loss"]["outlier_sigmas"] = 10.0  # the likelihood always had this bound
     new["filter"] = sections = {"noise": {}, "start": {}, "considered": {}}
     share, seconds = flat.pop("window_error_share", 0.0), flat.pop("window_error_seconds", 0.5)
     sections["noise"]["std_factor"] = [flat.pop(f"std_factor_{axis}", 1.0) for axis in "xyz"]

@@ -1,4 +1,4 @@
-"""What the commands beside `gnio train` are asked for: frozen dataclasses whose field comments are
+"""The options of the commands other than `gnio train`: frozen dataclasses whose field comments are
 the text of `--help`."""
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class EvaluateConfig:
     """Folder of the run, with its config.yaml and checkpoints; by default the newest below runs/.
     Results go to its folder eval/."""
     dataset: str | None = None
-    """Dataset to evaluate on; by default the run's own. Of a run that has learnt from several, name
+    """Dataset to evaluate on; by default the run's own. If the run has learnt from several, name
     one."""
     data_root: str | None = None
     """Folder of the dataset; by default the run's (for its own dataset), $GNIO_DATA/<dataset>, or
@@ -39,7 +39,7 @@ class EvaluateConfig:
     """The paper's filter, the sum of the displacements, or the IMU integrated without the network.
     """
     coupling: Literal["tight", "loose"] = "tight"
-    """For the ekf: the network runs inside the filter, or over all windows before it with a given
+    """For the ekf: the network runs inside the filter, or before it over all windows with a given
     orientation."""
     orientation: Literal["filter", "device", "reference"] | None = None
     """Attitude that rotates the network's windows; by default the filter's for the tight coupling,
@@ -59,7 +59,7 @@ class EvaluateConfig:
     """Recordings estimated side by side."""
     plots: bool = True
     """Draw every sequence and the distribution of the errors, and write report.html. If an earlier
-    evaluation has them, they are made again even with --no-plots."""
+    evaluation has these files, they are made again even with --no-plots."""
     rerun: str | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     filter: Annotated[FilterSettings | None, FILE_ONLY] = None
@@ -73,9 +73,9 @@ class CalibrateConfig:
     workdir: str | None = None
     """Folder of the run; by default the newest below runs/."""
     out: str | None = None
-    """Folder of the calibrated run; by default the run's with _calibrated behind its name."""
+    """Folder of the calibrated run; by default the run's folder with _calibrated after its name."""
     data_root: tuple[str, ...] = ()
-    """Folder of the run's dataset, of several one for each; by default the run's,
+    """Folder of the run's dataset, or one for each of several; by default the run's,
     $GNIO_DATA/<dataset>, or data/<dataset>."""
     split: str | None = None
     """Split whose recordings are fitted: the run's validation split (default) or its training
@@ -83,16 +83,16 @@ class CalibrateConfig:
     was fitted."""
     out_of_fold: tuple[str, ...] = ()
     """Folders of runs, one for each fold: gnio train --data.train-split train-0of4, then train-1of4
-    and so on. The filter is then fitted to the training split, and for each session the network is
-    used that was trained without it."""
+    and so on. The filter is then fitted to the training split, and each session is predicted by the
+    network that was trained without it."""
     fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
     """What is fitted by the likelihood of the innovations: `measurement`, the factor of the
     network's covariance; `noise`, the IMU's; `start`, the standard deviations of the initial
     biases; `window`, the part of a window's error that is temporally correlated. The factors of the
     axes and the consider covariance are always fitted."""
     average_headings: bool = False
-    """Average the network over four headings, as model.equivariance: four_headings does, whatever
-    the run says. The network must have learnt from walks turned by a random yaw."""
+    """Average the network over four headings, as model.equivariance: four_headings does, even if
+    the run has another setting. The network must have learnt from walks turned by a random yaw."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class TablesConfig:
     table: Annotated[Table, Words("TABLE", named=False)]
     """complexity, comparison, components, gates, bank-size, trajectories or standing."""
     base: str = "quickstart"
-    """Config whose recordings, budget and augmentation every row has (not for complexity)."""
+    """Config that gives every row its recordings, budget and augmentation (not for complexity)."""
     data_root: str | None = None
     """Folder of the dataset; by default the config's, $GNIO_DATA/<dataset>, or data/<dataset>."""
     split: str = "test"
@@ -114,8 +114,8 @@ class TablesConfig:
     epochs: Count | None = None
     """Epochs of every run, instead of the config's."""
     methods: str = "tlio,ronin_resnet,deepils,ctin,imot,gnio"
-    """Networks of comparison, trajectories and standing, separated by commas; the first is the one
-    that the others are compared with."""
+    """Networks of comparison, trajectories and standing, separated by commas; the others are
+    compared with the first."""
     sequences: str | None = None
     """Sequences that trajectories draws, separated by commas; by default the first eight."""
     out: Folder = Path("runs/tables")
@@ -125,8 +125,8 @@ class TablesConfig:
 @dataclass(frozen=True)
 class CompareConfig:
     rows: Annotated[tuple[str, ...], Words("RUNS", named=False)]
-    """Runs, the one to compare with first. A name without its seed stands for all seeds: runs/gnio
-    for runs/gnio_s0, runs/gnio_s1, ... The folder of an evaluation stands for itself."""
+    """Runs; the others are compared with the first. A name without its seed stands for all seeds:
+    runs/gnio for runs/gnio_s0, runs/gnio_s1, ... The folder of an evaluation is one row."""
     split: str = "test"
     """Split whose evaluations are compared."""
     estimator: Literal["ekf", "integrate", "imu_only"] = "ekf"
@@ -144,11 +144,11 @@ class CompareConfig:
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Facts that a recording may lack. By default they come from its format or header, or they are
-    detected. An ambiguous recording is refused."""
+    """Properties that a recording may not state. By default they come from its format or header, or
+    they are detected. An ambiguous recording is refused."""
 
     columns: Annotated[tuple[str, ...], Words("OURS=THEIRS")] = ()
-    """For a CSV: our name and the file's name of each column that is named otherwise: time=stamp
+    """For a CSV: our name and the file's name of each column with another name: time=stamp
     gyro_x=wx ... Our names are time, gyro_x..z, accel_x..z, and accel_time if the accelerometer's
     time is another column. "a+b" is the sum of two columns (gravity and user acceleration). In a
     file without a header, columns are numbered from 0."""
@@ -161,9 +161,9 @@ class ImportOptions:
     accel_unit: Literal["m/s2", "g", "mg"] | None = None
     """Unit of the accelerometer; detected by the magnitude of gravity."""
     accel_sign: Literal["android", "ios", "detect"] | None = None
-    """At rest, level, the up axis reads +1 g (android) or −1 g (ios, everything is negated); detect
-    assumes that the screen points up more than down. A CSV has android's by default: the data alone
-    do not show it."""
+    """At rest and level, the up axis reads +1 g (android) or −1 g (ios: all axes are negated).
+    detect assumes that the screen points up more than down. A CSV has android's sign by default,
+    because the data alone do not show it."""
     imu_topic: str | None = None
     """Topic of sensor_msgs/Imu, if the bag has several."""
     accel_topic: str | None = None

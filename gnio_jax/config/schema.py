@@ -1,5 +1,5 @@
-"""The sections of an experiment: frozen dataclasses, and tuples of the numbers that the filter uses
-as they stand here. The comments of the fields are the text of `--help`; their types carry bounds.
+"""The sections of an experiment: frozen dataclasses, and tuples of numbers that the filter uses
+directly. The comments of the fields are the text of `--help`; their types have bounds.
 
 A section that relates several fields to each other checks them in `check`.
 """
@@ -16,7 +16,7 @@ from gnio_jax.errors import InputError
 
 
 class Place(NamedTuple):
-    """Where a setting or a section stands in a file or on the command line."""
+    """The place of a setting or a section in a file or on the command line."""
 
     source: str
     field: str = ""
@@ -27,36 +27,37 @@ class Place(NamedTuple):
         return Place(self.source, f"{self.field}.{name}" if self.field else name)
 
     def refuse(self, problem: str, remedy: str = "") -> NoReturn:
-        """Raise the `InputError` of what stands here."""
+        """Raise an `InputError` about this place."""
         named = f"field '{self.field}' {problem}" if self.field else problem
         raise InputError(self.source, named, remedy)
 
 
 class Bound(NamedTuple):
-    """What a value, or each number of a tuple, must fulfil. A field that is None has no value and
-    fulfils every bound."""
+    """A condition that a value, or each number of a tuple, must fulfil. A field that is None has no
+    value and fulfils every bound."""
 
     holds: Callable[[Any], bool]
     problem: str
-    """How the message goes on after the field's name."""
+    """The text of the message after the field's name."""
 
 
 class Words(NamedTuple):
-    """How the words of a command line give a field, where they are not --name VALUE."""
+    """The form of a field on the command line if it is not --name VALUE."""
 
     metavar: str = ""
-    """What stands for the value in the help, where its type would say too little."""
+    """The name of the value in the help, if its type would say too little."""
     named: bool = True
-    """Without its name, as in gnio track FILE; of a section, its fields without the section's."""
+    """The field is given without its name, as in gnio track FILE; for a section, the fields are
+    given without the section's name."""
     repeated: bool = False
-    """A list that is given one by one: --set a=1 --set b=2."""
+    """A list whose items are given one by one: --set a=1 --set b=2."""
 
 
 FILE_ONLY = "file only"
-"""Of a field that is no option of a command line; --set reaches it."""
+"""Mark of a field that is no option of the command line; --set reaches it."""
 UNNAMED = Words(named=False)
 Number = Any
-"""A float in a file. Inside a JAX program it may be an array, so type checkers take anything."""
+"""A float in a file. Inside a JAX program it may be an array, so type checkers accept any type."""
 
 ABOVE_ZERO = Bound(lambda value: 0 < value < math.inf, "must be positive and finite")
 NOT_NEGATIVE = Bound(lambda value: 0 <= value < math.inf, "must be finite and not negative")
@@ -78,7 +79,7 @@ Folder = Annotated[Path, Bound(lambda path: not path.is_file(), "must be a folde
 
 
 def _is_whole(number: float) -> bool:
-    """Whether it is a whole number of samples or strides, to rounding. No recording has 10^9."""
+    """Whether it is a whole number of samples or strides, to rounding, and below 10^9."""
     return number == 0 or (0.5 < number < 1e9 and abs(number - round(number)) < 1e-6)
 
 
@@ -104,15 +105,16 @@ class DataConfig:
     train_split: str = "train"
     """Split of the dataset for training. train-0of4 leaves out the first of four folds of it, in
     which people and sessions are whole: with a network for each fold, gnio calibrate has walks that
-    were not learnt from (ours)."""
+    were not used for training (ours)."""
     val_split: str = "val"
     """Split of the dataset for validation, which chooses the best checkpoint."""
     weights: tuple[Positive, ...] = ()
-    """For several datasets: how often an epoch visits the windows of each. 0.5 visits half of them,
-    drawn again in every epoch; 2 visits all of them twice. The default is 1 for each (ours)."""
+    """For several datasets: how often an epoch visits the windows of each. With 0.5 it visits half
+    of them, drawn again in every epoch; with 2 it visits all of them twice. The default is 1 for
+    each (ours)."""
     poses_by: Annotated[str | None, FILE_ONLY] = None
-    """Calibrated run, or package of weights (see gnio weights), whose displacements and the
-    smoother make poses of walks with waypoints; by default they are interpolated (ours)."""
+    """Calibrated run, or package of weights (see gnio weights). From its displacements the smoother
+    makes poses for walks with waypoints; by default these poses are interpolated (ours)."""
 
     @property
     def window(self) -> int:
@@ -140,7 +142,8 @@ class DataConfig:
         return round(self.train_stride_seconds * self.rate)
 
     def check(self, at: Place) -> None:
-        """Window, context and strides are whole samples, and strides fill window and context."""
+        """Check that window, context and strides are whole samples, and that strides fill window
+        and context."""
         for name in ("window_seconds", "context_seconds", "stride_seconds", "train_stride_seconds"):
             samples = getattr(self, name) * self.rate
             if not _is_whole(samples):
@@ -183,10 +186,10 @@ class AugmentConfig:
     scale: Annotated[tuple[Probability, Probability], FILE_ONLY] = (0.0, 0.0)
     """Half-widths of a window's uniform scale errors of gyro and accelerometer (ours)."""
     rest_share: Annotated[Probability, FILE_ONLY] = 0.0
-    """Share of the windows that are replaced by those of a phone at rest (ours)."""
+    """Share of the windows that are replaced by windows of a phone at rest (ours)."""
 
     def check(self, at: Place) -> None:
-        """The lowest cut-off is no higher than the highest."""
+        """Check that the lowest cut-off is not above the highest."""
         if self.low_pass_hertz[0] > self.low_pass_hertz[1]:
             at.below("low_pass_hertz").refuse(
                 "has the higher frequency first", "give the lower one first"
@@ -222,10 +225,9 @@ class ModelConfig:
     """Dimensions of the displacement: 3, or 2 without the vertical, as published (ronin_resnet,
     deepils, ctin, imot)."""
     equivariance: Literal["none", "four_headings", "canonical_frame"] = "none"
-    """How any network is made equivariant: if a window is turned about the vertical, its
-    displacement turns by the same angle. four_headings is the mean over four headings of the
-    window, at inference; canonical_frame uses a frame that a small network finds in the window
-    (EqNIO)."""
+    """How a network is made equivariant, so that its displacement turns with a window that is
+    turned about the vertical. four_headings is the mean over four headings of the window, at
+    inference; canonical_frame uses a frame that a small network finds in the window (EqNIO)."""
 
 
 @dataclass(frozen=True)
@@ -234,8 +236,8 @@ class LossConfig:
 
     name: Literal["weighted_sum", "velocity_and_covariance"] = "weighted_sum"
     """Weighted sum of squared error, absolute error and negative log-likelihood of the
-    displacement, with the weights below; or CTIN's loss: errors of velocity and position and the
-    likelihood of each sample's velocity, weighted by two trainable parameters."""
+    displacement, with the weights below; or CTIN's loss, which has errors of velocity and position
+    and the likelihood of each sample's velocity, weighted by two trainable parameters."""
     mse_weight: NonNegative = 1e2
     """λ_MSE."""
     mae_weight: NonNegative = 0.0
@@ -277,7 +279,8 @@ class OptimConfig:
     clip_norm: Positive | None = None
     """Largest global norm of the gradient; none by default."""
     weight_decay: NonNegative = 0.0
-    """Factor of the parameter that is added to its gradient, before Adam (CTIN: 1e-6)."""
+    """Weight decay: this factor times the parameter is added to its gradient before Adam (CTIN:
+    1e-6)."""
     best_by: Literal["loss", "squared_error"] = "loss"
     """Mean over the validation split that chooses the best checkpoint: the loss, or the squared
     error of the displacement. The choice begins anew where `loss.nll_from_epoch` or
@@ -290,7 +293,7 @@ class OptimConfig:
 
 class CorrelatedError(NamedTuple):
     """The part of a window's error that is temporally correlated (ours): a first-order Gauss–Markov
-    process, since windows overlap and the errors of neighbours are alike."""
+    process, because windows overlap and the errors of successive windows are correlated."""
 
     share: Annotated[Number, SHARE] = 0.8
     """Share c of the network's standard deviation; the rest is white."""
@@ -300,7 +303,7 @@ class CorrelatedError(NamedTuple):
 
 class NoiseModel(NamedTuple):
     """White noise of the IMU as densities, so that it does not depend on the rate, random walks of
-    its biases, and how the filter takes the network's covariances. Each number may be traced.
+    its biases, and the factors of the network's covariances. Each number may be traced.
 
     The defaults of the IMU are TLIO's per-sample values, tuned at about 1 kHz, as densities.
     """
@@ -315,7 +318,7 @@ class NoiseModel(NamedTuple):
     """Random walk of the accelerometer bias, m/s²/√s."""
     std_factor: Annotated[tuple[Number, Number, Number], FACTOR] = (1.0, 1.0, 1.0)
     """Factors of the network's standard deviations along x, y, z of the window's yaw frame (ours;
-    what `gnio calibrate` finds that they lack)."""
+    `gnio calibrate` fits them)."""
     measurement_scale: Annotated[Number, FACTOR] = 10.0
     """Factor of the network's covariance in the update: overlapping windows are not independent
     (TLIO)."""
@@ -331,8 +334,8 @@ class NoiseModel(NamedTuple):
         gyro_bias_walk: Any = 1e-6,
         accel_bias_walk: Any = 1e-4,
     ) -> NoiseModel:
-        """From the standard deviation of one sample, rad/s and m/s², at `dt` seconds per sample:
-        density = σ √dt."""
+        """The noise with the given standard deviations of one sample, rad/s and m/s², at `dt`
+        seconds per sample: density = σ √dt."""
         root = dt**0.5
         return cls(gyro_std * root, accel_std * root, gyro_bias_walk, accel_bias_walk)
 
@@ -362,7 +365,7 @@ class ConsideredStd(NamedTuple):
     of its trajectories (ours; consider covariance analysis). No trajectory depends on them."""
 
     gyro_bias: Annotated[Number, NOT_NEGATIVE] = 0.0
-    """Bias of each gyro axis beside its first estimate, rad/s."""
+    """Error of the first bias estimate of each gyro axis, rad/s."""
     scale: Annotated[Number, NOT_NEGATIVE] = 0.0
     """Logarithm of the scale of the displacements."""
     heading: Annotated[Number, NOT_NEGATIVE] = 0.0
@@ -381,30 +384,30 @@ class FilterSettings:
     start: InitialStd = TLIO_STD
     """Standard deviations of the initial state."""
     considered: ConsideredStd = field(default_factory=ConsideredStd)
-    """Errors in the covariance that are not estimated (Schmidt's consider states)."""
+    """Errors that are not estimated but included in the covariance (Schmidt's consider states)."""
     mahalanobis_fail_scale: NonNegative = 0.0
     """0 skips an update that the χ² gate rejects; above 0 the update is applied with its covariance
     multiplied by this."""
     window_rotation: Literal["per_sample", "single", "tlio"] | None = None
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
-    `tlio` does it as TLIO's tracker: a sample earlier and without the filter's biases, for weights
-    trained that way."""
+    `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
+    for weights trained that way."""
     raw_gyro_bias: NonNegative | None = None
-    """Standard deviation of the gyro's first bias where its phone takes none off, rad/s: the
-    recording then says `imu_compensated: no` (ours). By default that of `start` for every IMU."""
+    """Standard deviation of the gyro's first bias if its phone subtracts no bias, rad/s; the
+    recording then has `imu_compensated: no` (ours). By default that of `start` for every IMU."""
 
 
 SHORTEST_HORIZON = 1.0
-"""s, of the relative errors in the losses through the filter."""
+"""Times of the relative errors in the losses through the filter, s."""
 Part = Literal["noise", "measurement", "start", "uncertainty", "head", "encoder", "all"]
-"""A part of network and filter that can learn."""
+"""A part of network and filter that can be trained."""
 
 
 @dataclass(frozen=True)
 class ThroughFilter:
     """Training with the network in the filter's loop (ours), from the weights of `init_from`. The
     section `optim` counts segments of recordings instead of windows; `loss` is for windows alone,
-    and so is `augment` but for its `yaw`."""
+    and so is `augment` except its `yaw`."""
 
     learn: Annotated[tuple[Part, ...], Words("PART")] = ()
     """Parts that are trained through the filter. Without this option the network is trained on
@@ -463,10 +466,11 @@ class TrainConfig:
         return (self.dataset,) if isinstance(self.dataset, str) else self.dataset
 
     def check(self, at: Place) -> None:
-        """Several datasets differ, lie in their usual folders and have a weight each, or none. Four
-        headings are averaged only if training shows windows of every heading. A network that learns
-        through the filter has weights, and its segments are whole strides and longer than a window
-        and its context. A network that predicts every sample takes no context."""
+        """Check the sections together. Several datasets must differ, be in their usual folders and
+        have a weight each, or none. Four headings are averaged only if training shows windows of
+        every heading. Training through the filter needs weights to start from, and segments of
+        whole strides that are longer than a window and its context. A network that predicts every
+        sample takes no context."""
         names, weights = self.datasets, self.data.weights
         if len(set(names)) < len(names) or not names:
             at.below("dataset").refuse("is empty, or names a dataset twice", "name each once")
