@@ -1,7 +1,8 @@
-"""Trajectories out of recordings, their errors, and the reports about them.
+"""Trajectories from recordings, their errors, and the reports about them.
 
-The way through, a file each: `prepare` (sequences with a start) → `infer` (the network's
-displacements) → `estimate` (trajectories) → `metrics` (`score`) → `report`. `evaluate` walks it.
+The stages have a file each: `prepare` (sequences with a start) → `infer` (the network's
+displacements) → `estimate` (trajectories) → `metrics` (`score`) → `report`. `evaluate` calls them
+in this order.
 """
 
 from gnio_jax.evaluation.estimate import Estimate, States, estimate, never_moves, perfect

@@ -1,7 +1,7 @@
 """Colours and sizes that pictures, pages and Rerun's files of results share.
 
-The colours are those of Okabe and Ito, which the colour-blind can tell apart; the reference is
-black throughout.
+The colours are those of Okabe and Ito, which colour-blind readers can distinguish; the reference is
+always black.
 """
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"

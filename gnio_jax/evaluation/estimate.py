@@ -1,9 +1,9 @@
 """Trajectories of prepared recordings.
 
-The filter runs with the network in it (tight coupling), with displacements that were inferred
-before (loose coupling), or without any; without a filter displacements are summed. A trajectory has
-a row at the start and one at the end of every stride. The filter runs in float64 (JAX's x64 must be
-on), the network in float32.
+The filter runs with the network in its loop (tight coupling), with displacements that were inferred
+before (loose coupling), or without displacements. Without a filter the displacements are summed. A
+trajectory has a row at the start and one at the end of every stride. The filter runs in float64
+(JAX's x64 must be on), the network in float32.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ from gnio_jax.types import Array, Prediction, Waypoints
 PERFECT_STD = 0.01
 """Standard deviation of the true displacements that a `perfect` filter is given, m per axis."""
 SHORTEST = 16
-"""No batch is padded to less than about this many strides."""
+"""Approximate smallest number of strides to which a batch is padded."""
 
 
 class States(NamedTuple):
-    """What the filter estimates beside poses, a row for each row of the trajectory."""
+    """The filter's estimates besides poses, a row for each row of the trajectory."""
 
     velocity: Float[np.ndarray, "n 3"]
     """In the filter's own world, m/s."""
@@ -68,29 +68,30 @@ class States(NamedTuple):
     """In the body, m/s²."""
     std: Float[np.ndarray, "n 15"]
     """Standard deviations of the errors of attitude (in the world, rad), velocity, position, gyro
-    bias, accelerometer bias, with those that the filter considers."""
+    bias, accelerometer bias, including the consider covariance."""
     innovation: Float[np.ndarray, "n 3"]
     """Measured minus predicted displacement, m; NaN where there was no measurement."""
 
 
 class Estimate(NamedTuple):
-    """A trajectory with what the estimator knows beside it: K + 1 rows for K strides.
+    """A trajectory with the estimator's other results: K + 1 rows for K strides.
 
-    Row k is at the end of stride k, which is `Recording.time[k]`. A measurement stands in the row
-    in which its window ends.
+    Row k is at the end of stride k, which is `Recording.time[k]`. A measurement is in the row at
+    the end of its window.
     """
 
     name: str
     trajectory: Trajectory
-    """NaN from where the filter was not healthy any more: it has diverged."""
+    """NaN from the row on in which the filter is no longer healthy: it has diverged."""
     reference: Trajectory
-    """At the same rows; NaN where it cannot be trusted."""
+    """The reference at the same rows; NaN where it cannot be trusted."""
     displacements: Displacements | None = None
-    """With the standard deviations that the filter used, or those of the network without one."""
+    """The displacements, with the standard deviations that the filter used, or without a filter
+    those of the network."""
     filtered: Filtered | None = None
     states: States | None = None
     notes: tuple[str, ...] = ()
-    """What a reader of the result should know."""
+    """Notes for a reader of the result."""
     waypoints: Waypoints | None = None
     """The reference of a sequence without poses, in a frame of their own."""
 
@@ -103,11 +104,11 @@ def estimate(
     batch_size: int = 16,
     progress: Progress = silent,
 ) -> list[Estimate]:
-    """Trajectories of the recordings, by the filter, or by the sum of displacements where `ekf` is
+    """Trajectories of the recordings, by the filter, or by the sum of displacements if `ekf` is
     None.
 
     `source` is the network, which then runs inside the filter, or the displacements of each
-    recording. The filter runs over `batch_size` recordings side by side; other batches give the
+    recording. The filter runs over `batch_size` recordings side by side; other batch sizes give the
     same trajectories to rounding.
     """
     if ekf is None:
@@ -135,7 +136,8 @@ def estimate(
 
 
 def never_moves(estimates: list[Estimate]) -> list[Estimate]:
-    """The start pose throughout: what an estimator must beat, above all in a small room."""
+    """Estimates that stay at the start pose. An estimator must be better than these, above all in a
+    small room."""
     still = []
     for each in estimates:
         time, *poses = each.trajectory
@@ -145,18 +147,19 @@ def never_moves(estimates: list[Estimate]) -> list[Estimate]:
 
 
 def perfect(ekf: FilterSetup) -> FilterSetup:
-    """The filter for true displacements, which lack nothing: without anything that was calibrated
-    for a network."""
+    """The filter for true displacements: without the settings that were calibrated for a
+    network."""
     noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), measurement_scale=1.0, correlation=None)
     considered = ekf.considered and ConsideredStd(gyro_bias=ekf.considered.gyro_bias)
     return ekf._replace(noise=noise, considered=considered)
 
 
 def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> Estimate:
-    """Estimate and reference in one frame, to be looked at together: the estimate with its
-    covariance aligned, or without an `alignment` the reference moved so that both start alike. To
-    waypoints it is aligned in their own way. Unchanged where that is impossible. Covariances are
-    turned about the vertical alone, which is what an alignment turns of a level world."""
+    """Estimate and reference in one frame, for drawing: the estimate is aligned with its
+    covariance, or without an `alignment` the reference is moved to the start of the estimate. An
+    estimate with waypoints is aligned with these. If that is impossible, nothing changes.
+    Covariances are turned only about the vertical, because an alignment of a level world turns
+    about it."""
     if alignment is None and estimate.waypoints is None:
         return estimate._replace(reference=in_frame_of(estimate.reference, estimate.trajectory))
     reference = estimate.waypoints or estimate.reference
@@ -173,7 +176,7 @@ def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> 
 
 
 class Inputs(NamedTuple):
-    """What the filter is driven by, with the recordings along the leading axis."""
+    """The inputs of the filter, with the recordings along the leading axis."""
 
     start: Start
     gyro: Array
@@ -187,8 +190,8 @@ class Inputs(NamedTuple):
 
 
 def _batches(strides: list[int], batch_size: int) -> list[Batch]:
-    """Batches of one size, as full as they can be. Their lengths are few (the longest recording's
-    times powers of 0.8), and none is padded by more than a quarter."""
+    """Batches of one size, as full as possible. They have few lengths (that of the longest
+    recording times powers of 0.8), and none is padded by more than a quarter."""
     count = max(1, math.ceil(len(strides) / batch_size))
 
     def padded(longest: int) -> int:
@@ -206,9 +209,9 @@ def filter_inputs(
     strides: int,
     config: FilterConfig,
 ) -> Inputs:
-    """The recordings side by side, filled up to so many strides with what changes nothing before
-    it. Rows of `given` without a displacement get a covariance of 1 m², which has a derivative and
-    no effect."""
+    """The recordings side by side, padded to the given number of strides by samples that change
+    nothing before them. Rows of `given` without a displacement get a covariance of 1 m², which has
+    a derivative but no effect."""
     samples, stacked = strides * config.samples_per_clone, None
     if given is not None:
         rows = []
@@ -235,8 +238,8 @@ def _run(
     apply: Callable | None,
     config: FilterConfig,
 ) -> FilterHistory:
-    """One compiled run over all recordings of a batch. Of its covariances that of the position is
-    kept, with the errors that the filter considers."""
+    """One compiled run over all recordings of a batch. Of its covariances only that of the position
+    is kept, including the consider covariance."""
 
     def run(own: Inputs) -> FilterHistory:
         signals, fixed = (own.gyro, own.accel), (config, noise, own.imu_valid)
@@ -272,8 +275,8 @@ def _predict(apply: Callable, variables: Any, windows: Array) -> Prediction:
 
 
 def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) -> Estimate:
-    """The history of one recording after a row for its start. It is void where it is not
-    healthy."""
+    """The estimate from the history of one recording, with a row for its start. It is invalid where
+    the history is not healthy."""
     start, notes = recording.start, recording.notes
     healthy = _after(1.0, history.healthy) > 0
     if not healthy.all():
@@ -325,11 +328,11 @@ def _stacked(trees: list[Any]) -> Any:
 
 
 def integrate(recording: Recording, found: Displacements, windows: DataConfig) -> Estimate:
-    """The path whose every stride is what the windows over it predict, on average, as RoNIN-type
-    baselines do."""
+    """The path in which every stride is the mean of the windows that cover it, as in RoNIN-type
+    baselines."""
     n, clones = windows.stride, windows.window // windows.stride
     assert recording.attitude is not None
-    ends = n * np.arange(clones, recording.strides + 1)  # of the windows, in samples
+    ends = n * np.arange(clones, recording.strides + 1)  # ends of the windows, in samples
     to_world = yaw_rotation(recording.attitude[ends - windows.window])
     steps = np.einsum("mij,mj->mi", to_world, found.value[clones - 1 :]) / clones
     moved = np.cumsum(mean_over_windows(steps, clones), 0)
@@ -349,10 +352,10 @@ def mean_over_windows(steps: Float[np.ndarray, "m 3"], window: int) -> Float[np.
     """Movement in each stride: the mean of displacement × stride/window (`steps`) over the windows
     that cover it. Window i covers strides i … i + `window` − 1.
 
-    Taking the one window that starts (or ends) at the stride instead puts the whole trajectory half
-    a window ahead of (or behind) its time: 0.6 m at walking speed. A stride without any window
-    keeps the movement of the one before; those before all windows (the context of the first) take
-    that of the first that has one.
+    Using only the window that starts (or ends) at the stride would put the whole trajectory half a
+    window ahead of (or behind) its time: 0.6 m at walking speed. A stride without any window gets
+    the movement of the stride before. Strides before all windows (in the context of the first) get
+    that of the first stride with a window.
     """
     good, over = finite_rows(steps), np.ones(window)
     counts = np.convolve(good, over)

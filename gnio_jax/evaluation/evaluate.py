@@ -2,8 +2,8 @@
 
     prepare → infer → estimate → score → report
 
-Each stage is one file of this folder and one call here. It takes what the stages before it have
-made, and no stage calls an earlier one.
+Each stage is one file of this folder and one call here. Its inputs are results of earlier stages,
+and no stage calls an earlier one.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ NAMED = {
     "alignment": "{}-alignment",
     "checkpoint": "{}",
 }
-"""Choices that are part of a folder's name where they are not the default."""
+"""Choices that are part of a folder's name if they are not the default."""
 WINDOWS = ("rate", "window_seconds", "context_seconds", "stride_seconds", "window_rotation")
-"""Settings of `DataConfig` that figures depend on."""
+"""Settings of `DataConfig` on which the figures depend."""
 
 
 class Evaluation(NamedTuple):
-    """What `evaluate` found."""
+    """The result of `evaluate`."""
 
     report: Report
     estimates: list[Estimate]
     recordings: list[Recording]
     folder: Path
-    """Where the results are."""
+    """Folder of the results."""
 
 
 def evaluate(
@@ -66,14 +66,14 @@ def evaluate(
     command: str = "",
     run: Any = None,
 ) -> Evaluation:
-    """Estimate every sequence of a split with the network of a run, measure the errors, and leave
-    the results in a folder of the run.
+    """Estimate every sequence of a split with the network of a run, measure the errors, and write
+    the results to a folder of the run.
 
     The folder is written whole or not at all, and replaces that of an earlier evaluation with the
-    same options. `workers` processes read what is slow to read; `command` is how this was called,
-    for the page; `run` is the `training.checkpoint.Run` of `config`, where it is restored already.
-    Raises `InputError` for options that do not fit together, a run without the checkpoint, missing
-    data, and a split of which no sequence can be estimated.
+    same options. `workers` processes read recordings that are slow to read; `command` is the
+    command line, for the page; `run` is the `training.checkpoint.Run` of `config`, if it is loaded
+    already. Raises `InputError` for options that do not fit together, a run without the checkpoint,
+    missing data, and a split of which no sequence can be estimated.
     """
     _check(config)
     from gnio_jax.training.checkpoint import learnt_from, load_run  # Orbax takes seconds to import
@@ -142,8 +142,8 @@ def evaluate(
 
 
 def score_files(reference: Path, estimate: Path, alignment: Alignment = "origin") -> Report:
-    """The report about two trajectories in TUM format, whoever wrote them, at the stamps that they
-    share. Raises `InputError` where these are too few."""
+    """The report about two trajectories in TUM format, written by any program, at the stamps that
+    they share. Raises `InputError` if these are too few."""
     try:
         path, truth = paired(read_tum(estimate), read_tum(reference))
     except Undefined as problem:
@@ -159,7 +159,7 @@ def score_files(reference: Path, estimate: Path, alignment: Alignment = "origin"
 
 
 def _check(config: EvaluateConfig) -> None:
-    """Raise `InputError` for options that cannot be, whatever the run is."""
+    """Raise `InputError` for options that are impossible for every run."""
     if config.batch_size < 1:
         raise InputError("--batch-size", f"must be at least 1, found {config.batch_size}")
     if not _infers(config) and config.orientation not in (None, "filter"):
@@ -174,9 +174,9 @@ def _check(config: EvaluateConfig) -> None:
 
 
 def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
-    """What is asked for, with what it takes from the run: dataset, folder of the data, orientation
-    of the windows, and the filter with what `config.set` changes of it. `run` is the configuration
-    of the run. Raises `InputError` for an unknown dataset, missing data and impossible settings."""
+    """The request, completed from the run: dataset, folder of the data, orientation of the windows,
+    and the filter with the changes of `config.set`. `run` is the configuration of the run. Raises
+    `InputError` for an unknown dataset, missing data and impossible settings."""
     changed = dataclasses.replace(run, filter=config.filter or run.filter)
     changed = configuration.validate(configuration.assign(changed, config.set), "command line")
     dataset, root = config.dataset or run.datasets[0], None
@@ -210,8 +210,9 @@ def _usual_orientation(config: EvaluateConfig) -> Orientation:
 
 
 def folder_of(workdir: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
-    """The folder of a run for the results of a resolved `config`. One that holds figures of other
-    recordings keeps them: then the name ends with the place of these, also from now on."""
+    """The folder of a run for the results of a resolved `config`. If that folder holds figures of
+    other recordings, it keeps them: the name then ends with the place of the recordings, in this
+    and in later evaluations."""
     folder = workdir / "eval" / folder_name(config, run)
     if config.data_root is None:
         return folder
@@ -220,13 +221,13 @@ def folder_of(workdir: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
     try:
         there = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         taken = there["settings"]["data_root"] != config.data_root
-    except (OSError, ValueError, LookupError, TypeError):  # nothing that names its recordings
+    except (OSError, ValueError, LookupError, TypeError):  # the file names no recordings
         taken = False
     return own if taken or own.exists() else folder
 
 
 def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
-    """<dataset>_<split>_<estimator>, then every choice of a resolved `config` that is not the
+    """<dataset>_<split>_<estimator>, then every choice of a resolved `config` other than the
     default."""
     usual = vars(EvaluateConfig(orientation=_usual_orientation(config)))
     own = vars(config)
@@ -245,7 +246,7 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
 def _settings(
     config: EvaluateConfig, run: TrainConfig, sequences: list[Sequence]
 ) -> dict[str, Any]:
-    """What changes the meaning of the figures, and what they are of."""
+    """The settings that define the meaning of the figures and their subject."""
     compensated = {str(each.attributes.get("imu_compensated", "no")) for each in sequences}
     tapped = all(each.waypoints is not None for each in sequences)
     return {

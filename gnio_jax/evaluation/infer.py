@@ -24,8 +24,8 @@ DIAGNOSTICS = ("gate", "scale")
 
 
 class Displacements(NamedTuple):
-    """Displacements over windows, a row for each stride of a recording: that of the window that
-    ends with the stride. NaN where there is none."""
+    """Displacements over windows, with a row for each stride of a recording: the displacement of
+    the window that ends with the stride. NaN where there is none."""
 
     value: Float[Array, "k 3"]
     """m, expressed in the yaw frame of the window's start."""
@@ -58,12 +58,12 @@ def infer(
     diagnostics: tuple[str, ...] = DIAGNOSTICS,
     least_std: float = 0.0,
 ) -> list[Displacements]:
-    """What the network predicts for every window of the recordings, which are cut with
-    `Recording.attitude`, in large batches over all of them. Float64 on the host.
+    """The network's predictions for every window of the recordings, which are cut with
+    `Recording.attitude`, in large batches over all recordings. The results are float64 on the host.
 
-    A window that touches a sample which was not measured has no displacement. `diagnostics` are
-    those that are kept, as far as the network has them. `least_std` is the smallest standard
-    deviation that the estimator takes, m (`FilterConfig.log_std_min`).
+    A window that touches a sample which was not measured has no displacement. `diagnostics` names
+    those that are kept, if the network has them. `least_std` is the smallest standard deviation
+    that the estimator uses, m (`FilterConfig.log_std_min`).
     """
     parts, starts, turns = [], [], []
     for each in recordings:
@@ -83,7 +83,7 @@ def infer(
     start, turn = np.concatenate(starts).astype(np.int32), np.concatenate(turns)
     total, size, found = len(start), min(WINDOWS_PER_CALL, len(start)), []
     for begin in range(0, total, size):
-        # The last batch is filled up with the last window, so that one program serves all.
+        # The last batch is filled up with the last window, so that all batches use one program.
         batch = np.minimum(np.arange(begin, begin + size), total - 1)
         arguments = network.variables, samples, start[batch], turn[batch]
         fixed = {"apply": network.apply, "length": windows.seen, "diagnostics": diagnostics}
@@ -112,7 +112,7 @@ def _predict(
 
 
 def keep(prediction: Prediction, names: tuple[str, ...] = DIAGNOSTICS) -> Prediction:
-    """The prediction with the named diagnostics only, as far as it has them."""
+    """The prediction with only the named diagnostics, if it has them."""
     kept = {name: value for name, value in prediction.diagnostics.items() if name in names}
     return prediction._replace(diagnostics=kept)
 

@@ -1,4 +1,4 @@
-"""Evaluations that a run has already, and whether they may stand for new ones."""
+"""Evaluations that a run has already, and whether they may replace new ones."""
 
 from __future__ import annotations
 
@@ -13,28 +13,27 @@ from gnio_jax.evaluation.report import Report, read
 from gnio_jax.reporting import Reporter
 
 IDENTITY = ("dataset", "data_root", "split", "alignment")
-"""Settings by which recordings and errors of two evaluations are the same."""
+"""Settings that two evaluations must share to have the same recordings and errors."""
 
 
 class Kept(NamedTuple):
-    """An evaluation of a run, before it is asked whether it has to be made."""
+    """A requested evaluation of a run, and whether it has to be made."""
 
     config: EvaluateConfig
-    """As `evaluate.resolve` leaves it."""
+    """The request, as `evaluate.resolve` completes it."""
     folder: Path
     report: Report | None
-    """What is there, if it is what is asked for."""
+    """The existing report, if it is the requested one."""
     problem: str
-    """Why it has to be made; empty where it is there."""
+    """The reason why it has to be made; empty if it exists."""
     run: Any = None
-    """The `training.checkpoint.Run`, where it is restored already and the evaluation has to be
-    made."""
+    """The `training.checkpoint.Run`, if it is loaded already and the evaluation has to be made."""
 
 
 def look(config: EvaluateConfig) -> Kept:
     """The evaluation of a run that `config` asks for, with the run's own filter.
 
-    Raises `InputError` for one that is not there and cannot be made.
+    Raises `InputError` for one that does not exist and cannot be made.
     """
     workdir, run = Path(config.workdir or ""), None
     trained = configuration.load(workdir / "config.yaml")
@@ -59,7 +58,7 @@ def look(config: EvaluateConfig) -> Kept:
 
 
 def made(kept: Kept, reporter: Reporter, workers: int = 1) -> Report:
-    """The evaluation, new if it has to be made."""
+    """The evaluation, which is made if necessary."""
     if kept.report is not None:
         return kept.report
     config = kept.config
@@ -70,7 +69,7 @@ def made(kept: Kept, reporter: Reporter, workers: int = 1) -> Report:
 
 
 def out_of_date(report: Report, workdir: Path) -> str:
-    """Why figures cannot stand for the run in `workdir`; empty where they can."""
+    """The reason why the figures are not those of the run in `workdir`; empty if they are."""
     step, which = report.settings.get("step"), report.settings.get("checkpoint")
     if step is not None and not (workdir / "checkpoints" / str(which) / str(step)).is_dir():
         return "its figures are of a checkpoint that the run has no more"
@@ -78,7 +77,7 @@ def out_of_date(report: Report, workdir: Path) -> str:
 
 
 def _differs(report: Report, config: EvaluateConfig) -> str:
-    """Why figures are not what is asked for; empty where they are."""
+    """The reason why the figures are not the requested ones; empty if they are."""
     for name in IDENTITY:
         if (own := report.settings.get(name)) != (wanted := getattr(config, name)):
             return f"its figures are of {name.replace('_', ' ')} {own}, not {wanted}"

@@ -1,9 +1,9 @@
-"""Errors of a trajectory, each under a name that says which definition of the field it is.
+"""Errors of a trajectory, each with a name that identifies its definition in the field.
 
 Positions are (n, d) arrays in metres whose rows are `step` seconds apart, with d = 3, or 2 for the
-horizontal metrics. A row of the reference that cannot be trusted is NaN and counts nowhere, and
-neither does a displacement that starts or ends there. A metric without a value raises `Undefined`
-with the reason. `measure` computes all of them. Everything is NumPy in float64.
+horizontal metrics. A row of the reference that cannot be trusted is NaN and is ignored, and so is a
+displacement that starts or ends there. A metric without a value raises `Undefined` with the reason.
+`measure` computes all of them. Everything is NumPy in float64.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ STANDING_SPEED = 0.05
 STANDING_SECONDS = 2.0
 """Shortest stretch that counts as standing still, s."""
 LEAST_PATH = 1.0
-"""Length of the reference below which `drift` and `path_length_ratio` say nothing, m."""
+"""Length of the reference below which `drift` and `path_length_ratio` are undefined, m."""
 LEAST_LEG = 1.0
-"""Length of a leg below which the ratio of lengths says nothing, m."""
+"""Length of a leg below which the ratio of lengths is not meaningful, m."""
 LEAST_SECONDS = 10.0
-"""Time below which `yaw_drift` says nothing of an hour, s."""
+"""Time below which `yaw_drift` is undefined, s."""
 
 
 # --- errors of positions
@@ -52,8 +52,8 @@ def ate(estimate: Positions, reference: Positions) -> float:
 
 def drift(estimate: Positions, reference: Positions, step: float) -> float:
     """Error at the last trusted row over the length of the reference's path, % (position drift
-    error, PDE). The error has grown over the whole path, so its holes are bridged by straight
-    lines."""
+    error, PDE). The error has grown over the whole path, so holes of the reference are bridged by
+    straight lines."""
     error, rows = _trusted_errors(estimate, reference)[-1], np.arange(len(reference))
     known = finite_rows(reference)
     bridged = [np.interp(rows, rows[known], axis[known]) for axis in reference.T]
@@ -82,8 +82,8 @@ def rte_distance(estimate: Positions, reference: Positions, metres: float) -> fl
     """RMS of the error of displacements over `metres` walked, from every row, m (D-RTE of CTIN and
     iMoT).
 
-    A displacement ends at the first row by which the reference has walked `metres`. Its path is
-    summed from row to row, within an unbroken stretch of the reference.
+    A displacement ends at the first row by which the reference has walked `metres`. The distance
+    walked is summed from row to row, within an unbroken stretch of the reference.
     """
     errors = [np.zeros((0, estimate.shape[1]))]
     for start, stop in spans(finite_rows(reference)):
@@ -107,8 +107,9 @@ def rpe(
     from every row, m (TLIO).
 
     ψ is the yaw error at the start (`relative_yaw`), so a wrong heading of the whole trajectory
-    costs nothing. With `full` the whole attitude at the start is aligned, R_i R̂_iᵀ in the place of
-    R_z (the translation part of TUM and evo). With `dims` 2 it is of the horizontal part.
+    adds no error. With `full` the whole attitude at the start is aligned, by R_i R̂_iᵀ in the place
+    of R_z (the translation part of TUM and evo). With `dims` 2 it is the error of the horizontal
+    part.
     """
     if full:
         ours, true = (matrix_from_quaternion(each.orientation) for each in (estimate, reference))
@@ -136,7 +137,7 @@ def _rms_of_pairs(
 
 
 def _rms(errors: Float[np.ndarray, "m d"], reason: str = "") -> float:
-    """Root mean square norm. Raises `Undefined(reason)` without a row."""
+    """Root mean square norm. Raises `Undefined(reason)` if there is no row."""
     if not len(errors):
         raise Undefined(reason)
     return float(np.sqrt(np.mean(np.sum(errors**2, 1))))
@@ -156,8 +157,8 @@ def path_length(position: Positions, step: float, seconds: float = 1.0) -> float
     """Length of the polygon through the first trusted row of each stretch of `seconds` and the last
     one, m. Sides that are longer than two such stretches, across untrusted rows, are left out.
 
-    Summed from row to row, the noise of positions would count as walking: 5 mm at 10 Hz make 3 m a
-    minute.
+    If the length were summed from row to row, the noise of positions would count as walking: 5 mm
+    at 10 Hz make 3 m per minute.
     """
     if len(position) < 2:
         raise Undefined("a single row")
@@ -169,7 +170,7 @@ def path_length(position: Positions, step: float, seconds: float = 1.0) -> float
 
 
 def path_length_ratio(estimate: Positions, reference: Positions, step: float) -> float:
-    """Estimated over true `path_length` where the reference is trusted: 1 is right, 0 is an
+    """Estimated over true `path_length` where the reference is trusted: 1 is correct, 0 is an
     estimate that never moved."""
     length = _path_of_reference(reference, step)
     trusted = np.where(finite_rows(reference)[:, None], estimate, np.nan)
@@ -184,8 +185,9 @@ def _path_of_reference(reference: Positions, step: float) -> float:
 
 
 def standing(reference: Positions, step: float) -> Bool[np.ndarray, "n"]:
-    """Rows of stretches of at least 2 s in which every displacement over 1 s is below 0.05 m. One
-    second forgives the noise of the reference and the swaying of a person who stands (ours)."""
+    """Rows of stretches of at least 2 s in which every displacement over 1 s is below 0.05 m. The
+    interval of one second tolerates the noise of the reference and the swaying of a person who
+    stands (ours)."""
     apart, still = max(1, round(1.0 / step)), np.zeros(len(reference), bool)
     if len(reference) <= apart:
         return still
@@ -200,7 +202,7 @@ def standing(reference: Positions, step: float) -> Bool[np.ndarray, "n"]:
 
 def stationary_drift(estimate: Positions, reference: Positions, step: float) -> float:
     """Metres that the estimate walks (`path_length`) per minute in which the reference stands still
-    (`standing`): what a gate on the displacement is for (GNIO)."""
+    (`standing`). A gate on the displacement should reduce this drift (GNIO)."""
     stretches = [each for each in spans(standing(reference, step)) if each[1] - each[0] > 1]
     if not stretches:
         raise Undefined(f"the reference never stands still for {STANDING_SECONDS:g} s")
@@ -213,9 +215,9 @@ def stationary_drift(estimate: Positions, reference: Positions, step: float) -> 
 
 
 def leg_ratio(estimate: Positions, waypoints: Positions) -> float:
-    """Median over the legs of estimated over true length (ours): 1 is right. The estimate's leg is
-    the straight line between its positions at the two times. One tap too late makes one leg longer
-    and the other shorter, which hardly moves a median. Legs under 1 m are left out."""
+    """Median over the legs of estimated over true length (ours): 1 is correct. The estimate's leg
+    is the straight line between its positions at the two times. A late tap makes one leg longer and
+    the next one shorter, which hardly changes a median. Legs under 1 m are left out."""
     ours, true = (np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (estimate, waypoints))
     long = true >= LEAST_LEG
     if not long.any():
@@ -224,20 +226,20 @@ def leg_ratio(estimate: Positions, waypoints: Positions) -> float:
 
 
 def leg_path_ratio(estimate: Positions, waypoints: Positions) -> float:
-    """Length of the estimate's polygon through the times of the waypoints over that of the
-    waypoints: the path ratio of a walk that is straight between them."""
+    """Length of the estimate's polygon at the times of the waypoints over the length of the polygon
+    through the waypoints: the path ratio of a walk that is straight between them."""
     if (length := _length(waypoints)) < LEAST_PATH:
         raise Undefined(f"the legs are {length:.2f} m long together, under {LEAST_PATH:g} m")
     return _length(estimate) / length
 
 
 def leg_error(estimate: Positions, waypoints: Positions) -> float:
-    """RMS error of the legs as vectors, m. Where one leg is wrong, those after it are not."""
+    """RMS error of the legs as vectors, m. An error of one leg does not affect later legs."""
     return _rms(np.diff(estimate - waypoints, axis=0))
 
 
 def _length(corners: Positions) -> float:
-    """Of a polygon, m."""
+    """Length of a polygon, m."""
     return float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
 
 
@@ -276,7 +278,7 @@ def normalised_squared(
 ) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of each row, infinite where P is not finite and positive definite.
 
-    Such a P claims to know some direction exactly, which no error agrees with. It is judged to the
+    Such a P has no uncertainty in some direction, which contradicts every error. P is tested to the
     rounding of float64 after scaling to unit variances, so that units do not matter (ours).
     """
     variance = np.einsum("nii->ni", covariance)
@@ -314,10 +316,10 @@ def _present(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
 
 
 class Filtered(NamedTuple):
-    """What a filter knows beside its trajectory, one row for each row of the trajectory."""
+    """A filter's results besides its trajectory, one row for each row of the trajectory."""
 
     covariance: Float[np.ndarray, "n 3 3"]
-    """Of the position, in the filter's own world, m²."""
+    """Covariance of the position, in the filter's own world, m²."""
     nis: Float[np.ndarray, "n"]
     """Normalised innovation squared; NaN where there was no measurement."""
     accepted: Float[np.ndarray, "n"]
@@ -325,14 +327,14 @@ class Filtered(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """An estimate beside its reference, as the metrics see it."""
+    """An estimate and its reference, in the form that the metrics need."""
 
     raw: Trajectory
-    """As the estimator gives it."""
+    """The estimate without alignment."""
     aligned: Trajectory
-    """Under the alignment that was asked for."""
+    """The estimate with the requested alignment."""
     started: Trajectory
-    """Under alignment `origin`."""
+    """The estimate with alignment `origin`."""
     reference: Trajectory
     step: float
     """Time between rows, s."""
@@ -342,8 +344,8 @@ class Compared(NamedTuple):
 
     @property
     def paths(self) -> tuple[Positions, Positions]:
-        """Of the aligned estimate and of the reference. Lengths are of the estimate as it is given:
-        an alignment of all axes would turn some of the height into the plane."""
+        """Positions of the aligned estimate and of the reference. Lengths use the estimate without
+        alignment, because an alignment of all axes would turn part of the height into the plane."""
         return self.aligned.position[:, : self.dims], self.reference.position[:, : self.dims]
 
     @property
@@ -395,13 +397,13 @@ SPATIAL: dict[str, Metric] = {
     "path_length_ratio": lambda c: path_length_ratio(*c._replace(aligned=c.raw).paths, c.step),
     "stationary_drift": lambda c: stationary_drift(*c._replace(aligned=c.raw).paths, c.step),
 }
-"""In 3-D, and in 2-D as `<name>_2d`. Those of `_ronin` average over components too: they are the
-others over √d (RoNIN, DeepILS)."""
+"""Metrics in 3-D, and in 2-D as `<name>_2d`. Those of `_ronin` also average over components: they
+are the others divided by √d (RoNIN, DeepILS)."""
 NEES: dict[str, Metric] = {
     "nees": lambda c: mean_normalised(c.nees(), c.dims),
     "nees_coverage": lambda c: coverage(c.nees(), c.dims),
 }
-"""In 3-D and in 2-D, of a filter."""
+"""Metrics of a filter, in 3-D and in 2-D."""
 OTHERS: dict[str, Metric] = {
     "yaw_rmse": lambda c: yaw_rmse(c.aligned.orientation, c.reference.orientation),
     "yaw_drift": lambda c: yaw_drift(c.raw.orientation, c.reference.orientation, c.step),
@@ -411,7 +413,7 @@ OF_FILTER: dict[str, Metric] = {
     "nis_coverage": lambda c: coverage(c.of_filter().nis, 3),
     "accepted": lambda c: 100.0 * mean_normalised(c.of_filter().accepted, 1),
 }
-"""They need no reference."""
+"""Metrics that need no reference."""
 LEGS: dict[str, Metric] = {
     "path_length": lambda c: _length(c.at_waypoints()[1]),
     "legs": lambda c: float(len(c.at_waypoints()[1]) - 1),
@@ -422,7 +424,7 @@ OF_WAYPOINTS: dict[str, Metric] = {
     "leg_error": lambda c: leg_error(*c.at_waypoints()),
     "waypoint_rms": lambda c: ate(*c.at_waypoints()),
 }
-"""Horizontal, of a sequence with waypoints: it has these in the place of all that need poses."""
+"""Horizontal metrics of a sequence with waypoints, which replace all that need poses."""
 NAMES = (
     *(name + tag for tag in ("", "_2d") for name in SPATIAL | NEES),
     *OTHERS,
@@ -430,11 +432,11 @@ NAMES = (
     *OF_WAYPOINTS,
 )
 POSITION_ERRORS = ("ate", "waypoint_rms")
-"""One of them is the error of the positions of a sequence."""
+"""Metrics of which every sequence has one as the error of its positions."""
 OF_REFERENCE = {"path_length", "legs"}
-"""They are finite whatever the estimate is."""
+"""Metrics that are finite for every estimate."""
 SAME_TIME = 1e-3
-"""Stamps that differ by no more are of one time, s."""
+"""Stamps that differ by no more are the same time, s."""
 SHARES = {"nees_coverage", "nees_coverage_2d", "nis_coverage", "accepted"}
 """Metrics that are small when they are bad: 0 for an estimate that diverged."""
 
@@ -443,12 +445,12 @@ class Measures(NamedTuple):
     """The metrics of one sequence."""
 
     values: dict[str, float | None]
-    """Metric → value: None where it is not defined, infinite where the estimate diverged."""
+    """Metric → value: None if it is not defined, infinite if the estimate diverged."""
     reasons: dict[str, str]
-    """Metric → why it is None or infinite, or the 0 of an estimate that diverged."""
+    """Metric → reason why it is None or infinite, or 0 for an estimate that diverged."""
     diverged: bool
-    """Whether the estimate is not finite throughout, or so far off that the error of its positions
-    is infinite. An infinite NEES alone is a bad covariance."""
+    """Whether the estimate is not finite in every row, or so wrong that the error of its positions
+    is infinite. If only the NEES is infinite, the covariance is bad."""
 
 
 def measure(
@@ -461,8 +463,8 @@ def measure(
     """Every metric of one sequence. `reference` has the estimate's stamps. With `waypoints` there
     is no other reference, and the metrics are those of `OF_WAYPOINTS` and of the filter.
 
-    `ate*`, `rte*`, `drift` and `yaw_rmse` see the estimate under `alignment`, which is fitted in
-    3-D for the horizontal ones too. NEES is taken with the start aligned, because the filter's
+    `ate*`, `rte*`, `drift` and `yaw_rmse` use the estimate with `alignment`, which is fitted in 3-D
+    for the horizontal metrics too. NEES uses alignment at the start, because the filter's
     covariance is relative to its start. An estimate with a row that is not finite has diverged:
     every metric that a finite one would have is infinite, and the shares are 0. Raises `ValueError`
     for a reference with other stamps.
@@ -479,7 +481,8 @@ def measure(
     if not estimate.known.all():
         since = estimate.time[np.argmin(estimate.known)] - estimate.time[0]
         lost = f"the estimate is not finite from {since:.1f} s on"
-        # Which metrics there would be depends on the reference: one at rest finds out.
+        # The reference decides which metrics exist, so an estimate at rest is measured to find
+        # them.
         level = np.tile([1.0, 0, 0, 0], (len(estimate.time), 1))
         path = Trajectory(estimate.time, np.zeros_like(estimate.position), level)
     aligned, started, missing = path, path, ""
@@ -513,7 +516,7 @@ def measure(
 
 
 def _metrics(compared: Compared) -> Iterator[tuple[str, Metric, Compared]]:
-    """Name, metric and what it is of, in the order of the files."""
+    """Name, metric and its data, in the order of the files."""
     nees, of_filter = ({}, {}) if compared.filtered is None else (NEES, OF_FILTER)
     if compared.waypoints is None:
         spatial = SPATIAL | nees

@@ -1,7 +1,7 @@
 """The page of an evaluation or a track: one file, which a browser opens without a network.
 
-It has a map, strips over time, a slider and the table of measures. Bokeh draws the figures from
-columns which the selector of sequences exchanges (`page.js`). Bokeh is imported here, so import
+It has a map, curves over time, a slider and the table of measures. Bokeh draws the figures from
+columns, which the selector of sequences exchanges (`page.js`). Bokeh is imported here, so import
 this module only where a page is written.
 """
 
@@ -32,20 +32,20 @@ from gnio_jax.evaluation.tabulate import COLUMNS
 from gnio_jax.files import write_text
 
 ROWS, FEWEST_ROWS = 9000, 150
-"""Rows that a page holds, over all runs and sequences, and those that a sequence has at least.
-Fifteen minutes at ten rows a second are whole; what is longer is thinned."""
+"""Largest number of rows of a page, over all runs and sequences, and smallest number of rows of a
+sequence. Fifteen minutes at ten rows per second are complete; longer sequences are thinned."""
 SAME = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "step")
-"""Settings in which evaluations are alike that stand side by side."""
+"""Settings that evaluations must share to be shown together."""
 LATER = ("command", "weights")
-"""What is told of the first run elsewhere than under the title."""
+"""Facts about the first run that are not shown under the title."""
 STRIPS = {"gate": "gate γ (–)", "scale": "scale (–)", "std": "σ of network (m)"}
 """Curves with a value for each axis of the window's yaw frame, and their labels."""
 LEVELS = (("mean", 3.0, colours.GREEN), ("refused above", 11.345, colours.VERMILION))
-"""Of the NIS of three axes: the mean of χ², and what the filter refuses by default."""
+"""Levels of the NIS of three axes: the mean of χ², and the filter's default threshold."""
 MAP_HEIGHT, STRIP_HEIGHT, LABEL_HEIGHT, LEFT = 560, 158, 30, 62
 WAYPOINT = {"marker": "x", "color": colours.REFERENCE, "line_width": 2.0}
 LONGEST_LABEL = 45
-"""Letters in a line of a legend: a phone has room for them."""
+"""Letters in a line of a legend, which fit on the screen of a phone."""
 LONG = 1e6
 """Longer than a recording, s."""
 GO_THERE = """
@@ -64,20 +64,20 @@ class Run(NamedTuple):
     """One run on the page."""
 
     name: str
-    """Short: how it differs from the other runs."""
+    """Its difference from the other runs, in few words."""
     about: dict[str, str]
-    """How the figures were made, in words: the command, alignment, orientation, ..."""
+    """Description of how the figures were made: the command, alignment, orientation, ..."""
     views: list[View]
     figures: dict[str, Figures]
     """By sequence."""
     summary: dict[str, Figures] = {}
     """Row below the sequences (mean, median, ...) → its metrics."""
     warnings: tuple[str, ...] = ()
-    """What makes it worth less than it looks: it stands above the figures."""
+    """Warnings that limit the value of the figures; they are shown above them."""
     remarks: tuple[str, ...] = ()
-    """What else a reader should know."""
+    """Other notes for a reader."""
     settings: str = ""
-    """Everything that was configured, as text of several lines."""
+    """The whole configuration, as text of several lines."""
 
 
 # --- what the page shows of an evaluation
@@ -86,7 +86,7 @@ class Run(NamedTuple):
 def of_report(
     report: Report, views: list[View], command: str = "", settings: str = "", name: str = ""
 ) -> Run:
-    """An evaluation; `settings` is the configuration of its run."""
+    """The run of the page for an evaluation; `settings` is the configuration of its run."""
     made, own = report.settings, report.summary()
     rows = {name: {x: getattr(of, name) for x, of in own.items()} for name in ("mean", "median")}
     for row in report.reference_rows:
@@ -104,16 +104,16 @@ def of_report(
 
 
 def of_folder(folder: Path, report: Report, name: str) -> Run:
-    """An evaluation that was read back: its paths and figures, without what network and filter gave
-    over time."""
+    """An evaluation read from its folder: its paths and figures, without the curves of network and
+    filter."""
     estimates = read_estimates(folder, list(report.scores))
     views = [plots.view(each, report.settings["alignment"]) for each in estimates]
     return of_report(report, views, name=name)
 
 
 def beside(folder: Path, settings: Mapping[str, Any]) -> list[Run]:
-    """The other evaluations of the same recordings by the same network, beside `folder`. What
-    cannot be read, or was measured otherwise, is left away."""
+    """The other evaluations of the same recordings by the same network, beside `folder`.
+    Evaluations that cannot be read or were measured in another way are left out."""
     found: dict[str, Run | None] = {tabulate.way(settings): None}
     for other in sorted(path.parent for path in folder.parent.glob("*/metrics.json")):
         try:
@@ -133,14 +133,14 @@ def beside(folder: Path, settings: Mapping[str, Any]) -> list[Run]:
 def write(path: Path, title: str, runs: list[Run]) -> None:
     """Write the page of some runs of the same recordings, whole or not at all.
 
-    The first run gives the sequences and the curves of network and filter; of the others there are
+    The first run gives the sequences and the curves of network and filter; the others have only
     paths, errors and figures. At most `len(COLOURS)` runs are shown.
     """
     write_text(path, render(title, runs[: len(colours.COLOURS)]))
 
 
 def render(title: str, runs: list[Run]) -> str:
-    """The page as text. It loads nothing, and its policy forbids it to."""
+    """The page as text. It loads nothing, and its content security policy forbids loading."""
     sequences = [seen.name for seen in runs[0].views]
     rows = max(FEWEST_ROWS, ROWS // (len(runs) * len(sequences)))
     document, names = _document(runs, [_held(run, sequences, rows) for run in runs])
@@ -173,7 +173,8 @@ def _file(name: str) -> str:
 
 
 def _held(run: Run, sequences: list[str], rows: int) -> list[Columns]:
-    """The columns of each sequence, of one set of names; a row of NaN where the run lacks it."""
+    """The columns of each sequence, all with the same names; a row of NaN if the run lacks the
+    sequence."""
     found = {seen.name: columns(seen, rows) for seen in run.views}
     names = dict.fromkeys(name for own in found.values() for name in own)
     held = []
@@ -202,7 +203,7 @@ def columns(seen: View, rows: int) -> Columns:
             found |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(colours.AXES)}
     found = {name: values[::step] for name, values in found.items()}
     if len(seen.passed):
-        # In the row that is nearest in time: a row without a waypoint is NaN.
+        # A waypoint is in the row that is nearest in time; other rows are NaN.
         rows = np.abs(found["time"][:, None] - seen.waypoints.time).argmin(0)
         x, y = seen.waypoints.position.T
         tapped = {"waypoint_x": x, "waypoint_y": y, "waypoint_error": seen.errors}
@@ -210,7 +211,7 @@ def columns(seen: View, rows: int) -> Columns:
             found[name] = np.full(len(found["time"]), np.nan)
             found[name][rows] = values
     if np.isfinite(nis := seen.filtered.nis).any():
-        # The largest of each `step` rows: a thinned curve keeps its peaks.
+        # The largest of each `step` rows is used, so that a thinned curve keeps its peaks.
         peaks = np.full(-(-len(nis) // step) * step, -np.inf)
         peaks[: len(nis)] = np.where(np.isnan(nis), -np.inf, nis)
         largest = peaks.reshape(-1, step).max(axis=1)
@@ -219,7 +220,7 @@ def columns(seen: View, rows: int) -> Columns:
 
 
 def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
-    """Corners of what the map shows of a sequence: the paths of all runs, and the ellipses of the
+    """Corners of the map of a sequence: they enclose the paths of all runs, and the ellipses of the
     first."""
     views = [seen for run in runs for seen in run.views if seen.name == sequence]
     variance = np.diagonal(views[0].filtered.covariance, axis1=1, axis2=2)[:, :2]
@@ -240,16 +241,16 @@ def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
 
 
 class Sources(NamedTuple):
-    """What the figures draw; `page.js` puts the columns of another sequence in their place."""
+    """The sources of the figures. `page.js` replaces their columns by those of another sequence."""
 
     paths: list[ColumnDataSource]
-    """Of each run; the first has the curves of network and filter too."""
+    """The paths of each run; the first also has the curves of network and filter."""
     marks: ColumnDataSource
     """A row for each run, at the time of the slider."""
     starts: ColumnDataSource
-    """Where each run begins."""
+    """The start of each run."""
     corners: ColumnDataSource
-    """Of the map."""
+    """Corners of the map."""
 
 
 def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, list[str]]:
@@ -271,7 +272,7 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
         (path, run.name, own) for path, run, own in zip(sources.paths, runs, palette, strict=True)
     ]
     figures: dict[str, Any] = {"map": _draw_map(drawn, sources, known, tapped)}
-    label_of_error = "error" if len(runs) == 1 else ""  # of several the map names the colours
+    label_of_error = "error" if len(runs) == 1 else ""  # for several runs the map names the colours
     errors = [(path, "error", label_of_error, colour) for path, _, colour in drawn if known]
     label = "error (m)" if known or tapped else "3σ (m)"
     strips = [_draw_strip(sources, times, label, errors, band=True, tapped=tapped)]
@@ -296,7 +297,7 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
         document.add_root(root)
     drawings = [figures["map"], *strips]
     for place, line in enumerate(figures["map"].select(name="x")):
-        # What the legend of the map hides is hidden everywhere.
+        # A run that is hidden in the legend of the map is hidden everywhere.
         for drawing in drawings[1:]:
             for other in drawing.select(name="error"):
                 if other.data_source is sources.paths[place]:
@@ -316,7 +317,7 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
 def _draw_map(
     drawn: list[tuple[Any, str, str]], sources: Sources, known: bool, tapped: bool
 ) -> new_figure:
-    """Plan view, both axes to the same scale. `drawn` is source, name and colour of each run. Where
+    """Plan view, both axes to the same scale. `drawn` is source, name and colour of each run. If
     there are waypoints, lines join them to the first run at their times."""
     plan = new_figure(
         height=MAP_HEIGHT,
@@ -327,7 +328,7 @@ def _draw_map(
         x_axis_label="x (m)",
         y_axis_label="y (m)",
     )
-    # What the slider moves does not move the map's frame.
+    # Items that the slider moves do not change the map's frame.
     corners = plan.scatter("x", "y", source=sources.corners, alpha=0.0)
     plan.x_range, plan.y_range = DataRange1d(renderers=[corners]), DataRange1d(renderers=[corners])
     if known:
@@ -364,9 +365,9 @@ def _draw_strip(
     tapped: bool = False,
     levels: tuple[tuple[str, float, str], ...] = (),
 ) -> new_figure:
-    """Curves over time: of each its source, column, label and colour. A `band` is the filter's 3σ
-    behind errors, to which those at waypoints (`tapped`) belong; `levels` are marked on an axis of
-    powers."""
+    """Curves over time, each with its source, column, label and colour. A `band` is the filter's 3σ
+    behind errors, which include those at waypoints (`tapped`); `levels` are marked on a logarithmic
+    axis."""
     strip = new_figure(
         height=STRIP_HEIGHT,
         sizing_mode="stretch_width",
@@ -395,7 +396,7 @@ def _draw_strip(
 
 
 def _finish(figure: new_figure, grid_x: bool = False) -> new_figure:
-    """Dark text on white, a light grid, a legend that hides what is clicked."""
+    """Style a figure: dark text on white, a light grid, and a legend that hides a clicked curve."""
     figure.min_border_left = LEFT
     figure.toolbar.logo = None
     figure.outline_line_color = None

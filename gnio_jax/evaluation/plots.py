@@ -1,6 +1,6 @@
 """Pictures of results. Every function returns a `Figure` and keeps no state.
 
-Matplotlib is imported here, so import this module only where something is drawn.
+Matplotlib is imported here, so import this module only where pictures are drawn.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ START: dict[str, Any] = {"marker": "o", "ls": "", "mfc": "white", "ms": 8, "mew"
 END: dict[str, Any] = {"marker": "s", "ls": "", "ms": 7}
 TAP: dict[str, Any] = {"marker": "x", "ls": "", "ms": 7, "mew": 1.8}
 MARKERS = "os^Dv"
-"""Where there are more rows than colours, the next marker."""
+"""Markers; the next one is used when there are more rows than colours."""
 ELLIPSES = 4
-"""Outlines on a map, at even times, the last at the end."""
+"""Number of outlines on a map, at equal times, the last at the end."""
 TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
-"""Errors in the title of a sequence."""
+"""Errors that the title of a sequence names."""
 
 
 # --- what is drawn of an estimate
 
 
 class View(NamedTuple):
-    """A trajectory and its reference in one frame, and what network and filter gave beside it.
+    """A trajectory and its reference in one frame, with the curves of network and filter.
 
-    There are n rows, one for each row of the estimate. What is not known is NaN.
+    There are n rows, one for each row of the estimate. Unknown values are NaN.
     """
 
     name: str
     time: Float[np.ndarray, "n"]
-    """From the start, s."""
+    """Time from the start, s."""
     position: Float[np.ndarray, "n 3"]
-    """Of the estimate, m."""
+    """Position of the estimate, m."""
     reference: Float[np.ndarray, "n 3"]
-    """Position, m."""
+    """Position of the reference, m."""
     network: Displacements
     filtered: Filtered
     waypoints: Waypoints
-    """At times from the start; none where the sequence has poses."""
+    """Waypoints, at times from the start; none if the sequence has poses."""
     passed: Float[np.ndarray, "k 2"]
-    """Where the estimate is at the times of the waypoints, m."""
+    """Horizontal position of the estimate at the times of the waypoints, m."""
 
     @property
     def step(self) -> float:
@@ -79,7 +79,7 @@ class View(NamedTuple):
 
     @property
     def errors(self) -> Float[np.ndarray, "_"]:
-        """Horizontal, where there is a reference or at the waypoints, m."""
+        """Horizontal errors where there is a reference, or at the waypoints, m."""
         if not self.known:
             return np.linalg.norm(self.passed - self.waypoints.position, axis=1)
         error = (self.position - self.reference)[finite_rows(self.reference), :2]
@@ -87,8 +87,8 @@ class View(NamedTuple):
 
 
 def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
-    """An estimate in the frame of its reference; without an `alignment` the reference is moved so
-    that it starts as the estimate does."""
+    """An estimate in the frame of its reference; without an `alignment` the reference is moved to
+    the start of the estimate."""
     seen = in_one_frame(estimate, alignment)
     rows = len(seen.trajectory.time)
     none, blank = np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan)
@@ -115,7 +115,7 @@ class Ellipses(NamedTuple):
     minor: Float[np.ndarray, "n"]
     """Semi-axis, m."""
     angle: Float[np.ndarray, "n"]
-    """Of the major axis, from x towards y, rad."""
+    """Angle of the major axis, from x towards y, rad."""
 
 
 def ellipses(covariance: Float[np.ndarray, "n 3 3"]) -> Ellipses:
@@ -142,8 +142,9 @@ def speed(position: Float[np.ndarray, "n 3"], step: float) -> Float[np.ndarray, 
 
 
 def sequence(seen: View, title: str = "") -> Figure:
-    """Map on the left; on the right, over time, the errors with the filter's 3σ, the speed, and the
-    gate of the network or else which displacements the filter used."""
+    """A picture with a map on the left and curves over time on the right: the errors with the
+    filter's 3σ, the speed, and the gate of the network, or if there is none, which displacements
+    the filter used."""
     strips: list[Callable[[Axes, View], None]] = [_draw_speed]
     if seen.known or np.isfinite(seen.filtered.covariance).any():
         strips = [_draw_error, functools.partial(_draw_error, vertical=True), *strips]
@@ -163,7 +164,7 @@ def sequence(seen: View, title: str = "") -> Figure:
         draw(axes, seen)
         axes.set_xlim(seen.time[0], max(seen.time[-1], seen.time[0] + 1e-3))
         axes.tick_params(labelbottom=draw is strips[-1])
-        # Beside the strip, where it hides nothing.
+        # The legend is beside the curves, where it hides nothing.
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
         finish(axes)
     figure.axes[-1].set_xlabel("time (s)")
@@ -209,7 +210,8 @@ def _draw_map(axes: Axes, seen: View) -> None:
 
 
 def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
-    """Of the position, with the filter's 3σ behind it; without a reference the 3σ alone."""
+    """Draw the error of the position, with the filter's 3σ behind it; without a reference only the
+    3σ."""
     bound, colour, name = ellipses(seen.filtered.covariance).major, colours.BLUE, "horizontal"
     error = np.linalg.norm((seen.position - seen.reference)[:, :2], axis=1)
     if vertical:
@@ -261,8 +263,8 @@ def _draw_accepted(axes: Axes, seen: View) -> None:
 
 
 def error_cdf(views: list[View], report: Report) -> Figure:
-    """Distribution of errors over the set: of every sample's horizontal position, and of the
-    sequences' ATE beside the reference rows. Of a sequence with waypoints they are its errors there
+    """Distributions of errors over the set: of every sample's horizontal position, and of the
+    sequences' ATE with the reference rows. For a sequence with waypoints these are its errors there
     and their root mean square."""
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -301,17 +303,18 @@ def error_cdf(views: list[View], report: Report) -> Figure:
 
 
 def _step(axes: Axes, values: Float[np.ndarray, "k"], **style: Any) -> None:
-    """Cumulative distribution. A value that is not finite has diverged: it counts, and the line
-    ends below 1."""
+    """Draw a cumulative distribution. A value that is not finite has diverged: it counts, so the
+    line ends below 1."""
     x = np.sort(values[np.isfinite(values)])
     share = np.arange(len(x) + 1) / len(values)
     axes.step(np.concatenate([[0.0], x]), share, where="post", **style)
 
 
 def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
-    """A metric of every sequence with every row: the mean over seeds a dot, each seed a fainter
-    stroke, rows one below the other. A line per sequence, sorted by the first row; beside its name
-    the person or session it belongs to, and a mark where a row diverged, which then has no dot."""
+    """A metric of every sequence for every row. A dot is the mean over seeds, and a fainter stroke
+    is one seed; rows are one below the other. Each sequence has a line, sorted by the first row,
+    with its name and its person or session. A mark shows that a row diverged; this row then has no
+    dot."""
     seeds = [[report.scores for report in row] for row in rows.values()]
     lost = [statistics.lost(row) for row in seeds]
     tables = [statistics.values(row, metric) for row in seeds]
@@ -337,7 +340,8 @@ def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
         for place, own in zip(places, values, strict=True):
             if len(own) > 1:
                 axes.plot(own, [place] * len(own), "|", ms=8, color=colour, alpha=0.6)
-        # Matplotlib leaves out what begins with an underscore: a space of no width goes before it.
+        # Matplotlib ignores labels that begin with an underscore, so a zero-width space goes before
+        # it.
         text = shown_name(label, 100)
         legend["\u200b" + text if text.startswith("_") else text] = dots
     marked = {name for diverged in lost for name in diverged}
@@ -383,14 +387,14 @@ def save(path: Path, figure: Figure) -> None:
 
 
 def finish(axes: Axes) -> None:
-    """Grid behind the lines, no frame above and to the right."""
+    """Put the grid behind the lines, and remove the frame above and to the right."""
     axes.grid(True, color=GRID, lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def _shade(axes: Axes, time: Float[np.ndarray, "n"], still: Bool[np.ndarray, "n"]) -> None:
-    """Grey where the reference stands still; once in the legend."""
+    """Shade the times at which the reference stands still, with one entry in the legend."""
     for number, (start, stop) in enumerate(spans(still)):
         begin, end = float(time[start]), float(time[stop - 1])
         label = "standing still" if not number else None

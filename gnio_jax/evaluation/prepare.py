@@ -1,4 +1,5 @@
-"""Sequences made ready for an estimator: at the network's rate, in whole strides, with a start."""
+"""Preparation of sequences for an estimator: at the network's rate, in whole strides, with a
+start."""
 
 from __future__ import annotations
 
@@ -29,10 +30,10 @@ from gnio_jax.types import Sequence, Waypoints
 from gnio_jax.windows import true_displacement, window_starts
 
 REFERENCE_BIAS_SECONDS = 10.0
-"""How long `gyro_bias="reference"` looks at the reference, s."""
+"""Time of the reference that `gyro_bias="reference"` uses, s."""
 ROUGH_START = 0.4
-"""Standard deviation of the first velocity above which a static start is only rough, m/s (ours):
-nobody stands still there."""
+"""Standard deviation of the first velocity above which a static start is inaccurate, m/s (ours),
+because the person does not stand still."""
 OF_WAYPOINTS = (
     "waypoints, no poses: it starts level, with yaw and position zero, and is compared after one "
     "turn about z and one shift"
@@ -45,7 +46,7 @@ Matrices = Float[np.ndarray, "t 3 3"]
 
 
 class Start(NamedTuple):
-    """Where the filter starts, and how well that is known."""
+    """The start of the filter, and its uncertainty."""
 
     rotation: Float[np.ndarray, "3 3"]
     """Body→world."""
@@ -57,17 +58,17 @@ class Start(NamedTuple):
     """First estimate, rad/s."""
     std: InitialStd
     raw_gyro: bool
-    """Whether neither the phone nor a rest gave a first estimate of the gyro's bias."""
+    """True if neither the phone nor a rest gave a first estimate of the gyro's bias."""
 
 
 class Recording(NamedTuple):
-    """A sequence ready for an estimator: K strides of n samples."""
+    """A sequence prepared for an estimator: K strides of n samples."""
 
     name: str
     group: str
-    """Person or session: recordings of one are not independent of each other."""
+    """Person or session; recordings of the same one are not independent."""
     placement: str
-    """How the IMU was carried, as its dataset says; empty where that is not known."""
+    """Way of carrying the IMU, as its dataset names it; empty if it is not known."""
     time: Float[np.ndarray, "k1"]
     """Stamps of the start and of the end of each stride, K + 1, s."""
     gyro: Float[np.ndarray, "t 3"]
@@ -78,13 +79,13 @@ class Recording(NamedTuple):
     """Which samples were measured; None: all."""
     start: Start
     attitude: Matrices | None
-    """Body→world at every sample and at the end of the last, K·n + 1, for windows that are not cut
-    inside the filter."""
+    """Body→world at every sample and at the end of the last one, K·n + 1 rows, for windows that are
+    not cut inside the filter."""
     reference: Trajectory
-    """At `time`; NaN where it cannot be trusted."""
+    """The reference at `time`; NaN where it cannot be trusted."""
     displacement: Float[np.ndarray, "m 3"]
-    """Of the reference over each window, a stride apart, m, expressed in the yaw frame of the
-    window's start; NaN where the reference cannot be trusted."""
+    """Displacement of the reference over each window, with a stride between windows, m, expressed
+    in the yaw frame of the window's start; NaN where the reference cannot be trusted."""
     notes: tuple[str, ...]
     """What a reader of the result should know."""
     waypoints: Waypoints | None = None
@@ -109,14 +110,13 @@ def prepare(
 ) -> tuple[list[Recording], dict[str, str]]:
     """Recordings to estimate, and the names of the sequences that are left out with the reason.
 
-    A recording begins at the first sample with a trusted reference; with `from_first`, and where
-    there is no reference, at its first sample. `std` is the filter's initial uncertainty, of which
-    a static start replaces tilt and velocity by what it finds. A sequence with waypoints has no
-    pose to start from, and its start is static whatever `init` is. `raw_gyro_bias` takes the place
-    of the standard deviation of the gyro's bias where neither the phone nor a rest gives a first
-    estimate of it: where `imu_compensated` is "no" and the bias starts from zero. `orientation`
-    is the source of `Recording.attitude`; None makes none. Raises `InputError` for a sequence that
-    lacks what these choices need.
+    A recording begins at the first sample with a trusted reference. With `from_first`, or without a
+    reference, it begins at its first sample. `std` is the filter's initial uncertainty; a static
+    start replaces that of tilt and velocity. A sequence with waypoints has no pose to start from,
+    so its start is always static. `raw_gyro_bias` replaces the standard deviation of the gyro's
+    bias if neither the phone nor a rest gives a first estimate of it: if `imu_compensated` is "no"
+    and the bias starts from zero. `orientation` is the source of `Recording.attitude`; None: there
+    is none. Raises `InputError` for a sequence that lacks what these choices need.
     """
     recordings, left_out = [], {}
     for sequence in sequences:
@@ -173,7 +173,7 @@ def prepare(
 
 
 def measured_rows(sequence: Sequence) -> Int[np.ndarray, "m"]:
-    """Rows of the IMU that were measured, and are no line across a gap."""
+    """Rows of the IMU that were measured, and not interpolated across a gap."""
     mask = sequence.imu_valid
     return np.arange(len(sequence.time)) if mask is None else np.flatnonzero(mask)
 
@@ -181,7 +181,7 @@ def measured_rows(sequence: Sequence) -> Int[np.ndarray, "m"]:
 def _check(
     sequence: Sequence, init: Init, gyro_bias: BiasSource, orientation: Orientation | None
 ) -> None:
-    """Raise `InputError` where the sequence lacks what the choices need."""
+    """Raise `InputError` if the sequence lacks what the choices need."""
     if orientation == "device" and sequence.device_orientation is None:
         remedy = "give --orientation filter or reference"
         raise InputError(sequence.name, "has no device orientation", remedy)
@@ -213,7 +213,7 @@ def _start(
     std: InitialStd,
     init: Init,
 ) -> tuple[Start, str]:
-    """The start, and what a reader should know of it."""
+    """The start, and a note about it."""
     if init == "reference":
         velocity = sequence.velocity[0]
         velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
@@ -230,7 +230,7 @@ def _start(
     start = Start(np.asarray(level.rotation), np.zeros(3), np.zeros(3), gyro_bias, std, False)
     if velocity_std <= ROUGH_START:
         return start, ""
-    tilt = float(f"{np.degrees(tilt_std):.1g}")  # of many sequences few different notes
+    tilt = float(f"{np.degrees(tilt_std):.1g}")  # rounded, so that few different notes are made
     sigma = f"one sigma: velocity {velocity_std:.1f} m/s, tilt {tilt:g}°"
     return start, f"start: it moves, so the start is uncertain ({sigma})"
 
@@ -238,11 +238,11 @@ def _start(
 def _gyro_bias(
     sequence: Sequence, measured: Int[np.ndarray, "m"], rate: float, source: BiasSource
 ) -> tuple[Float[np.ndarray, "3"], str]:
-    """First estimate of the gyro bias, rad/s, and where it is from."""
+    """First estimate of the gyro bias, rad/s, and its origin."""
     if source == "zero":
         return np.zeros(3), ""
     if source == "rest":
-        # A line across a gap is as quiet as a table: what was not measured is no rest.
+        # Samples interpolated across a gap look like rest, so only measured samples count.
         gyro, accel = np.full((2, len(sequence.time), 3), np.nan)
         gyro[measured], accel[measured] = sequence.gyro[measured], sequence.accel[measured]
         rest = rest_at_start(gyro, accel, 1.0 / rate)
@@ -264,20 +264,20 @@ def _attitude(sequence: Sequence, start: Start, rate: float, source: Orientation
     """Body→world at every sample.
 
     `filter` is the gyro integrated from the start; `device` is the device's own estimate, turned
-    about z to the yaw of the start. Where reference or device are missing, the gyro carries on from
-    the last known attitude. Raises `InputError` where they are missing at the start.
+    about z to the yaw of the start. Where reference or device are missing, the gyro is integrated
+    from the last known attitude. Raises `InputError` if they are missing at the start.
     """
     turns = Rotation.from_rotvec((sequence.gyro[:-1] - start.gyro_bias) / rate)
     integrated = start.rotation @ cumulative_rotation(turns).as_matrix()
     if source == "filter":
         return integrated
     given = sequence.orientation if source == "reference" else sequence.device_orientation
-    assert given is not None  # `_check` has seen it
+    assert given is not None  # `_check` ensures it
     known = finite_rows(given) & (sequence.valid if source == "reference" else True)
     if not known[0]:
         problem = f"has no {source} orientation at its start"
         raise InputError(sequence.name, problem, "give --orientation filter")
-    # What is not trusted may hold anything, also what is no rotation.
+    # Untrusted rows may have any values, even ones that are no rotation.
     rotation = matrix_from_quaternion(np.where(known[:, None], given, np.nan))
     if source == "device":
         ours, its = yaw_rotation(np.stack([start.rotation, rotation[0]]))

@@ -1,13 +1,10 @@
-"""The results of an evaluation as a folder: what is written, and how it is read back.
+"""The results of an evaluation as a folder: writing and reading.
 
-metrics.json      settings, every metric of every sequence, means, intervals, reference rows
-metrics.csv       a line per sequence, a column per metric
-trajectories/     estimates in TUM format, for evo
-references/       references in TUM format
-waypoints/        references of sequences without poses: t x y
-states/           everything that the estimator gave, for NumPy (docs/tables.md)
-plots/            a picture per sequence, and the distribution of the errors
-report.html       a page with map, curves and a time slider
+metrics.json settings, every metric of every sequence, means, intervals, reference rows metrics.csv
+a line per sequence, a column per metric trajectories/ estimates in TUM format, for evo references/
+references in TUM format waypoints/ references of sequences without poses: t x y states/ all results
+of the estimator, for NumPy (docs/tables.md) plots/ a picture per sequence, and the distribution of
+the errors report.html a page with map, curves and a time slider
 """
 
 from __future__ import annotations
@@ -39,20 +36,20 @@ from gnio_jax.files import file_stem, replacing_folder, write_csv
 from gnio_jax.reporting import Progress, silent
 
 DEFINITIONS = 3
-"""What the figures of metrics.json mean, in its `settings`. Raise it with every change after which
-a file's figures cannot stand beside newer ones: another definition of a metric, of what counts as
-diverged or of a mean, or something in the file that tables need."""
+"""Version of the meaning of the figures of metrics.json, in its `settings`. Raise it with every
+change after which the figures of older files cannot be compared with newer ones: another definition
+of a metric, of divergence or of a mean, or a new field that tables need."""
 PAGE = "report.html"
 REMEDY = "evaluate the run anew with gnio evaluate"
 BESIDE = ("infinite", "reasons", "diverged", "group", "placement", "notes")
-"""What metrics.json has of a sequence besides its metrics."""
+"""Fields of a sequence in metrics.json besides its metrics."""
 
 
 class Report(NamedTuple):
-    """The content of metrics.json, before it is written and after it was read."""
+    """The content of metrics.json."""
 
     settings: dict[str, Any]
-    """What changes the meaning of the figures."""
+    """The settings that define the meaning of the figures."""
     scores: dict[str, Measures]
     """By sequence."""
     reference_rows: dict[str, dict[str, Measures]]
@@ -60,11 +57,11 @@ class Report(NamedTuple):
     groups: dict[str, str]
     """Sequence → person or session."""
     notes: dict[str, list[str]]
-    """Sequence → what a reader should know of its start and of its filter."""
+    """Sequence → notes about its start and its filter."""
     left_out: dict[str, str]
-    """Sequence → why it has no figures."""
+    """Sequence → reason why it has no figures."""
     placements: dict[str, str] = {}
-    """Sequence → how the IMU was carried, where that is known."""
+    """Sequence → way of carrying the IMU, if it is known."""
 
     @property
     def diverged(self) -> list[str]:
@@ -72,7 +69,7 @@ class Report(NamedTuple):
         return [name for name, own in self.scores.items() if own.diverged]
 
     def summary(self, row: str | None = None) -> dict[str, Summary]:
-        """Each metric over the sequences, of this evaluation or of one of its reference rows."""
+        """Each metric over the sequences, for this evaluation or one of its reference rows."""
         scores = self.scores if row is None else self.reference_rows[row]
         metrics = dict.fromkeys(metric for own in scores.values() for metric in own.values)
         return {name: statistics.summarise([scores], name, self.groups) for name in metrics}
@@ -92,9 +89,9 @@ def write(
 ) -> None:
     """Write the folder of an evaluation, whole or not at all.
 
-    Pictures and page are made with `plots`. Those that an earlier evaluation left are made anew in
-    any case: they are neither lost nor of other figures. `trained` is the configuration of the run
-    and `command` how this was called, for the page.
+    Pictures and page are made if `plots` is set. If an earlier evaluation has them, they are always
+    made again, so that they are neither lost nor out of date. `trained` is the configuration of the
+    run and `command` the command line, for the page.
     """
     drawn = plots or (folder / PAGE).exists()
     with replacing_folder(folder) as new:
@@ -127,7 +124,8 @@ def write(
 
 
 def arrays(estimate: Estimate) -> dict[str, Float[np.ndarray, "n ..."]]:
-    """What the estimator gave, as docs/tables.md lists it: a row for each of the trajectory."""
+    """The results of the estimator that docs/tables.md lists: a row for each row of the
+    trajectory."""
     found: dict[str, Any] = estimate.trajectory._asdict()
     if estimate.displacements is not None:
         value, covariance, diagnostics = estimate.displacements
@@ -139,8 +137,8 @@ def arrays(estimate: Estimate) -> dict[str, Float[np.ndarray, "n ..."]]:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """The report as plain values. JSON has no infinity: what is not finite is null, and `infinite`
-    names those metrics of a sequence that are infinite."""
+    """The report as plain values. JSON has no infinity, so values that are not finite are null, and
+    `infinite` names the infinite metrics of a sequence."""
     return {
         "settings": report.settings,
         "sequences": _of_estimates(report),
@@ -154,8 +152,8 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def file_names(names: list[str]) -> list[str]:
-    """A distinct file name for each sequence: its name with anything a file system could mind as
-    `_`."""
+    """A distinct file name for each sequence: its name, with `_` for characters that a file system
+    may refuse."""
     stems: list[str] = []
     for name in names:
         stem = file_stem(name)
@@ -205,9 +203,9 @@ def finite(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read(folder: Path) -> Report:
-    """The figures of an evaluation, as its metrics.json has them.
+    """The figures of an evaluation from its metrics.json.
 
-    Raises `InputError` if the folder holds none, they are damaged, or they were written by a
+    Raises `InputError` if the folder has none, if they are damaged, or if they were written by a
     version whose figures mean something else.
     """
     path = folder / "metrics.json"
@@ -233,7 +231,8 @@ def read(folder: Path) -> Report:
             {name: str(reason) for name, reason in found["left_out"].items()},
             {n: str(own["placement"]) for n, own in sequences.items() if "placement" in own},
         )
-        # What is not as it is written is no report: a text in the place of a number, say.
+        # A file with another structure is no report, for example one with a text in the place of a
+        # number.
         again = {row: _sequences(own) for row, own in report.reference_rows.items()}
         written = _of_estimates(report), again, report.left_out
         if written != (sequences, rows, found["left_out"]):
@@ -251,8 +250,8 @@ def read(folder: Path) -> Report:
 def read_estimates(folder: Path, names: list[str]) -> list[Estimate]:
     """Estimate and reference of each of an evaluation's sequences, at the estimate's stamps.
 
-    `names` are all of them, in the order of its metrics.json. A row that the reference does not
-    know is NaN. The estimate ends where it diverged.
+    `names` has all sequences, in the order of its metrics.json. A row without a reference is NaN.
+    The estimate ends where it diverged.
     """
     found = []
     for name, stem in zip(names, file_names(names), strict=True):
@@ -273,7 +272,7 @@ def read_estimates(folder: Path, names: list[str]) -> list[Estimate]:
 
 
 def _scores(sequences: Mapping[str, Any]) -> dict[str, Measures]:
-    """What `_sequences` was made of."""
+    """The inverse of `_sequences`."""
     scores = {}
     for name, own in sequences.items():
         found = {metric: own[metric] for metric in own if metric not in BESIDE}

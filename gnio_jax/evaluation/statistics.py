@@ -1,8 +1,8 @@
 """Means over sequences and seeds, their intervals, and differences paired by sequence.
 
 Sequences of one person or session are not independent: they form a group, and an interval treats
-the groups as what was drawn. An estimate that diverged leaves every mean and every difference, with
-all its metrics and all seeds, and is counted beside them.
+the groups as the random sample. A sequence whose estimate diverged is left out of every mean and
+every difference, with all its metrics and all seeds, and it is counted separately.
 """
 
 from __future__ import annotations
@@ -27,22 +27,23 @@ class Summary(NamedTuple):
     """One metric over the sequences that have it with every seed."""
 
     mean: float | None
-    """Over the sequences whose estimate diverged with no seed; None without one. Infinite where one
-    of them is (NEES, with a covariance that is not positive definite)."""
+    """Mean over the sequences whose estimate did not diverge with any seed; None if there are none.
+    It is infinite if one of them is (NEES, with a covariance that is not positive definite)."""
     seeds: list[float]
     """The same for each seed."""
     median: float | None
-    """Over all sequences and seeds: of an error, infinite where half of them diverged."""
+    """Median over all sequences and seeds; that of an error is infinite if half of them
+    diverged."""
     interval: Interval | None
     """95 % interval of the mean. That of a share ends at 0 and at 100 %."""
     sequences: int
-    """In the mean."""
+    """Number of sequences in the mean."""
     groups: int
-    """That the sequences of the mean belong to."""
+    """Number of groups to which the sequences of the mean belong."""
     diverged: int
-    """Estimates of `estimates` that diverged."""
+    """Number of `estimates` that diverged."""
     estimates: int
-    """Sequences × seeds."""
+    """Number of sequences × seeds."""
 
     @property
     def std(self) -> float | None:
@@ -57,20 +58,22 @@ class Difference(NamedTuple):
     finite, and with no seed diverged."""
 
     mean: float | None
-    """Of the means over seeds. None without such a sequence, and where it is withheld."""
+    """Difference of the means over seeds. None if there is no such sequence, or if it is
+    withheld."""
     interval: Interval | None
     """95 % interval of the mean."""
     gain: float | None
-    """By how much the row's mean is smaller, %."""
+    """Reduction of the row's mean, %."""
     better: int
-    """Sequences on which the row is nearer to the best value, as a mean over seeds."""
+    """Number of sequences on which the row is nearer to the best value, as a mean over seeds."""
     compared: int
     sequences: int
-    """That either row has with any seed."""
+    """Number of sequences that either row has with any seed."""
     groups: int
-    """That the compared sequences belong to."""
+    """Number of groups to which the compared sequences belong."""
     withheld: bool = False
-    """The row would be better, but a larger share of its estimates diverged: it is not better."""
+    """True if the row would be better, but a larger share of its estimates diverged, so that it
+    does not count as better."""
 
 
 def values(seeds: Sequence[Scores], metric: str) -> dict[str, Float[np.ndarray, "seeds"]]:
@@ -84,7 +87,7 @@ def values(seeds: Sequence[Scores], metric: str) -> dict[str, Float[np.ndarray, 
 
 
 def lost(seeds: Sequence[Scores]) -> dict[str, int]:
-    """Sequence → number of seeds with which its estimate diverged, where there are any."""
+    """Sequence → number of seeds with which its estimate diverged, if there are any."""
     return Counter(name for scores in seeds for name, own in scores.items() if own.diverged)
 
 
@@ -113,12 +116,12 @@ def summarise(seeds: Sequence[Scores], metric: str, groups: Mapping[str, Any]) -
 def interval(values: Float[np.ndarray, "n"], groups: Iterable[Any]) -> Interval | None:
     """95 % interval of the mean of a population of groups, such as people or sessions.
 
-    `groups` holds the group of each value. Groups are taken to be drawn at random, so the standard
+    `groups` has the group of each value. Groups are assumed to be drawn at random, so the standard
     error is the cluster-robust one, sqrt(G / (G − 1) Σ_g (Σ_{i in g} (x_i − x̄))²) / n for G groups
     and n values (Liang and Zeger 1986), and the quantile is Student's t with G − 1 degrees of
-    freedom. It covers the mean as often as it should for groups of like sizes, also for few: a
-    percentile bootstrap over 2, 3, 6 and 10 groups misses it in 50, 25, 15 and 10 % of the cases.
-    None for fewer than two groups, and where a value or the interval is not finite.
+    freedom. For groups of similar sizes it covers the mean with the stated probability, even for
+    few groups: a percentile bootstrap over 2, 3, 6 and 10 groups misses the mean in 50, 25, 15 and
+    10 % of the cases. None for fewer than two groups, and if a value or the interval is not finite.
     """
     members, group = np.unique([str(name) for name in groups], return_inverse=True)
     count = len(members)
@@ -140,8 +143,8 @@ def compare(
     groups: Mapping[str, Any],
     best: float = 0.0,
 ) -> Difference:
-    """How a row differs from another in a metric whose best value is `best`. The rows may have
-    different numbers of seeds."""
+    """The difference of a row from another one in a metric whose best value is `best`. The rows may
+    have different numbers of seeds."""
     of_own, of_other = values(own, metric), values(other, metric)
     diverged = lost(own) | lost(other)
     shared = sorted(
@@ -173,7 +176,7 @@ def compare(
 
 
 def _share_lost(seeds: Sequence[Scores]) -> float:
-    """Of the estimates whose positions have an error, infinite or not, those that diverged."""
+    """Share of diverged estimates among those whose positions have an error, finite or not."""
     scored = [
         own.diverged
         for of in seeds
@@ -188,4 +191,4 @@ class Cell(NamedTuple):
 
     mean: Summary
     difference: Difference | None
-    """To the first row; None for the first itself."""
+    """Difference from the first row; None for the first row itself."""

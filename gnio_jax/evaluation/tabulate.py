@@ -23,17 +23,17 @@ from gnio_jax.files import with_ending, write_csv, write_text
 
 
 class Column(NamedTuple):
-    """How a metric is written."""
+    """The format of a metric."""
 
     heading: str
     unit: str = ""
     digits: int = 2
     best: float = 0.0
-    """The best value there is."""
+    """The best possible value."""
 
     @property
     def title(self) -> str:
-        """Heading, unit, and the best value where that is not 0."""
+        """Heading, unit, and the best value if it is not 0."""
         best = f"best {self.best:g}" if self.best else ""
         remarks = ", ".join(filter(None, (self.unit, best)))
         return f"{self.heading} ({remarks})" if remarks else self.heading
@@ -60,7 +60,7 @@ COLUMNS = {
     "waypoint_rms": Column("waypoint rms", "m"),
 }
 SCREEN = ("ate", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio", "nees_coverage")
-"""What the table on the screen has: it fits into 80 columns. The files hold all metrics."""
+"""Metrics of the table on the screen, which fits into 80 columns. The files have all metrics."""
 WAYPOINT_SCREEN = (
     "path_length",
     "legs",
@@ -69,23 +69,23 @@ WAYPOINT_SCREEN = (
     "leg_error",
     "waypoint_rms",
 )
-"""The same of sequences with waypoints in the place of poses."""
+"""The same for sequences with waypoints instead of poses."""
 MIXED_SCREEN = (*SCREEN[:3], *WAYPOINT_SCREEN[-3:])
-"""The same where a split has both."""
+"""The same for a split with both."""
 TO_WAYPOINTS = "one turn and one shift to the waypoints"
 PARTS = r"[^-_/.: ]*[-_/.: ]+|[^-_/.: ]+"
-"""Of a name, which is broken between them and not inside its words."""
+"""Parts of a name, between which it may be broken across lines."""
 LONGEST_HEADING = 9
-"""Letters; a longer one is broken on the screen."""
+"""Largest number of letters of a heading; a longer one is broken on the screen."""
 DIVERGED = (
-    "∞: the estimate diverged. It counts in medians, with infinite errors and coverages of 0; "
-    "means, intervals and n are in every column of the others alone, so they cannot be compared "
+    "∞: the estimate diverged. It counts in medians, with infinite errors and coverages of 0, "
+    "but means, intervals and n leave it out in every column, so they cannot be compared "
     "with those of another run"
 )
 
 
 def column(metric: str) -> Column:
-    """How any metric is written: a horizontal one as the spatial one."""
+    """The format of any metric; a horizontal one has that of the spatial one."""
     spatial = COLUMNS.get(metric.removesuffix("_2d"))
     if spatial is None:
         return Column(metric, "", 3)
@@ -96,7 +96,7 @@ def column(metric: str) -> Column:
 
 
 def number(value: float | None, digits: int) -> str:
-    """One figure; – where it is not defined, ∞ where the estimate diverged."""
+    """One figure; – if it is not defined, ∞ if the estimate diverged."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -105,7 +105,7 @@ def number(value: float | None, digits: int) -> str:
 
 
 def mean(found: Summary, digits: int) -> str:
-    """Mean over sequences ± standard deviation over seeds, and † with how many diverged."""
+    """Mean over sequences ± standard deviation over seeds, and † with the number that diverged."""
     text = number(found.mean, digits)
     if found.std is not None:
         text += f" ± {number(found.std, digits)}"
@@ -113,14 +113,15 @@ def mean(found: Summary, digits: int) -> str:
 
 
 def difference(found: Difference | None, digits: int) -> str:
-    """Difference, its interval, and over how many sequences if not over all. Nothing of the first
-    row."""
+    """Difference, its interval, and the number of sequences if it is not over all. It is empty for
+    the first row."""
     if found is None:
         return ""
     if found.mean is None:
         return "– ‡" if found.withheld else "–"
     low, high = found.interval or (0.0, 0.0)
-    # As many digits as show two of the interval's half width, at most three more than the mean's.
+    # Enough digits to show two of the interval's half width, but at most three more than the
+    # mean's.
     size = (high - low) / 2 or abs(found.mean)
     needed = 1 - math.floor(math.log10(size)) if size else digits
     digits = min(max(digits, needed), digits + 3)
@@ -172,7 +173,7 @@ def records(
 
 
 def marks(cells: Sequence[Cell]) -> list[str]:
-    """What the marks of a table mean, and how its intervals were made."""
+    """The meaning of the marks of a table, and the way its intervals were computed."""
     means, found = [cell.mean for cell in cells], [c.difference for c in cells if c.difference]
     drawn = " or ".join(map(str, sorted({each.groups for each in found if each.interval})))
     applies = {
@@ -201,7 +202,8 @@ def marks(cells: Sequence[Cell]) -> list[str]:
 
 
 def way(settings: Mapping[str, Any]) -> str:
-    """How trajectories were estimated: the estimator, and what is not as usual."""
+    """The way trajectories were estimated: the estimator, and every choice other than the
+    default."""
     loose = settings.get("coupling") == "loose"
     own_attitude = settings["estimator"] == "imu_only" or settings.get("coupling") == "tight"
     turned, started = settings.get("orientation_source"), settings.get("initial_state", "reference")
@@ -237,15 +239,15 @@ def about(settings: Mapping[str, Any]) -> dict[str, str]:
 
 
 def windows(settings: Mapping[str, Any]) -> str:
-    """What the network sees, from fields of `DataConfig`."""
+    """The network's window and context, from fields of `DataConfig`."""
     text = f"{settings['window_seconds']:g} s at {settings['rate']:g} Hz"
     context = settings["context_seconds"]
     return f"{text}, and {context:g} s before" if context else text
 
 
 def remarks(report: Report) -> list[str]:
-    """What a reader should know of sequences: each note once, with the sequences it is of, what was
-    left out and why, what diverged."""
+    """Notes about sequences: each note once with its sequences, the sequences that were left out
+    with the reason, and those that diverged."""
     of: dict[str, list[str]] = {}
     for name, notes in report.notes.items():
         for note in notes:
@@ -269,7 +271,7 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def write(path: Path, text: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """`path`.md with a text, and `path`.csv with rows, empty where there is no value."""
+    """Write `path`.md with a text, and `path`.csv with rows, empty where there is no value."""
     write_text(with_ending(path, ".md"), text.rstrip() + "\n")
     write_csv(with_ending(path, ".csv"), [[*rows[0]], *([*row.values()] for row in rows)])
 
@@ -278,7 +280,7 @@ def write(path: Path, text: str, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def render(report: Report) -> Group:
-    """The table of an evaluation and what belongs under it, for `rich.console.Console.print`: a row
+    """The table of an evaluation and the lines under it, for `rich.console.Console.print`: a row
     per sequence, then those of the set, then the reference rows."""
     summary = report.summary()
     screen = SCREEN
@@ -289,7 +291,7 @@ def render(report: Report) -> Group:
     grid = Table(title=title, title_style="bold", title_justify="left", box=box.SIMPLE_HEAD)
     grid.add_column("sequence", overflow="fold")  # a name is never cut
     for name in shown:
-        # Short lines. Not as markup, which the console of results does not read.
+        # Lines are short, and are not markup, which the console of results does not read.
         heading, unit, *_ = COLUMNS[name]
         words = heading.removesuffix(f" {unit}") if unit else heading
         if not unit or len(words) > LONGEST_HEADING:
@@ -329,7 +331,8 @@ def render(report: Report) -> Group:
 
 
 class _Name(NamedTuple):
-    """A name in a cell: it is broken between its `PARTS`, as far as these are not too long."""
+    """A name in a cell. It is broken between its `PARTS`, and inside a part only if that is too
+    long."""
 
     text: str
 

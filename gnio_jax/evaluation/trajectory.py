@@ -1,4 +1,4 @@
-"""Trajectories: what they are, how one is aligned with another, and the TUM format of evo."""
+"""Trajectories: their definition, their alignment with each other, and the TUM format of evo."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ Alignment = Literal["origin", "none", "yaw_position", "se3"]
 TUM = "t x y z qx qy qz qw"
 TXY = "t x y"
 SAME_MOMENT = 0.01
-"""s by which stamps of an estimate and of a reference may differ: that of evo."""
+"""Largest difference of matching stamps of an estimate and a reference, s, as in evo."""
 SCATTERED = 100
-"""Steps for each shared stamp, on average, from which on two files are not of one walk (ours)."""
+"""Mean number of steps per shared stamp above which two files are not of the same walk (ours)."""
 NEAR = 0.2
-"""How far beyond the ends of a trajectory a waypoint may lie and count at the end, s (ours). A
-person taps no more exactly, and a trajectory ends with a whole stride."""
+"""Largest time of a waypoint before the start or after the end of a trajectory, s (ours); it then
+counts at that end. A person does not tap more accurately, and a trajectory ends with a whole
+stride."""
 
 
 class Undefined(ValueError):
@@ -57,11 +58,11 @@ class Trajectory(NamedTuple):
 def relative_yaw(estimate: Quaternions, reference: Quaternions) -> Float[np.ndarray, "n"]:
     """Yaw error of attitudes R̂ against R, rad in (−π, π].
 
-    It is the angle ψ that minimises ‖R̂ − R_z(ψ) R‖. With E = R̂ Rᵀ the square of that norm is
-    6 − 2 (cos ψ (E00 + E11) + sin ψ (E10 − E01) + E22), so ψ = atan2(E10 − E01, E00 + E11): the
-    twist of E about z, whatever the attitude of the phone. Between level attitudes it is the
-    difference of their yaws. It is 0 where E is half a turn about a horizontal axis, where every ψ
-    is as near (ours), and NaN where an input is.
+    It is the angle ψ that minimises ‖R̂ − R_z(ψ) R‖. With E = R̂ Rᵀ the square of that norm is 6 −
+    2 (cos ψ (E00 + E11) + sin ψ (E10 − E01) + E22), so ψ = atan2(E10 − E01, E00 + E11): the twist
+    of E about z, whatever the attitude of the phone. Between level attitudes it is the difference
+    of their yaws. It is 0 where E is half a turn about a horizontal axis, where all ψ are equally
+    near (ours), and NaN where an input is NaN.
     """
     (a, b, c, d), (w, x, y, z) = estimate.T, reference.T
     scalar, vertical = a * w + b * x + c * y + d * z, d * w - a * z + c * x - b * y
@@ -73,13 +74,13 @@ def align(
 ) -> Trajectory:
     """The estimate moved into the frame of the reference by one rigid motion.
 
-    The motion is fitted to the rows that both trajectories know. `origin` matches position and yaw
-    of the first of them, which is what a user of odometry knows. `yaw_position` is the
-    least-squares motion of four degrees of freedom, which inertial odometry cannot observe. `se3`
-    is that of all six, without scale (Horn/Kabsch, as evo). `none` changes nothing. To waypoints,
-    whatever `how` is, the estimate is turned about z and shifted horizontally so that it is nearest
-    to them at their times, in least squares. Raises `Undefined` if there is no such row, or fewer
-    than three for `se3` or two waypoints.
+    The motion is fitted to the rows that are known in both trajectories. `origin` matches position
+    and yaw of the first of these rows, which a user of odometry knows. `yaw_position` is the
+    least-squares motion of the four degrees of freedom that inertial odometry cannot observe. `se3`
+    is that of all six, without scale (Horn/Kabsch, as evo). `none` changes nothing. For waypoints,
+    and any `how`, the estimate is turned about z and shifted horizontally so that it is nearest to
+    them at their times, in least squares. Raises `Undefined` if there is no such row, or fewer than
+    three for `se3` or two waypoints.
     """
     if isinstance(reference, Waypoints):
         passed = positions_at(estimate, reference.time)
@@ -114,8 +115,8 @@ def align(
 
 
 def positions_at(path: Trajectory, stamps: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 2"]:
-    """Horizontal positions at moments, on straight lines between the rows, m. NaN beside a row that
-    is not known and at moments further than `NEAR` from the trajectory."""
+    """Horizontal positions at given times, on straight lines between the rows, m. NaN next to an
+    unknown row and at times further than `NEAR` from the trajectory."""
     x, y = (np.interp(stamps, path.time, axis) for axis in path.position[:, :2].T)
     within = (stamps >= path.time[0] - NEAR) & (stamps <= path.time[-1] + NEAR)
     return np.where(within[:, None], np.stack([x, y], 1), np.nan)
@@ -124,8 +125,8 @@ def positions_at(path: Trajectory, stamps: Float[np.ndarray, "k"]) -> Float[np.n
 def _best_turn(
     source: Float[np.ndarray, "k _"], target: Float[np.ndarray, "k _"]
 ) -> Float[np.ndarray, "3 3"]:
-    """The turn about z that brings centred points nearest to others, in least squares; none where
-    all of either are one place."""
+    """The turn about z that brings centred points nearest to others, in least squares; the identity
+    if all points of either set are the same."""
     sine = source[:, 0] @ target[:, 1] - source[:, 1] @ target[:, 0]
     cosine = source[:, 0] @ target[:, 0] + source[:, 1] @ target[:, 1]
     return rotation_z(np.arctan2(sine, cosine))
@@ -137,7 +138,7 @@ def _moved(
     source: Float[np.ndarray, "3"],
     target: Float[np.ndarray, "3"],
 ) -> Trajectory:
-    """The trajectory turned about `source`, which comes to `target`."""
+    """The trajectory turned about `source`, which is moved to `target`."""
     return Trajectory(
         estimate.time,
         (estimate.position - source) @ turn.T + target,
@@ -148,13 +149,13 @@ def _moved(
 def paired(
     estimate: Trajectory, reference: Trajectory, most: float = SAME_MOMENT
 ) -> tuple[Trajectory, Trajectory]:
-    """Both at the stamps that they share, to `most` s: each pose of the reference with the nearest
-    one of the estimate, as evo matches them.
+    """Both trajectories at the stamps that they share, to `most` s: each pose of the reference with
+    the nearest one of the estimate, as evo matches them.
 
-    The rows are a median step of the shared stamps apart, or so many times less as no two of them
-    fall in one row. Where the reference has none it is NaN, and the estimate stays where it was: it
-    counts nowhere. Raises `Undefined` for fewer than two shared stamps, or where they are scattered
-    over more than a hundred times as many rows.
+    The step of the rows is the median step of the shared stamps, halved until no two stamps fall in
+    one row. Rows without a shared stamp are ignored: the reference is NaN there, and the estimate
+    keeps its last pose. Raises `Undefined` for fewer than two shared stamps, or where they are
+    scattered over more than a hundred times as many rows.
     """
     if len(reference.time) < 2:
         raise Undefined("the reference has a single pose")
@@ -187,7 +188,7 @@ def paired(
 def in_frame_of(
     path: Trajectory, other: Trajectory | Waypoints, how: Alignment = "origin"
 ) -> Trajectory:
-    """`align`, to look at a trajectory beside a reference: `path` as it is where that is
+    """`align`, for drawing a trajectory with a reference: `path` is unchanged if alignment is
     impossible."""
     try:
         return align(path, other, how)
