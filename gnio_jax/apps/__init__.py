@@ -1,1 +1,1 @@
-"""The applications around the method: each uses it, and nothing of it imports them."""
+"""The applications around the method: they use the other packages, which do not import them."""

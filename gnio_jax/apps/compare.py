@@ -1,6 +1,6 @@
-"""Runs side by side: what a change has changed, sequence by sequence, and how sure that is.
+"""Comparison of runs: the effect of a change, sequence by sequence, with its uncertainty.
 
-find (the evaluations that the rows name) → check → make what is missing → compare → text
+    find (the evaluations that the rows name) → check → make missing ones → compare → text
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ USUAL = (
     *("ate", "rpe_1s", "yaw_rmse", "path_length_ratio"),
     *("leg_ratio", "leg_error", "waypoint_rms", "nis", "nees"),
 )
-"""Metrics that are compared where none are named."""
+"""Metrics that are compared if none are named."""
 HEADER = ("metric", "row", "mean", "difference (95 %)", "better in")
 SUMMED = "integrate"
 """The estimator that has no filter."""
 SEED = re.compile(r"_s(\d+)(?=(_calibrated)?$)")
-"""In the name of a run."""
+"""Pattern of the seed in the name of a run."""
 
 
 class Source(NamedTuple):
-    """An evaluation of a row: one that is there, or that of a run."""
+    """An evaluation of a row: an existing one, or that of a run."""
 
     path: Path
-    """As it was named."""
+    """Path, as the user named it."""
     run: Path
     folder: Path
     identity: dict[str, Any]
-    """Of `kept.IDENTITY`."""
+    """Values of the settings `kept.IDENTITY`."""
     found: Report | kept.Kept
-    """The figures of an evaluation that is named; of a run, how it is evaluated."""
+    """The figures of a named evaluation, or for a run its requested evaluation."""
 
 
 class Row(NamedTuple):
@@ -50,16 +50,16 @@ class Row(NamedTuple):
 
     label: str
     runs: list[str]
-    """Their names."""
+    """Names of the seeds' runs."""
     reports: list[Report]
 
     @property
     def way(self) -> str:
-        """How its trajectories are estimated."""
+        """The way its trajectories are estimated."""
         return " and ".join(dict.fromkeys(tabulate.way(each.settings) for each in self.reports))
 
     def recordings(self, metric: str | None = None) -> set[str]:
-        """Those that all seeds have, also with a value of a metric."""
+        """Recordings that all seeds have, and for which the metric, if given, has a value."""
         seeds = [each.scores for each in self.reports]
         if metric is not None:
             return set(statistics.values(seeds, metric))
@@ -67,7 +67,7 @@ class Row(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What a comparison shows."""
+    """The result of a comparison."""
 
     rows: list[Row]
     cells: dict[str, list[Cell]]
@@ -80,8 +80,7 @@ def compare(
     """Read the rows' evaluations, make those that are missing, and compare them.
 
     `workers` processes read recordings that are slow to read. Raises `InputError` for rows that
-    cannot be compared and metrics that none of them has, before it evaluates where that can be
-    known.
+    cannot be compared and metrics that none of them has, if possible before it evaluates.
     """
     reporter = reporter or Lines()
     if config.metrics == ():
@@ -125,12 +124,12 @@ def compare(
 
 
 def find(word: str) -> list[Path]:
-    """The runs, or folders of evaluations, that `word` names: itself, or the seeds of it.
+    """The runs, or folders of evaluations, that `word` names: itself, or its seeds.
 
     A name without a seed stands for all its seeds, in their order: `runs/gnio` for `runs/gnio_s0`,
     `runs/gnio_s1` and so on, `runs/gnio_calibrated` for `runs/gnio_s0_calibrated` and so on. Raises
-    `InputError` where there is nothing, where some seeds have such a path and others do not, and
-    where two have the same number.
+    `InputError` if there is nothing, if some seeds have such a path and others do not, or if two
+    have the same number.
     """
     path = Path(word)
     if path.exists():
@@ -158,7 +157,8 @@ def find(word: str) -> list[Path]:
 
 
 def _source(path: Path, config: CompareConfig) -> Source:
-    """The evaluation of a run with all options as by default, or the one that is named itself."""
+    """The evaluation of a run with all options at their defaults, or the evaluation that is
+    named."""
     if (path / "config.yaml").is_file():
         how = {"split": config.split, "estimator": config.estimator, "plots": False}
         asked = kept.look(EvaluateConfig(str(path), data_root=config.data_root, **how))
@@ -173,8 +173,8 @@ def _source(path: Path, config: CompareConfig) -> Source:
 
 
 def _check_sources(sources: list[Source]) -> None:
-    """Raise `InputError` where an evaluation stands twice, and where rows are of other recordings
-    or measured in another way."""
+    """Raise `InputError` if an evaluation is named twice, or if rows are of different recordings or
+    measured in different ways."""
     taken: dict[Path, Path] = {}
     first = sources[0]
     for source in sources:
@@ -198,8 +198,8 @@ def _check_sources(sources: list[Source]) -> None:
 
 
 def _check_recordings(folders: list[Path], reports: list[Report]) -> None:
-    """Raise `InputError` where recordings of one name have other lengths, or belong to different
-    people or sessions: the seeds of a row are compared too."""
+    """Raise `InputError` if recordings of one name have different lengths, or belong to different
+    people or sessions. The seeds of a row are checked too."""
     known: dict[str, tuple[Path, str, float]] = {}
     for folder, report in zip(folders, reports, strict=True):
         for name, group in report.groups.items():
@@ -215,7 +215,8 @@ def _check_recordings(folders: list[Path], reports: list[Report]) -> None:
 
 
 def _labels(words: tuple[str, ...]) -> list[str]:
-    """The rows' names without the folders that all begin with, and those that all end with."""
+    """The rows' names without the folders that are common to all at the beginning and at the
+    end."""
     paths = [Path(os.path.abspath(word)) for word in words]
     common = os.path.commonpath([path.parent for path in paths])
     parts = [path.relative_to(common).parts for path in paths]
@@ -228,7 +229,7 @@ def _labels(words: tuple[str, ...]) -> list[str]:
 
 
 def title(found: Comparison) -> str:
-    """Recordings, how the trajectories are estimated, and the first row."""
+    """Recordings, the way the trajectories are estimated, and the first row."""
     ways, settings = {row.way for row in found.rows}, found.rows[0].reports[0].settings
     how = f", {ways.pop()}" if len(ways) == 1 else ""
     head = f"{settings['dataset']} {settings['split']}{how}"
@@ -236,8 +237,8 @@ def title(found: Comparison) -> str:
 
 
 def lines(found: Comparison) -> list[list[str]]:
-    """The cells of `HEADER`: each metric's rows one below the other. Means that are not over the
-    same recordings say over how many they are."""
+    """The cells of `HEADER`: each metric's rows one below the other. Means over different
+    recordings state their number."""
     table = []
     for metric, cells in found.cells.items():
         column = tabulate.column(metric)
@@ -256,7 +257,7 @@ def lines(found: Comparison) -> list[list[str]]:
 
 
 def explanations(found: Comparison) -> list[str]:
-    """What a reader must know of the figures."""
+    """Sentences that explain the figures."""
     rows, cells = found.rows, [cell for of in found.cells.values() for cell in of]
     remarks = ["There is one seed of each run, so the variation between seeds is not known."]
     if any(len(row.runs) > 1 for row in rows):
@@ -284,7 +285,8 @@ def explanations(found: Comparison) -> list[str]:
 
 
 def filter_options(found: Comparison) -> list[str]:
-    """Names of the filter's options in which a row differs from the first, where both have one."""
+    """Names of the filter's options in which a row differs from the first, if both have a
+    filter."""
     first, *others = (
         [each.settings["filter"] for each in row.reports if each.settings["estimator"] != SUMMED]
         for row in found.rows
@@ -294,7 +296,7 @@ def filter_options(found: Comparison) -> list[str]:
 
 
 def write(path: Path, found: Comparison) -> None:
-    """`path`.md, `path`.csv and `path`.png."""
+    """Write `path`.md, `path`.csv and `path`.png."""
     from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
 
     text = f"{title(found)}\n\n{tabulate.markdown(HEADER, lines(found))}\n"

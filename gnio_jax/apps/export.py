@@ -26,7 +26,7 @@ from gnio_jax.numerics import rotations, turns_between
 SUFFIXES = {".tum": "tum", ".txt": "tum", ".csv": "csv", ".mcap": "mcap"}
 FORMATS = tuple(dict.fromkeys(SUFFIXES.values()))
 LAST_STAMP = 2.0**31
-"""s, builtin_interfaces/Time."""
+"""Largest stamp of builtin_interfaces/Time, s."""
 WORLD, BODY = "odom", "imu"
 TOPICS = {
     "/odometry": "nav_msgs/msg/Odometry",
@@ -43,8 +43,8 @@ def export(
 ) -> int:
     """Write a trajectory, whole or not at all, and return its number of poses.
 
-    Rows that are not finite are left out. `kind` is one of `FORMATS`; None takes that of the
-    suffix. `covariance` is that of the positions, m² (mcap). Raises `InputError`.
+    Rows that are not finite are left out. `kind` is one of `FORMATS`; None: the suffix decides.
+    `covariance` is that of the positions, m² (mcap). Raises `InputError`.
     """
     kind = kind or SUFFIXES.get(path.suffix.lower())
     if kind not in FORMATS:
@@ -71,8 +71,8 @@ def export(
 
 
 def check(where: object, kind: str, time: Float[np.ndarray, "n"]) -> None:
-    """Raise `InputError`, before the work, for a format whose packages are missing or that cannot
-    hold these stamps, s."""
+    """Raise `InputError`, before any work, for a format whose packages are missing or that cannot
+    have these stamps, s."""
     if kind != "mcap":
         return
     require_packages(where, "bags", "mcap", "rosbags")
@@ -107,8 +107,8 @@ def _write_mcap(
 def _messages(
     poses: Trajectory, covariance: Float[np.ndarray, "n 3 3"] | None, types: dict[str, Any]
 ) -> Iterator[tuple[str, int, Any]]:
-    """Topic, stamp (ns) and message: the path, then odometry and transform of each pose, in
-    order. Zeros stand for a covariance that is not known (ours)."""
+    """Topic, stamp (ns) and message: the path, then odometry and transform of each pose, in order.
+    An unknown covariance is zero (ours)."""
 
     def make(name: str, *fields: Any) -> Any:
         package, _, message = name.partition("/")
@@ -150,7 +150,7 @@ def _messages(
 def _body_motion(
     poses: Trajectory,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Velocity (m/s) and angular rate (rad/s) in the body, by differences of the poses."""
+    """Velocity (m/s) and angular rate (rad/s) in the body frame, from differences of the poses."""
     count = len(poses.time)
     if count < 2:
         return np.zeros((count, 3)), np.zeros((count, 3))

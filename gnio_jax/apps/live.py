@@ -2,8 +2,8 @@
 
     lines, datagrams or a recording → samples with both sensors → rate and units → tracker → path
 
-A stream says nothing of itself. Its rate and the unit of its accelerometer are measured over its
-first second, in which the device must lie still anyway.
+A stream does not describe itself. Its rate and the unit of its accelerometer are measured over its
+first second, in which the device must be still in any case.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 # --- samples
 
 LONGEST_LINE = 4096
-"""Characters; what is longer is no sample."""
+"""Largest number of characters of a sample."""
 MISSING = (math.nan, math.nan, math.nan)
-"""Of a sensor that was not read."""
+"""Values of a sensor that was not read."""
 
 
 class Sample(NamedTuple):
-    """Raw, in the body frame. A value that is missing is NaN."""
+    """A sample, raw, in the body frame. A missing value is NaN."""
 
     time: float
     """s."""
@@ -65,17 +65,18 @@ class Sample(NamedTuple):
 
 
 Units = tuple[str, str]
-"""Of gyro and accelerometer, by the names that an import knows."""
+"""Units of gyro and accelerometer, by the names that an import knows."""
 SI: Units = ("rad/s", "m/s2")
 
 
 def parse_line(line: str, stated: Units = SI) -> Sample | None:
-    """The sample of a line, whose units are `stated`, or None where it is no sample.
+    """The sample of a line with the units `stated`, or None if it is no sample.
 
-    Two forms: seven numbers `time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z`, separated by
-    commas, semicolons, tabs or blanks, an empty one missing; or a JSON object with `time`, `gyro`
-    and `accel`, a null missing, or one sensor alone. A line without a time, with too many numbers,
-    or with rates or accelerations that no phone measures is no sample.
+    There are two forms. One is seven numbers `time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z`,
+    separated by commas, semicolons, tabs or blanks; an empty cell is a missing value. The other is
+    a JSON object with `time`, `gyro` and `accel`, or with one sensor alone; null is a missing
+    value. A line without a time, with too many numbers, or with rates or accelerations beyond the
+    range of a phone is no sample.
     """
     line = line.strip()
     if not line or len(line) > LONGEST_LINE:
@@ -106,7 +107,7 @@ def parse_line(line: str, stated: Units = SI) -> Sample | None:
 
 
 def _number(value: Any) -> float:
-    """Raises `TypeError` for what is neither a number nor null."""
+    """The number, NaN for null. Raises `TypeError` for other values."""
     if value is None:
         return math.nan
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -125,29 +126,30 @@ def _is_missing(values: Iterable[float]) -> bool:
 # --- sensors with rows of their own
 
 LONGEST_WAIT = 0.1
-"""s that a row of one sensor alone waits for what comes late (ours). Two readings of the
+"""Time that a row of one sensor alone waits for late rows, s (ours). Two readings of the
 accelerometer are interpolated if they are no further apart."""
 ROUNDING = 1e-6
-"""s by which differences of stamps may be off: Unix time in float64 has steps of 2e-7 s."""
+"""Error of differences of stamps, s: Unix time in float64 has steps of 2e-7 s."""
 
 
 def paired(samples: Iterable[Sample | None]) -> Iterator[Sample | None]:
-    """Samples at the stamps of the gyro, with the accelerometer interpolated by a line where a row
-    has none: many phones send each sensor in rows of its own.
+    """Samples at the stamps of the gyro, with the accelerometer interpolated linearly where a row
+    has none, because many phones send each sensor in its own rows.
 
-    Rows come through as they are until one is of one sensor alone. From then on they are held for
-    `LONGEST_WAIT` by their stamps and leave in order, so that either sensor may come so late. A row
-    of the gyro gets the accelerometer from the readings around it. A row without the gyro makes no
-    sample, but where the gyro is silent for longer than `LONGEST_WAIT`: time passes. None stands
-    for what is no sample, and for a row that is not later than the last one of the same sensors.
+    Rows pass unchanged until a row has one sensor alone. From then on they are held for
+    `LONGEST_WAIT` by their stamps and are passed on in order, so either sensor may be late by this
+    time. A row of the gyro gets the accelerometer from the readings around it. A row without the
+    gyro makes no sample, except if there is no gyro for longer than `LONGEST_WAIT`: then it is
+    passed on, so that time advances. None stands for a row that is no sample, and for a row that is
+    not later than the last one of the same sensors.
     """
     held: list[tuple[float, int, Sample]] = []
     newest: dict[tuple[bool, bool], float] = {}
-    """Stamps, by which sensors a row has."""
+    """Last stamps, by the sensors that a row has."""
     reading: Sample | None = None
-    """The last row with the accelerometer that has left."""
+    """The last row with the accelerometer that was passed on."""
     turned = math.nan
-    """The last stamp of the gyro that has left, or where the stream began."""
+    """The last stamp of the gyro that was passed on, or the start of the stream."""
     apart = False
 
     def leaving(now: float) -> Iterator[Sample]:
@@ -183,8 +185,9 @@ def paired(samples: Iterable[Sample | None]) -> Iterator[Sample | None]:
 def _with_accelerometer(
     row: Sample, before: Sample | None, held: list[tuple[float, int, Sample]]
 ) -> Sample:
-    """A row of the gyro with the accelerometer between the reading before and the next that is
-    held, or as it is where it has one or they enclose nothing."""
+    """A row of the gyro with the accelerometer interpolated between the reading before and the next
+    one that is held. The row is unchanged if it has the accelerometer, or if the readings do not
+    enclose it."""
     after = min((each for each in held if _is_finite(each[2].accel)), default=None)
     if not _is_missing(row.accel) or after is None:
         return row
@@ -201,27 +204,27 @@ def _with_accelerometer(
 # --- where samples come from
 
 LONGEST_QUEUE = 100_000
-"""Datagrams that wait for the filter; later ones are lost."""
+"""Largest number of datagrams that wait for the filter; later ones are lost."""
 QUIET_SECONDS = 5.0
-"""s without a datagram after which it is said that none comes."""
+"""Time without a datagram after which a message says so, s."""
 
 
 class Source(NamedTuple):
     """Samples as they come."""
 
     samples: Iterator[Sample | None]
-    """None for a line that is no sample."""
+    """The samples; None for a line that is no sample."""
     name: str
 
 
 def lines_of(stream: Iterable[str], name: str = "standard input", stated: Units = SI) -> Source:
-    """The lines of a stream, until it ends; its units are `stated`."""
+    """The lines of a stream with the units `stated`, until it ends."""
     return Source(paired(parse_line(line, stated) for line in stream), name)
 
 
 def from_recording(sequence: Sequence, speed: float) -> Source:
-    """The samples of a recording, `speed` times as fast as they were taken; 0 as fast as they can
-    be followed. What lies across a gap is missing."""
+    """The samples of a recording, `speed` times as fast as they were recorded; 0: as fast as
+    possible. Samples that are interpolated across a gap are missing."""
 
     def played() -> Iterator[Sample]:
         begin, first, there = time.monotonic(), float(sequence.time[0]), sequence.imu_valid
@@ -236,8 +239,8 @@ def from_recording(sequence: Sequence, speed: float) -> Source:
 
 
 class Datagrams:
-    """What comes on a UDP socket, one or several lines in each datagram. A thread takes it from the
-    socket from now on, so that nothing is lost while the filter is compiled."""
+    """The datagrams of a UDP socket, with one or several lines each. A thread reads them from the
+    socket from the beginning, so that nothing is lost while the filter is compiled."""
 
     def __init__(self, inbox: socket.socket, name: str):
         self.name, self._socket = name, inbox
@@ -261,10 +264,11 @@ class Datagrams:
         at_rest: Callable[[list[Sample]], bool] = bool,
     ) -> Source:
         """The samples, in the units `stated`, until nothing comes for `silence` s after the first
-        one (None: for ever).
+        one (None: without end).
 
-        `say` is told where nothing comes. What has come so far counts if `at_rest` says that it
-        begins at rest; else the device was carried before anybody could know, and it is left out.
+        `say` prints a message if nothing comes. Samples that came before this call are used if
+        `at_rest` says that they begin at rest. Otherwise the device was in motion before the
+        message to hold it still, and they are left out.
         """
         come = [self._waiting.get_nowait() for _ in range(self._waiting.qsize())]
         messages = self._messages(silence, say, begun=bool(come))
@@ -307,28 +311,29 @@ def _lines(messages: Iterable[bytes]) -> Iterator[str]:
 # --- the tracker, at the rate and in the units of the stream
 
 FIRST_SECONDS = 1.0
-"""Of a stream, over which its rate is measured …"""
+"""Time of a stream over which its rate is measured, s …"""
 FIRST_SAMPLES = 21
-"""… and at least so many samples, by which gravity and the stamps tell their units (ours)."""
+"""… and smallest number of samples for it, from which the units of gravity and stamps are
+recognised (ours)."""
 LONGEST_INTERVAL = 0.5
-"""s between samples, by their stamps: what is slower is no IMU, but stamps in ms (ours)."""
+"""Largest time between samples by their stamps, s: a slower stream has stamps in ms (ours)."""
 RATE_SHARE = 0.75
-"""A rate that is stated may be off by so much of the measured one (ours)."""
+"""Largest relative difference of a stated rate from the measured one (ours)."""
 TURNING_SECONDS = 10.0
-"""After which the turning of gravity is held against the gyro (ours)."""
+"""Time after which the rotation of gravity is compared with the gyro, s (ours)."""
 
 
 def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float = 1.0) -> Tracker:
     """The compiled tracker of a run, with the filter and the start of `gnio track`.
 
-    Of the same samples it makes the same trajectory, to rounding, where the recording rests for
-    `rest_seconds` and less than a second longer: of a longer rest a track takes the whole for the
-    gyro's bias, but what has not come yet is not known. Live, samples are interpolated by lines
-    where the rates differ.
+    From the same samples it makes the same trajectory as `gnio track`, to rounding, if the
+    recording rests for `rest_seconds` and less than a second longer. From a longer rest a track
+    uses all samples for the gyro's bias, but a live tracker does not know the later ones. Live
+    samples are interpolated linearly if the rates differ.
 
-    `imu_rate` is that of the samples that will come, Hz; None: the network's, until
-    `Tracker.expect` knows better. Samples that are further apart than 1.5 of its intervals miss
-    some between them. Raises `ValueError` for a rest that is shorter than two samples.
+    `imu_rate` is the rate of the samples that will come, Hz; None: the network's, until
+    `Tracker.expect` changes it. If samples are further apart than 1.5 of its intervals, some are
+    missing between them. Raises `ValueError` for a rest that is shorter than two samples.
     """
     setup, network = tracking_filter(run), Network.of(run.model, run.variables)
     return Tracker(
@@ -344,25 +349,26 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
 
 
 def longest_interval(run: Run, imu_rate: float | None = None) -> float:
-    """s between samples that miss none between them; `imu_rate` as in `create_tracker`."""
+    """Largest time between samples without missing ones, s; `imu_rate` as in `create_tracker`."""
     own = 1 / run.config.data.rate
     return 1.5 * max(own, 1 / imu_rate if imu_rate else own)
 
 
 def expect(tracker: Tracker, found: Followed, run: Run, imu_rate: float) -> None:
-    """Let the tracker of a run and what is followed know the rate of the samples, Hz."""
+    """Set the rate of the samples, Hz, in the tracker of a run and in `found`."""
     tracker.expect(imu_rate, longest_interval(run, imu_rate))
     found.bridged = longest_bridge(imu_rate)
 
 
 def begins_at_rest(run: Run) -> Callable[[list[Sample]], bool]:
-    """Whether the first second of some samples is quiet enough for the start of the filter."""
+    """A function that tells whether the first second of some samples is quiet enough for the start
+    of the filter."""
     setup = tracking_filter(run)
 
     def at_rest(samples: list[Sample]) -> bool:
         first = [each for each in samples if each.time - samples[0].time < FIRST_SECONDS]
         if len(first) < FIRST_SAMPLES or samples[-1].time - samples[0].time < FIRST_SECONDS:
-            return True  # too little has come: the rest may go on
+            return True  # too few samples: the rest may continue
         rows = np.array([(each.time, *each.gyro, *each.accel) for each in first])
         config = dataclasses.replace(setup.config, dt=float(np.median(np.diff(rows[:, 0]))))
         state = level_state(config, rows[:, 1:4], rows[:, 4:], setup.initial_std)
@@ -374,11 +380,11 @@ def begins_at_rest(run: Run) -> Callable[[list[Sample]], bool]:
 def measured(
     source: Source, begin: Callable[[float], None], imu_rate: float | None = None
 ) -> Source:
-    """The same samples, of which the first second is held until its rate, Hz, is given to `begin`.
+    """The same samples; the first second is held until its rate, Hz, is given to `begin`.
 
-    Raises `InputError` on the way where the stamps are not in seconds, where `imu_rate`, which is
-    stated, is another one, where the accelerometer of a device at rest does not read gravity, and
-    where after ten seconds gravity does not turn as the gyro does.
+    Raises `InputError` while it runs, if the stamps are not in seconds, if the stated `imu_rate` is
+    wrong, if the accelerometer of a device at rest does not read gravity, or if after ten seconds
+    gravity does not turn as the gyro does.
     """
 
     def samples() -> Iterator[Sample | None]:
@@ -443,30 +449,31 @@ def _check_turning(samples: list[Sample], where: str) -> None:
 # --- following
 
 LINES_BEFORE_A_SAMPLE = 100
-"""So many lines without a single sample are no stream of an IMU."""
+"""Number of lines without a sample after which the input counts as no stream of an IMU."""
 SECONDS_WITHOUT_A_SENSOR = 10.0
-"""So many s from the start without a sample that has both sensors: one of them is not sent, or goes
-by another name (ours)."""
+"""Time from the start without a sample of both sensors after which one of them counts as not sent,
+or as sent by another name, s (ours)."""
 REFUSED_IN_A_ROW = 1000
-"""So many refused samples in a row end the stream: its clock or its format is another one now, and
-no later sample would be taken (ours)."""
+"""Number of successive refused samples that ends the stream: its clock or its format has changed,
+and all later samples would be refused (ours)."""
 VELOCITY = slice(3, 6)
-"""Of a pose's covariance."""
+"""Rows of the position in a pose's covariance."""
 
 
 @dataclass
 class Followed:
-    """What has come of a stream so far. Of the poses only the path is kept: 64 bytes each, 23 MB in
+    """The results of a stream so far. Only the path of the poses is kept: 64 bytes each, 23 MB in
     ten hours at 10 Hz."""
 
     bridged: float = math.inf
-    """s between two whole samples; a longer time is a gap (`data.resampling.longest_bridge`)."""
+    """Largest time between two whole samples, s; a longer time is a gap
+    (`data.resampling.longest_bridge`)."""
     pose: Pose | None = None
-    """The newest."""
+    """The newest pose."""
     rough: bool = False
-    """Whether the device moved while it should lie still."""
+    """Whether the device moved while it should be still."""
     path: array = field(default_factory=lambda: array("d"))
-    """Of each healthy pose time, position and attitude (wxyz), one after another."""
+    """Time, position and attitude (wxyz) of each healthy pose, one pose after another."""
     samples: int = 0
     first: float = math.nan
     """Stamp of the first sample, s."""
@@ -475,13 +482,13 @@ class Followed:
     whole: float = math.nan
     """Stamp of the newest sample with both sensors, s."""
     gaps: list[tuple[float, float]] = field(default_factory=list)
-    """Since the first pose: stamp of the end and length, s."""
+    """Gaps since the first pose: stamp of the end and length, s."""
     refused: int = 0
-    """Lines that were no samples, and samples that the tracker could not take."""
+    """Number of lines that were no samples, and of samples that the tracker refused."""
     in_a_row: int = 0
-    """Refused since the newest sample."""
+    """Number of lines refused since the newest sample."""
     reasons: tuple[str, str] = ("", "")
-    """Why the first and the newest one were refused."""
+    """Reasons why the first and the newest line were refused."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -491,18 +498,18 @@ class Followed:
 
     @property
     def lost(self) -> bool:
-        """Whether the stream was given up."""
+        """Whether the stream was ended because of refused lines."""
         return self.in_a_row >= REFUSED_IN_A_ROW
 
     def warnings(self) -> list[str]:
-        """How it began, what is missing and what was refused, as far as a user must know."""
+        """Warnings for the user about the start, missing samples and refused lines."""
         found = []
         if self.rough:
-            problem = "it moved while it should lie still, so velocity and tilt are rough"
+            problem = "it moved while it should lie still, so velocity and tilt are inaccurate"
             found.append(f"start: {problem}")
         if self.gaps:
             longest = f"the longest of {max(length for _, length in self.gaps):.2g} s"
-            guessed = "the motion there is guessed, and the reported covariance is too small"
+            guessed = "the motion there is not known, and the reported covariance is too small"
             found.append(f"gaps: {len(self.gaps)}, {longest}: samples are missing, {guessed}")
         if self.refused:
             found.append(f"{self.refused} lines refused, the first: {self.reasons[0]}")
@@ -518,11 +525,11 @@ def follow(
     found: Followed,
     on_pose: Callable[[Followed], None],
 ) -> None:
-    """Feed the samples to a tracker, by its `push`, until the source ends, or nothing of it is
-    taken any more (`Followed.lost`); `found` grows on the way, and `on_pose` is called after each
-    clone step.
+    """Feed the samples to a tracker, by its `push`, until the source ends or its samples are no
+    longer accepted (`Followed.lost`).
 
-    Raises `InputError` where nothing that comes is a sample or none has both sensors.
+    `found` is updated with each sample, and `on_pose` is called after each clone step. Raises
+    `InputError` if no line is a sample, or if no sample has both sensors.
     """
     for sample in source.samples:
         try:
@@ -546,9 +553,9 @@ def follow(
 
 
 def _count(found: Followed, sample: Sample, where: str) -> None:
-    """A sample that the tracker has taken."""
+    """Count a sample that the tracker has taken."""
     while found.gaps and found.gaps[-1][0] > sample.time:
-        found.gaps.pop()  # the stamp leapt, and the tracker did not believe it
+        found.gaps.pop()  # the tracker rejected a stamp that jumped
     found.first = sample.time if found.samples == 0 else found.first
     found.last, found.samples, found.in_a_row = sample.time, found.samples + 1, 0
     if sample.whole:
@@ -560,8 +567,8 @@ def _count(found: Followed, sample: Sample, where: str) -> None:
 
 
 def _note_gap(found: Followed) -> None:
-    """Keep the time from the newest whole sample to the last one, if samples are missing there.
-    What came before the start is not in the path."""
+    """Record the time from the newest whole sample to the last one as a gap, if samples are missing
+    there. Samples before the start are not in the path."""
     if found.pose is not None and found.last - found.whole > found.bridged:
         found.gaps.append((found.last, found.last - found.whole))
 
@@ -578,14 +585,14 @@ def _add(found: Followed, pose: Pose) -> None:
 # --- the terminal
 
 LEAST_EXTENT = 4.0
-"""Metres that the drawing shows at least."""
+"""Smallest extent of the drawing, m."""
 _DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 """Bits of the Unicode braille patterns by row and column of the dot."""
 
 
 def line(found: Followed) -> str:
-    """The newest pose in words. The way is horizontal, through points 1 s apart, as that of `gnio
-    track` is."""
+    """The newest pose as text. The distance walked is horizontal, through points 1 s apart, as in
+    `gnio track`."""
     assert found.pose is not None
     x, y, z = np.round(found.pose.position, 2) + 0.0  # no -0.00
     path, time = found.trajectory, found.trajectory.time

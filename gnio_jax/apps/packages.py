@@ -1,8 +1,8 @@
-"""Trained networks that are passed on: a package is made of a run, found by name, loaded as a run.
+"""Packages of trained networks: a package is made from a run, found by name, and loaded as a run.
 
 A package is a folder or a zip of two files: `weights.safetensors` with the arrays, and
-`manifest.json` with the settings, the model card and the SHA-256 of the weights and of itself. All
-of it is checked before anything is used. Nothing is unpacked to the disk, and nothing is executed.
+`manifest.json` with the settings, the model card and the SHA-256 of the weights and of itself.
+Everything is checked before it is used. Nothing is unpacked to the disk, and nothing is executed.
 docs/weights.md has the format.
 """
 
@@ -38,55 +38,55 @@ from gnio_jax.training.checkpoint import Run, Which
 SHIPPED = Path(__file__).parents[1] / "weights"
 """The packages that come with gnio-jax."""
 VARIABLE = "GNIO_WEIGHTS"
-"""Folders of packages, separated as in $PATH."""
+"""Variable with the folders of packages, separated as in $PATH."""
 FORMAT, VERSION = "gnio-package", 2
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
 LARGEST_MANIFEST, LARGEST_WEIGHTS = 2**20, 2**32
-"""Bytes (ours): a zip of some megabytes may say that it unpacks to any size."""
+"""Largest sizes in bytes (ours), because a small zip may unpack to any size."""
 SHOWN = ("ate_2d", "rte_60s_2d", "path_length_ratio_2d", "yaw_rmse", "nees_coverage_2d")
-"""Metrics of the card. Networks are listed by the first."""
+"""Metrics of the card. Lists of networks show the first."""
 AT_WAYPOINTS = ("leg_ratio", "waypoint_rms")
-"""Further ones, of evaluations of walks with waypoints."""
+"""Further metrics, of evaluations of walks with waypoints."""
 _DAMAGED = "the package is damaged: fetch or publish it again"
 
 
 class About(NamedTuple):
-    """What the manifest says of a package."""
+    """The content of a package's manifest."""
 
     name: str
     network: str
-    """In the registry of `gnio_jax.models`."""
+    """Name of the network in the registry of `gnio_jax.models`."""
     data: str
-    """What the network was trained on, in its publisher's words."""
+    """The training data, in the publisher's words."""
     license: str
     epoch: int
     step: int
     measured: str
-    """The error by which networks are listed, in words; empty where the run held no evaluation."""
+    """The error that lists of networks show, in words; empty if the run had no evaluation."""
     made_by: str
     """The program that published it, with its version."""
     card: list
     """Lines of the model card, Markdown."""
     config: dict
-    """The settings, as config.yaml of a run has them."""
+    """The settings, in the form of a run's config.yaml."""
     weights: dict
     """Size and SHA-256 of `weights.safetensors`, as `files.fingerprint` gives them."""
 
 
 class Weights(NamedTuple):
-    """A network that is ready to track."""
+    """A network for tracking."""
 
     name: str
     run: Run
     about: str
-    """What it was trained on, and the error that was measured of it, where one was."""
+    """Its training data, and its measured error if there is one."""
 
 
 # --- where packages are found
 
 
 def is_package(place: Path) -> bool:
-    """Whether a folder or file is meant to be a package; its content is not looked at."""
+    """Whether a folder or file is meant to be a package; its content is not checked."""
     return (place.is_file() and place.suffix == ".zip") or (place / MANIFEST).is_file()
 
 
@@ -126,7 +126,7 @@ def find(which: str | Path | None = None) -> Path:
 
 
 def choose(which: str | Path | None = None) -> Weights:
-    """The weights of a name, package or run, as `find` finds them. Raises `InputError`."""
+    """The weights of a name, package or run that `find` finds. Raises `InputError`."""
     place = find(which)
     if is_package(place):
         about, content = read(place)
@@ -146,18 +146,18 @@ def choose(which: str | Path | None = None) -> Weights:
         try:
             measured = _measured(_figures(place), run.config.datasets)
         except InputError:
-            measured = ""  # a damaged evaluation keeps nobody from tracking
+            measured = ""  # a damaged evaluation must not prevent tracking
     return Weights(name, run, f"{trained_on}, whose {measured}" if measured else trained_on)
 
 
 def load_pretrained(which: str | Path | None = None) -> Run:
     """The network of `which` with its variables and configuration.
 
-    `which` is the folder or zip of a package, the folder of a run, or the name of a package that
-    gnio-jax or a folder of $GNIO_WEIGHTS holds; None is the default of `gnio track`.
+    `which` is the folder or zip of a package, the folder of a run, or the name of a package in
+    gnio-jax or in a folder of $GNIO_WEIGHTS; None is the default of `gnio track`.
     `Run.model.apply(run.variables, windows)` gives a `Prediction` of windows (b, N, 6), float32,
-    [accel m/s², gyro rad/s] in the gravity frame at `run.config.data.rate`; `run.config.filter` are
-    the filter's settings as they were calibrated or trained. Raises `InputError`.
+    [accel m/s², gyro rad/s] in the gravity frame at `run.config.data.rate`; `run.config.filter` has
+    the calibrated or trained settings of the filter. Raises `InputError`.
     """
     return choose(which).run
 
@@ -171,9 +171,9 @@ def card_of(which: str | Path) -> str:
 
 
 def write_run(which: str | Path, workdir: Path) -> None:
-    """Make a run of a package, which all commands take: its settings, and its weights as the best
+    """Turn a package into a run, which all commands take: its settings, and its weights as the best
     checkpoint. The folder is written whole or not at all. Raises `InputError` as `load_pretrained`
-    does, and for a folder that is there already."""
+    does, and for a folder that exists already."""
     if workdir.exists():
         raise InputError(workdir, "is there already", "name another folder")
     run = load_pretrained(which)
@@ -187,7 +187,7 @@ def write_run(which: str | Path, workdir: Path) -> None:
 
 
 def read(place: Path) -> tuple[About, bytes]:
-    """A package: what it says of itself, and its weights. Raises `InputError` if it is damaged."""
+    """The manifest and the weights of a package. Raises `InputError` if it is damaged."""
     about = read_about(place)
     content = _content(place, WEIGHTS, LARGEST_WEIGHTS)
     if fingerprint(content) != about.weights:
@@ -197,7 +197,7 @@ def read(place: Path) -> tuple[About, bytes]:
 
 
 def read_about(place: Path) -> About:
-    """What a package says of itself; only its manifest is read. Raises `InputError`."""
+    """The manifest of a package; the weights are not read. Raises `InputError`."""
     try:
         found = json.loads(_content(place, MANIFEST, LARGEST_MANIFEST))
     except (ValueError, RecursionError) as error:  # InputError, too, is a ValueError
@@ -225,7 +225,7 @@ def read_about(place: Path) -> About:
 
 
 def _of_version_1(place: Path, found: dict[str, Any]) -> dict[str, Any]:
-    """The manifest of an earlier version, whose settings and card were files beside it."""
+    """The manifest of an earlier version, whose settings and card were separate files."""
     files = found.get("files")
     described = files if isinstance(files, dict) else {}
     texts = {}
@@ -245,13 +245,13 @@ def _of_version_1(place: Path, found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _digest(manifest: dict[str, Any]) -> str:
-    """The SHA-256 of all that a manifest says, but for this digest."""
+    """The SHA-256 of all fields of a manifest except this digest."""
     rest = {name: value for name, value in manifest.items() if name != "sha256"}
     return str(fingerprint(json.dumps(rest, sort_keys=True).encode())["sha256"])
 
 
 def _content(place: Path, name: str, most: int) -> bytes:
-    """The bytes of a file, which must not be more than `most`."""
+    """The content of a file of at most `most` bytes."""
     try:
         if place.is_dir():
             with (place / name).open("rb") as file:
@@ -275,7 +275,7 @@ def to_bytes(variables: Any) -> bytes:
 
 def from_bytes(content: bytes, template: Any, where: object) -> Any:
     """The variables of a file in the structure of `template` (arrays or shapes). Raises
-    `InputError` where a name or a shape differs, or a value is not finite."""
+    `InputError` if a name or a shape differs, or if a value is not finite."""
     try:
         tensors = load(content)
     except (SafetensorError, ValueError, KeyError) as error:
@@ -310,16 +310,16 @@ def publish(
     fails: tuple[str, ...] = (),
     which: Which = "best",
 ) -> About:
-    """Make a package of a run at `out`: a zip if its name ends so, else a folder, which takes the
-    place of an older package. It is written whole or not at all, and folders of this machine are
-    left out of its settings.
+    """Make a package from a run at `out`: a zip if its name ends with .zip, else a folder. It
+    replaces an older package. It is written whole or not at all, and its settings do not contain
+    folders of this machine.
 
-    Only the publisher knows on which `data` the network was trained (recordings, devices, people,
-    carrying positions), under which `license` the data may be used and the weights passed on, and
-    where it `fails`, a sentence each.
+    The publisher must describe the `data` on which the network was trained (recordings, devices,
+    people, carrying positions), the `license` under which the data may be used and the weights
+    passed on, and the cases in which it `fails`, one sentence each.
 
-    Raises `InputError` for a run that cannot be loaded, a name that is none of a file, empty texts,
-    or something at `out` that is no package.
+    Raises `InputError` for a run that cannot be loaded, a name that is not a file name, empty
+    texts, or something at `out` that is no package.
     """
     if name != file_stem(name):
         remedy = "use letters, digits, '.', '_', '+' and '-'"
@@ -354,7 +354,7 @@ def publish(
     if out.suffix == ".zip":
         with replacing(out) as temporary, zipfile.ZipFile(temporary, "w") as archive:
             for name, each in files.items():
-                # A date of its own would make other bytes of the same package.
+                # With a date the bytes of the same package would differ.
                 archive.writestr(zipfile.ZipInfo(name), each, zipfile.ZIP_DEFLATED)
     else:
         with replacing_folder(out) as folder:
@@ -372,15 +372,15 @@ def _has_manifest(place: Path) -> bool:
 
 
 def _figures(workdir: Path) -> dict[str, Report]:
-    """Every evaluation that a run holds, by its folder's name. Raises `InputError`."""
+    """Every evaluation of a run, by its folder's name. Raises `InputError`."""
     places = sorted(path.parent for path in workdir.glob("eval/*/metrics.json"))
     return {place.name: report.read(place) for place in places}
 
 
 def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
-    """The error by which networks are listed, in words, of the first evaluation that has it: with
-    the filter before without, on the run's own datasets before others, on a test split before
-    others; with that of each way of carrying. Empty where none has it."""
+    """The error that lists of networks show, in words, with that of each way of carrying. It is
+    that of the first evaluation that has it. Evaluations with the filter come first, then those on
+    the run's own datasets, then those on a test split. It is empty if no evaluation has it."""
 
     def rank(name: str) -> tuple[bool, bool, bool, int, str]:
         how = figures[name].settings
@@ -396,7 +396,7 @@ def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
 
 
 def _by_placement(figures: Report) -> list[str]:
-    """The mean of that error for each way of carrying, the smallest first, in words."""
+    """The mean of this error for each way of carrying, the smallest first, in words."""
     errors: dict[str, list[float]] = {}
     for name, placement in figures.placements.items():
         own = figures.scores[name]
@@ -419,7 +419,7 @@ def _cell(figures: Report, metric: str) -> str:
 
 
 def _named_run(which: str) -> str:
-    """A package by its name, and a run without the folders of this machine."""
+    """The name of a package, or a run without the folders of this machine."""
     known = which in packages() and not Path(which).exists()
     return shlex.quote(which if known else f"runs/{Path(which).name}")
 

@@ -1,4 +1,4 @@
-"""Results for the viewer Rerun (rerun.io): as a file, or sent while a trajectory grows.
+"""Results for the viewer Rerun (rerun.io): as a file, or sent while a trajectory is estimated.
 
 Needs `gnio-jax[rerun]`.
 """
@@ -24,15 +24,16 @@ from gnio_jax.filtering import Pose
 from gnio_jax.numerics import finite_rows, quaternion_from_matrix, xyzw_from_wxyz
 
 OPTION, VIEWER = "--rerun", "viewer"
-"""The viewer stands in the place of a file's name: show it now."""
+"""This word in the place of a file's name starts the viewer."""
 LINE_EVERY = 10
-"""Poses between two drawings of the newest piece of a path that grows."""
+"""Number of poses between two drawings of the newest piece of a growing path."""
 LONGEST_PIECE = 600
-"""Poses. A piece is sent anew when it grows: with the whole path that would be ever more."""
+"""Number of poses of a piece. A piece is sent again when it grows; sending the whole path would
+take more and more data."""
 
 
 def check(target: str | Path) -> None:
-    """Refuse, before the work, what cannot be shown or written. Raises `InputError`."""
+    """Raise `InputError`, before any work, for a target that cannot be shown or written."""
     require_packages(OPTION, "rerun", "rerun")
     if target == VIEWER:
         return
@@ -49,10 +50,11 @@ def write(
     recordings: list[Recording],
     alignment: Alignment | None = None,
 ) -> None:
-    """Write sequences as one recording of Rerun, whole or not at all: of each its estimate and its
+    """Write sequences as one recording of Rerun, whole or not at all: for each its estimate and its
     reference in one frame (`estimate.in_one_frame`), and the IMU.
 
-    Each has a folder of its own, named as its files. Times are those from its start, s.
+    Each sequence has a folder of its own with the name of its files. Times are counted from its
+    start, s.
     """
     import rerun
 
@@ -80,7 +82,7 @@ def write(
 
 
 def _log_paths(log: Any, stem: str, estimate: Estimate) -> None:
-    """Both paths as lines; the pose of the estimate and its 3σ ellipsoid over time."""
+    """Log both paths as lines, and the pose of the estimate and its 3σ ellipsoid over time."""
     import rerun
 
     path, reference = estimate.trajectory, estimate.reference
@@ -98,7 +100,8 @@ def _log_paths(log: Any, stem: str, estimate: Estimate) -> None:
 def _log_poses(
     log: Any, place: str, poses: Trajectory, covariance: Float[np.ndarray, "k 3 3"] | None
 ) -> None:
-    """Poses over time, and the contours of the covariances of their positions (m²) at `SIGMAS`."""
+    """Log poses over time, and the contours of the covariances of their positions (m²) at
+    `SIGMAS`."""
     import rerun
 
     time = rerun.TimeColumn("time", duration=poses.time)
@@ -118,7 +121,7 @@ def _log_poses(
 
 
 def _log_curves(log: Any, place: str, time: Float[np.ndarray, "n"], values: Any) -> None:
-    """Curves (n, w) over time, where they are known; none for None."""
+    """Log curves (n, w) over time, where they are known; nothing for None."""
     import rerun
 
     if values is None or not (known := finite_rows(values)).any():
@@ -140,7 +143,7 @@ def _rgb(colour: str) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def streaming(target: str) -> Iterator[RerunStream]:
-    """To the viewer, which is started, or into the file NAME.rrd, whole or not at all."""
+    """A stream to the viewer, which is started, or into the file NAME.rrd, whole or not at all."""
     import rerun
 
     log = rerun.RecordingStream("gnio-jax")
@@ -157,7 +160,8 @@ def streaming(target: str) -> Iterator[RerunStream]:
 
 
 class RerunStream:
-    """What has been sent of a trajectory. Its places are those of a file's sequence `live`."""
+    """A trajectory that is sent pose by pose. Its entities are those of a sequence `live` in a
+    file."""
 
     def __init__(self, log: Any):
         import rerun
@@ -169,8 +173,8 @@ class RerunStream:
         log.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def add(self, pose: Pose) -> None:
-        """Send the pose, its 3σ ellipsoid and its NIS; now and then the path. Nothing of a filter
-        that has diverged."""
+        """Send the pose, its 3σ ellipsoid and its NIS, and sometimes the path. Nothing is sent
+        after the filter has diverged."""
         import rerun
 
         if not pose.healthy:

@@ -1,4 +1,4 @@
-"""The trajectory of one's own recording, and how far to trust it: what `gnio track` does.
+"""The trajectory of your own recording and its accuracy (`gnio track`).
 
 recording + weights → check → prepare → estimate → score → summarise → write
 """
@@ -35,67 +35,70 @@ from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import GRAVITY, Sequence
 
 ZERO_VELOCITY_STD = 0.02
-"""m/s that the filter measures while the IMU is quiet (ours): what lies on a table stays there."""
+"""Standard deviation of the zero velocity that the filter measures while the IMU is quiet, m/s
+(ours)."""
 GAP_GYRO_STD, GAP_ACCEL_STD = 0.8, 0.8
-"""rad/s and m/s²: what a carrier does unseen where samples are missing. Over a second walkers turn
-by 0.5 to 0.8 rad and change their velocity by 0.5 to 0.7 m/s, root mean square of each axis, on
-OxIOD and on simulated walks; over two and three by less for each second (ours)."""
+"""Standard deviations of a carrier's motion while samples are missing, rad/s and m/s² (ours). On
+OxIOD and on simulated walks the root mean square over a second is 0.5 to 0.8 rad and 0.5 to 0.7 m/s
+for each axis; over two and three seconds it is less per second."""
 LYING = 0.95
-"""Share of rest from which a recording is said to lie still (ours)."""
+"""Share of rest from which a warning says that a recording lies still (ours)."""
 RUNNING, RUNNING_SHARE = 5.0, 0.7
-"""m/s² root mean square of |accel| − g over a second, beyond which somebody may run, and the share
-of such seconds that is worth a warning (ours). Who runs has it in 92 % or more (Tyrex); who walks,
-in at most 1 % on Tyrex and OxIOD, however the phone is carried, and in up to 52 % in Indoor
-Location's mall."""
+"""Root mean square of |accel| − g over a second, m/s², above which the person may run, and the
+share of such seconds that gives a warning (ours). Runs have 92 % or more of them (Tyrex). Walks
+have at most 1 % on Tyrex and OxIOD, for every way of carrying, and up to 52 % in Indoor Location's
+mall."""
 CLIMB = 3.0
-"""m between the highest and the lowest place of a path, from which on it tells of stairs or of a
+"""Height between the lowest and the highest point of a path, m, from which it indicates stairs or
 drift (ours)."""
 REFUSED = 0.15
-"""Share of refused displacements that is worth a warning (ours). On people that a network has not
-met it refuses 0 to 5 %; walks of a kind that it has not met went wrong by 20 sigma with 29 %."""
+"""Share of refused displacements that gives a warning (ours). For people that a network has not
+seen the filter refuses 0 to 5 %. For walks of a kind that it has not seen it refused 29 %, and the
+error was 20 sigma."""
 FASTEST = 3.0
-"""Mean speed above which nobody walks, m/s; the self-check of recordings has the same."""
+"""Largest plausible mean speed of a walk, m/s, as in the self-check of recordings."""
 COVERED = 50.0
-"""% of the rows in which the 95 % region of the filter must hold the reference (ours)."""
+"""Smallest share of rows in which the 95 % region of the filter must contain the reference, %
+(ours)."""
 NAMES = ("summary.json", "trajectory.txt", "track.png")
-"""Files that every track has."""
+"""Files of every track."""
 
 
 class Summary(NamedTuple):
-    """What is said of a track."""
+    """The figures and remarks about a track."""
 
     recording: str
     weights: str
     trained_on: str
-    """And the error that was measured of these weights, where one was."""
+    """The training data, and the measured error of these weights if there is one."""
     start_time: float
-    """Of the recording's own clock, s."""
+    """Duration by the recording's own clock, s."""
     seconds: float
     path_length: float
-    """Horizontal, through points 1 s apart, m."""
+    """Horizontal length of the path, through points 1 s apart, m."""
     from_start: float
     """Horizontal distance of the end from the start, m."""
     expected_error: float
-    """Horizontal at the end, root mean square by the filter's covariance, m."""
+    """Expected horizontal error at the end, root mean square by the filter's covariance, m."""
     rest: float
     """Share of the time in which the IMU is quieter than a hand."""
     running: float
-    """Share of the seconds in which it is shaken as in a run."""
+    """Share of the seconds with accelerations as in a run."""
     climb: float
-    """Between the highest and the lowest place, m."""
+    """Height between the lowest and the highest point, m."""
     accepted: float | None
     """Share of the displacements that the filter used; None if there was none."""
     errors: dict[str, float | None]
     """Metrics against the reference, start aligned; empty where there is none."""
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
-    """What the import and the start detected, assumed or repaired."""
+    """Notes about what the import and the start detected, assumed or repaired."""
     limits: str
-    """How far to trust the track, in one line."""
+    """The accuracy of the track, in one line."""
 
 
 class Tracked(NamedTuple):
-    """What `track` found and where it is."""
+    """The result of `track` and its folder."""
 
     estimate: Estimate
     summary: Summary
@@ -103,8 +106,8 @@ class Tracked(NamedTuple):
 
 
 def tracking_filter(run: Run) -> FilterSetup:
-    """The run's own filter, for which rest is a measurement too, and which grows uncertain like a
-    walker where samples are missing. `gnio live` and `gnio export` have the same."""
+    """The run's own filter, which also measures rest, and whose covariance grows by a walker's
+    motion while samples are missing. `gnio live` and `gnio export` use the same."""
     setup = filter_setup(run.config.data, run.config.filter)
     config = dataclasses.replace(
         setup.config,
@@ -124,14 +127,15 @@ def track(
     command: str = "",
     rerun_file: Path | None = None,
 ) -> Tracked:
-    """Track a recording and leave trajectory, picture, page and summary in the folder `out`.
+    """Track a recording and write trajectory, picture, page and summary into the folder `out`.
 
-    The trajectory starts at the origin with yaw zero; its stamps are the recording's own. The start
-    is level by the gravity of the first second, its velocity zero as surely as that second is
-    quiet, with the gyro's bias of a rest at the start. A reference starts nothing: it is only
-    compared with. `formats` are further ones of `export.FORMATS`, `command` is how this was called,
-    for the page, `rerun_file` a file to write for the viewer Rerun. The folder is written whole or
-    not at all and takes the place of an earlier track. Raises `InputError`.
+    The trajectory starts at the origin with yaw zero; its stamps are the recording's own. The tilt
+    at the start comes from the gravity of the first second. The velocity is zero, with a standard
+    deviation that depends on how quiet that second is, and a rest at the start gives the gyro's
+    bias. A reference is not used for the start, only for comparison. `formats` are further ones of
+    `export.FORMATS`, `command` is the command line, for the page, and `rerun_file` a file to write
+    for the viewer Rerun. The folder is written whole or not at all and replaces an earlier track.
+    Raises `InputError`.
     """
     sequence, config = recording.sequence, weights.run.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
@@ -165,7 +169,7 @@ def track(
 def _check_results(
     out: Path, formats: tuple[str, ...], rerun_file: Path | None, stamps: Float[np.ndarray, "n"]
 ) -> None:
-    """Raise `InputError`, before the work, for what could not be written after it."""
+    """Raise `InputError`, before any work, for results that could not be written afterwards."""
     track = all((out / name).is_file() for name in NAMES)
     if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
         raise InputError(out, "exists and is not an earlier track", "name another --out")
@@ -177,8 +181,10 @@ def _check_results(
 
 
 def _check_bridged(sequence: Sequence) -> None:
-    """Raise `InputError` for a hole that nothing bridges: what was walked in it is in no sample."""
-    # Lines of an earlier resampling; each clock has widened a hole by up to a sample at each end.
+    """Raise `InputError` for a hole that is too long to be bridged, because no sample shows the
+    motion in it."""
+    # An earlier resampling interpolated the holes, and each clock has widened a hole by up to a
+    # sample at each end.
     there = np.union1d(sequence.time[measured_rows(sequence)], sequence.time[[0, -1]])
     bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
     check_gaps(sequence.time, sequence.name)
@@ -193,7 +199,7 @@ def summarise(
     weights: Weights,
     ekf: FilterSetup,
 ) -> Summary:
-    """The figures of a finished track, up to where it diverged if it did."""
+    """The figures of a finished track, up to a divergence if there was one."""
     filtered, sequence = found.filtered, recording.sequence
     assert filtered is not None
     rows = int(np.flatnonzero(found.trajectory.known)[-1]) + 1
@@ -235,7 +241,7 @@ def summarise(
     if holes or any(GAPS in note for note in recording.notes):
         where = "" if holes else " (see above)"
         warnings.append(
-            f"gaps: samples are missing{where}, and what happened there is guessed: from there on "
+            f"gaps: samples are missing{where}, and the motion there is not known: from there on "
             "heading and place are less certain than the filter says"
         )
     if ready.start.raw_gyro:
@@ -244,13 +250,13 @@ def summarise(
             "minute; hold the phone still for some seconds first"
         )
     if ready.start.std.velocity > ROUGH_START:
-        warnings.append("start: it moves in its first second, so its velocity and tilt are rough")
+        warnings.append("start: it moves in its first second, so velocity and tilt are inaccurate")
     diverged = (note for note in found.notes if note not in ready.notes)
     return summary._replace(warnings=(*warnings, *diverged))
 
 
 def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
-    """What makes the track worth less than its figures."""
+    """Warnings that limit the value of the figures."""
     accepted = 1.0 if summary.accepted is None else summary.accepted
     covered = {
         "place": summary.errors.get("nees_coverage_2d"),
@@ -262,13 +268,13 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
     found = {
         f"rate: recorded at {own_rate:.4g} Hz, the network was trained at {rate:g} Hz: the "
         f"content above {own_rate / 2.0:.3g} Hz is unknown": own_rate < 0.99 * rate,
-        f"rest: it lies still {summary.rest:.0%} of the time, and the filter holds it there": (
+        f"rest: it lies still {summary.rest:.0%} of the time, and the filter holds the position": (
             summary.rest >= LYING
         ),
         f"running: in {summary.running:.0%} of the seconds it is shaken as in a run, where "
-        "networks of walks make the path too short": summary.running > RUNNING_SHARE,
+        "networks trained on walks make the path too short": summary.running > RUNNING_SHARE,
         f"height: it changes by {summary.climb:.1f} m: that is drift unless the way goes up or "
-        "down, where few networks have learnt": summary.climb > CLIMB,
+        "down, which few networks have learnt": summary.climb > CLIMB,
         f"gate: the filter refused {1.0 - accepted:.0%} of the network's displacements: the motion "
         "is unlike what the network was trained on": accepted < 1.0 - REFUSED,
         f"speed: {speed:.1f} m/s in the mean is faster than people walk: the track is wrong": (
@@ -281,8 +287,8 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
 
 
 def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
-    """Share of the strides in which the IMU is as quiet as the filter's rest; a line across a gap
-    is not."""
+    """Share of the strides in which the IMU is as quiet as the filter's rest; strides across a gap
+    do not count as rest."""
     rate = ready.gyro - ready.start.gyro_bias
     one_program = jax.jit(quiet_samples, static_argnames="config")
     quiet = np.asarray(one_program(rate, ready.accel, config=ekf.config))
@@ -292,7 +298,7 @@ def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
 
 
 def _share_running(ready: Recording, ekf: FilterSetup) -> float:
-    """Share of the seconds in which the IMU is shaken as in a run; of what was measured."""
+    """Share of the measured seconds with accelerations as in a run."""
     second = round(1.0 / ekf.config.dt)
     off = np.linalg.norm(ready.accel, axis=1) - GRAVITY
     off = off if ready.imu_valid is None else off[ready.imu_valid]
@@ -303,7 +309,7 @@ def _share_running(ready: Recording, ekf: FilterSetup) -> float:
 def _write_figures(
     folder: Path, found: Estimate, summary: Summary, formats: tuple[str, ...]
 ) -> None:
-    """Summary and trajectories, which have the stamps of the recording's own clock."""
+    """Write the summary and the trajectories, with the stamps of the recording's own clock."""
     plain = summary._asdict() | {"errors": report.finite(summary.errors)}
     text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False)
     (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
@@ -322,7 +328,7 @@ def _write_figures(
 def _draw(
     folder: Path, found: Estimate, summary: Summary, config: TrainConfig, command: str
 ) -> None:
-    """The picture and the page, which are those of an evaluation's sequence."""
+    """Draw the picture and write the page, in the form of an evaluation's sequence."""
     from gnio_jax.evaluation import page, plots, tabulate  # they take a second to import
 
     seen = plots.view(found, alignment=None)
@@ -344,7 +350,7 @@ def _draw(
         "windows": tabulate.windows(dataclasses.asdict(config.data)),
     }
     figures = {"accepted": None if summary.accepted is None else 100.0 * summary.accepted}
-    # Of the whole track, also where a reference knows only a part of it.
+    # The figures are of the whole track, even if the reference covers only a part of it.
     figures |= summary.errors | {"duration": summary.seconds, "path_length": summary.path_length}
     run = page.Run(
         "track",

@@ -1,9 +1,8 @@
-"""A recording as people have it, as a `Sequence`: a phone logger's export, a robot's bag, a folder
-of EuRoC's layout, or any CSV.
+"""Import of recordings as a `Sequence`: a phone logger's export, a robot's bag, a folder of EuRoC's
+layout, or any CSV.
 
-The format is told by the content, and the reader of the format gives a `recording.Recording`: the
-samples of each sensor, the units that are known, the reference. `recording.as_sequence` does the
-rest.
+The format is recognised by the content. The reader of the format gives a `recording.Recording`: the
+samples of each sensor, the known units, the reference. `recording.as_sequence` does the rest.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ _MAGIC = {
     b"\x89HDF\r\n\x1a\n": "hdf5",
 }
 _NOTES, _WARNINGS = "import_notes", "import_warnings"
-"""Attributes of an HDF5 file: one note or warning a line."""
+"""Attributes of an HDF5 file, with one note or warning per line."""
 
 
 def import_recording(
@@ -72,13 +71,13 @@ def import_recording(
         layout, or a CSV: the gyro's file, and the accelerometer's unless `options.accel_path` is
         given; lines that begin with # are comments.
     `options`
-        What the recording does not say of itself. What `options.columns` leaves out is looked up by
-        our name. Rows out of order are sorted, of rows with one stamp the first counts, and a CSV's
-        separator is the most frequent of comma, semicolon and tab, or blanks.
+        Properties that the recording does not state. Columns that `options.columns` leaves out are
+        found by our names. Rows out of order are sorted, and of rows with the same stamp the first
+        is used. A CSV's separator is the most frequent of comma, semicolon and tab, or blanks.
     `rate`
-        Hz of the result; None keeps the faster sensor's own.
+        Rate of the result, Hz; None keeps that of the faster sensor.
     `name`
-        Of the sequence; None takes that of the file.
+        Name of the sequence; None takes that of the file.
 
     Two sensors with stamps of their own are put on one clock over the time that both cover, by
     cubic splines. Raises `InputError` naming file, field and remedy.
@@ -116,8 +115,8 @@ def _read(path: Path, options: ImportOptions) -> Recording:
 
 
 def _recognised(path: Path) -> str:
-    """csv, logger, euroc or one of `ros.KINDS`, by what a file or folder holds: names lie. Text of
-    no logger is a CSV, whose columns the user may name."""
+    """csv, logger, euroc or one of `ros.KINDS`, by the content of a file or folder, because names
+    may be wrong. A text of no known logger is a CSV, whose columns the user may name."""
     if path.is_dir():
         if any((folder / "imu0" / "data.csv").is_file() for folder in (path, path / "mav0")):
             return "euroc"
@@ -138,7 +137,7 @@ def _recognised(path: Path) -> str:
 
 
 def _read_csv(path: Path, options: ImportOptions) -> Recording:
-    """One file, or one of each sensor, with the columns that the user names."""
+    """Read one file, or one of each sensor, with the columns that the user names."""
     named = {name: name for name in ("time", *GYRO, *ACCEL)}
     for word in options.columns:
         ours, _, theirs = word.partition("=")
@@ -176,7 +175,7 @@ def _read_csv(path: Path, options: ImportOptions) -> Recording:
 
 
 def _table(path: Path, named: dict[str, str]) -> Table:
-    """The table of a file that has these columns: our name and the file's of each."""
+    """The table of a file with these columns: our name → the file's name."""
     table = read_table(path, tuple(named.values()))
     labels = pd.Series([str(label) for label in table.columns])
     single = {ours: theirs for ours, theirs in named.items() if "+" not in theirs}
@@ -192,7 +191,7 @@ def _table(path: Path, named: dict[str, str]) -> Table:
 def _csv_reference(table: Table, gyro: Sensor, unit: str | None) -> Track | None:
     """The reference in the package's own columns, on the gyro's stamps."""
     if not np.isfinite(gyro.stamps).all() or len(gyro.stamps) < 2:
-        return None  # the gyro is refused for this
+        return None  # the gyro is refused for the same reason
     first = gyro.stamps.min().item()
     unit = unit or time_unit(gyro.stamps - first)[0]
     poses = reference(table, seconds(gyro.stamps, first, unit)) if unit else None
@@ -205,7 +204,8 @@ def _csv_reference(table: Table, gyro: Sensor, unit: str | None) -> Track | None
 
 
 def _read_euroc(path: Path) -> Recording:
-    """The folder `mav0`, or the one that holds it, at any rate, with or without a reference."""
+    """Read the folder `mav0`, or the one that contains it, at any rate, with or without a
+    reference."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     table = euroc.read_table(mav / "imu0" / "data.csv")
     gyro = sensor_of("gyro", table, euroc.STAMP, *euroc.GYRO)
@@ -224,7 +224,7 @@ def _read_euroc(path: Path) -> Recording:
 
 
 def write_imported(path: str | os.PathLike[str], recording: Imported) -> None:
-    """Write the sequence, its notes and warnings as `write_hdf5` does."""
+    """Write the sequence as `write_hdf5` does, with its notes and warnings."""
     sequence = recording.sequence
     lines = {_NOTES: recording.notes, _WARNINGS: recording.warnings}
     texts = {
@@ -236,8 +236,8 @@ def write_imported(path: str | os.PathLike[str], recording: Imported) -> None:
 
 
 def read_imported(path: Path, options: ImportOptions = NOTHING_STATED) -> Imported:
-    """A recording in the package's HDF5, which has notes and warnings where an import wrote it; a
-    file of any other format is imported. Raises `InputError`."""
+    """Read a recording in the package's HDF5 format, which has notes and warnings if an import
+    wrote it. A file of any other format is imported. Raises `InputError`."""
     if path.suffix.lower() not in HDF5:
         return import_recording(path, options)
     sequence = read_hdf5(path)
@@ -249,7 +249,7 @@ def read_imported(path: Path, options: ImportOptions = NOTHING_STATED) -> Import
 
 
 def impressions(sequence: Sequence) -> list[str]:
-    """What a person can compare with what was recorded: length, strength, rest."""
+    """Lines that a person can compare with the recording: length, magnitudes, rest."""
     time = sequence.time
     step = float(np.median(np.diff(time)))
     accel, gyro = (np.linalg.norm(field, axis=1) for field in (sequence.accel, sequence.gyro))

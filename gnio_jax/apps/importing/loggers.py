@@ -1,36 +1,36 @@
 """The exports of phone loggers: a zip or folder of CSV files, one CSV, or a workbook.
 
-Zips are read in memory: nothing is ever unpacked to the disk.
+Zips are read in memory: nothing is unpacked to the disk.
 
 Facts of Sensor Logger (Kelvin Choi; Android and iOS), from its documentation
 (github.com/tszheichoi/awesome-sensor-logger):
 
-- A CSV of each sensor with the columns `time,seconds_elapsed,z,y,x`: ns since 1970, s since the
-  start (UNITS.md).
+- There is a CSV of each sensor with the columns `time,seconds_elapsed,z,y,x`: ns since 1970, s
+  since the start (UNITS.md).
 - `Gyroscope` and `GyroscopeUncalibrated` are in rad/s, with the same axes on both systems
   (UNITS.md, COORDINATES.md).
 - `Accelerometer` is in m/s² without gravity, `Gravity` in m/s²; their sum is the accelerometer's
   reading. Android adds `TotalAcceleration`, gravity included, m/s² (UNITS.md).
 - `AccelerometerUncalibrated` includes gravity, in m/s² on Android; on iOS in g unless "Standardise
-  Units & Frames" is on (UNITS.md). Its magnitude tells.
+  Units & Frames" is on (UNITS.md). Its magnitude shows the unit.
 - All accelerations of iOS have the other sign, unless that setting is on (CROSSPLATFORM.md).
 - `Metadata.csv` says `platform`, ios or android (seen in exports of releases 1.10 and 1.28), and
   since 1.29 `standardisation`, false where that setting is off (seen), true where it is on
-  (assumed). Where the file is missing, `TotalAcceleration` tells Android. Otherwise the sign must
-  be stated.
+  (assumed). If the file is missing, `TotalAcceleration` shows that it is Android. Otherwise the
+  sign must be stated.
 
 Facts of phyphox (RWTH Aachen; Android and iOS), from its sources (github.com/phyphox):
 
-- A table for each set of an experiment's export: `Accelerometer`, `Gyroscope`, `Linear
-  Acceleration`, ..., of a single sensor `Raw Data` (phyphox-android, SimpleExperimentCreator.java,
-  accelerometer.phyphox). A zip has `meta/` beside them, a workbook the sheets `Metadata ...`
-  (DataExport.java).
+- There is a table for each set of an experiment's export: `Accelerometer`, `Gyroscope`, `Linear
+  Acceleration`, ...; for a single sensor it is `Raw Data` (phyphox-android,
+  SimpleExperimentCreator.java, accelerometer.phyphox). A zip also has `meta/`, and a workbook the
+  sheets `Metadata ...` (DataExport.java).
 - Columns `Time (s)`, `Acceleration x (m/s^2)`, `Linear Acceleration x (m/s^2)`, `Gyroscope x
   (rad/s)`. Earlier releases wrote `X (m/s^2)` and `X (rad/s)` (seen in exports). The app translates
-  names, so that the units and the axes tell here, and of the names only Linear and Gravity.
+  names, so sensors are recognised by units and axes, and only Linear and Gravity by their names.
 - Separators are comma, semicolon or tab, the decimal is a point or a comma; short columns are
   filled with NaN (DataExport.java).
-- All sensors share one clock, s since the start. It stands while the experiment is paused
+- All sensors share one clock, s since the start. It stops while the experiment is paused
   (ExperimentTimeReference.java); `meta/time.csv`, or the sheet `Metadata Time`, has the times of
   START and PAUSE by the phone's clock too.
 - "Acceleration" includes gravity, "Linear Acceleration" does not. iOS's readings are multiplied by
@@ -67,13 +67,13 @@ from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import interpolate
 
 XLS_MAGIC = b"\xd0\xcf\x11\xe0"
-"""First bytes of an OLE file: .xls."""
+"""First bytes of an OLE file (.xls)."""
 LARGEST = 512 * 2**20
-"""Bytes to which a table may unpack: six hours of a sensor at 200 Hz are less (ours)."""
+"""Largest unpacked size of a table, bytes: six hours of a sensor at 200 Hz are less (ours)."""
 MOST_TABLES = 200
-"""CSV files; a logger writes one for each sensor (ours)."""
+"""Largest number of CSV files; a logger writes one for each sensor (ours)."""
 _HEAD = 4096
-"""Bytes that hold the first line of a table."""
+"""Number of bytes that contain the first line of a table."""
 _AXIS = re.compile(r"\b([xyz])\b", re.IGNORECASE)
 _KINDS = ("gyro", "accel", "linear", "gravity", "raw")
 _TURNS = ("rad/s", "deg/s")
@@ -96,9 +96,9 @@ class _File(NamedTuple):
     """A table of an export, not yet read."""
 
     name: str
-    """Within a zip, folder or workbook, "meta/time.csv"."""
+    """Name within a zip, folder or workbook, such as "meta/time.csv"."""
     labels: tuple[str, ...]
-    """Of its columns."""
+    """Names of its columns."""
     read: Callable[[], Table]
 
     @property
@@ -121,14 +121,15 @@ class _Set(NamedTuple):
 
 
 def is_phyphox(labels: Iterable[str]) -> bool:
-    """By the columns of a table: a time in s, and three axes in units of an IMU."""
+    """Whether the columns of a table are phyphox's: a time in s, and three axes in units of an
+    IMU."""
     labels = list(labels)
     return any(map(_is_time, labels)) and bool(_axes_of(labels))
 
 
 def read_logger(path: Path) -> Recording:
-    """A recording of an export of either app. Raises `InputError` where it is of neither, where a
-    sensor is missing, and where there is only acceleration without gravity."""
+    """Read a recording exported by either app. Raises `InputError` if it is from neither, if a
+    sensor is missing, or if there is only acceleration without gravity."""
     files = _files(path)
     if any("seconds_elapsed" in file.labels for file in files):
         return _sensor_logger(path, files)
@@ -150,8 +151,8 @@ def _names(files: list[_File]) -> str:
 
 
 def _files(path: Path) -> list[_File]:
-    """Those of a zip, of a folder and its folders, of a workbook, or the one CSV. Raises
-    `InputError` for what is damaged or unpacks to more than a logger writes."""
+    """The tables of a zip, of a folder with its subfolders, of a workbook, or the single CSV.
+    Raises `InputError` for a damaged file or one that unpacks to more than a logger writes."""
     if path.is_dir():
         found = sorted(each for each in (*path.glob("*"), *path.glob("*/*")) if each.is_file())
         return _of_csvs(path, [each.relative_to(path).as_posix() for each in found])
@@ -185,7 +186,7 @@ def _of_csvs(path: Path, names: list[str]) -> list[_File]:
         try:
             labels = table_layout(path / name, first_line).labels
         except InputError:
-            labels = ()  # no text
+            labels = ()  # not a text
         found.append(_File(name, labels, partial(_read_member, path, name)))
     return found
 
@@ -195,13 +196,13 @@ def _read_member(path: Path, name: str) -> Table:
 
 
 def _content(path: Path, name: str, most: int = -1) -> bytes:
-    """What a file of a zip or folder holds, or its first `most` bytes."""
+    """The content of a file of a zip or folder, or its first `most` bytes."""
     if path.is_dir():
         with parsed_as(path / name, "a file"), (path / name).open("rb") as file:
             return file.read(most)
     with parsed_as(path, "a zip"), zipfile.ZipFile(path) as archive:
         _check_size(archive.getinfo(name).file_size, path / name)
-        with archive.open(name) as file:  # it gives no more than the size that it announces
+        with archive.open(name) as file:  # it gives at most the announced size
             return file.read(most)
 
 
@@ -214,10 +215,10 @@ def _check_size(size: int, place: Path) -> None:
 def _of_workbook(path: Path, engine: str) -> list[_File]:
     require_packages(path, "excel", engine)
     options: dict[str, Any] = {"engine": engine}
-    if engine == "xlrd":  # it writes what it thinks of a damaged file to the standard output
+    if engine == "xlrd":  # it writes remarks about a damaged file to the standard output
         options["engine_kwargs"] = {"logfile": io.StringIO()}
     with parsed_as(path, "a workbook"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of styles
+        warnings.simplefilter("ignore")  # warnings about styles
         sheets: dict[Any, pd.DataFrame] = pd.read_excel(path, sheet_name=None, **options)
     return [
         _File(str(name), tuple(map(str, sheet.columns)), partial(Table, path / str(name), sheet))
@@ -302,8 +303,8 @@ def _axes_of(labels: Iterable[str]) -> list[tuple[str, str, tuple[str, ...]]]:
 
 
 def _check_pauses(file: _File, path: Path) -> None:
-    """Raise `InputError` where a table of events tells of a pause: the clock stood, so that nothing
-    in the samples tells that some are missing."""
+    """Raise `InputError` if a table of events has a pause: the clock stopped, so the samples do not
+    show that some are missing."""
     try:
         events = file.read().columns
     except InputError:
@@ -332,8 +333,8 @@ def _check_pauses(file: _File, path: Path) -> None:
 def _recording(
     path: Path, app: str, files: list[_File], sets: list[_Set], sign: str | None
 ) -> Recording:
-    """The gyro, and the accelerometer with gravity in it: of its own, or the sum of the two sets
-    without and of gravity."""
+    """The gyro, and the accelerometer with gravity: from a set of its own, or as the sum of the set
+    without gravity and that of gravity."""
     kinds = {kind: [each for each in sets if each.kind == kind] for kind in _KINDS}
     for sensor, needed in (("gyro", ("gyro",)), ("accelerometer", ("accel", "linear", "raw"))):
         if not any(kinds[kind] for kind in needed):
@@ -360,7 +361,7 @@ def _recording(
 
 
 def _only(kind: str, kinds: dict[str, list[_Set]], path: Path) -> list[_Set]:
-    """The one set of a kind. Raises `InputError` where there are several."""
+    """The only set of a kind. Raises `InputError` if there are several."""
     sets = kinds[kind]
     if len(sets) > 1:
         names = ", ".join(f"{one.file.name} ({one.axes[0]})" for one in sets)
@@ -372,12 +373,12 @@ def _only(kind: str, kinds: dict[str, list[_Set]], path: Path) -> list[_Set]:
 
 
 def _added(motion: Sensor, gravity: Sensor) -> Sensor:
-    """The accelerometer's reading of acceleration without gravity, on the stamps of `motion`, and
-    of gravity, which turns slowly and is interpolated linearly (ours)."""
+    """The accelerometer's reading on the stamps of `motion`: the sum of the acceleration without
+    gravity and of gravity, which turns slowly and is interpolated linearly (ours)."""
     seen = np.isfinite(gravity.values).all(axis=1) & np.isfinite(gravity.stamps)
     if seen.sum() < 2:
         raise InputError(gravity.file, f"holds {seen.sum()} samples", "record for longer")
-    first = np.nanmin(motion.stamps)  # as integers ns of unix time have more digits than a float
+    first = np.nanmin(motion.stamps)  # unix time in ns has more digits than a float
     time, stamps = ((each - first).astype(np.float64) for each in (motion.stamps, gravity.stamps))
     order = np.flatnonzero(seen)[np.argsort(stamps[seen], kind="stable")]
     inside = (time >= stamps[order[0]]) & (time <= stamps[order[-1]])

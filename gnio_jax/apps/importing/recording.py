@@ -1,5 +1,5 @@
-"""A recording as the reader of its format gives it, and the way from there to a `Sequence`: rows in
-order, units and signs, the one clock of all recordings (`data.assembly`), the reference."""
+"""A recording from the reader of its format, and its conversion to a `Sequence`: rows in order,
+units and signs, the uniform clock of all recordings (`data.assembly`), the reference."""
 
 from __future__ import annotations
 
@@ -33,15 +33,17 @@ from gnio_jax.numerics import interpolate
 from gnio_jax.types import Sequence
 
 GAPS = "lacks samples"
-"""What a note of holes in a recording says."""
+"""Words in a note about holes in a recording."""
 SLOW = 50.0
-"""Hz below which the impacts of steps are lost; networks are trained on 100 and more (ours)."""
+"""Rate below which the impacts of steps are lost, Hz; networks are trained on 100 Hz and more
+(ours)."""
 DECIMAL_ROWS = 20
-"""Rows by which a decimal comma is told: in some all numbers may be whole."""
+"""Number of rows in which a decimal comma is searched, because some rows may have only whole
+numbers."""
 
 
 class Units(NamedTuple):
-    """What a format or the user states. None: nothing is stated, and the data must tell."""
+    """Units that a format or the user states. None: not stated, so it is detected from the data."""
 
     time: str | None = None
     """s, ms, us or ns."""
@@ -50,13 +52,13 @@ class Units(NamedTuple):
     accel: str | None = None
     """m/s2, g or mg."""
     sign: str | None = None
-    """Of the accelerometer: android, ios or detect (see `units.signed`)."""
+    """Sign of the accelerometer: android, ios or detect (see `units.signed`)."""
     sign_is_assumed: bool = False
-    """Nothing says that the sign is this one."""
+    """Whether the sign is only assumed."""
 
 
 class Sensor(NamedTuple):
-    """A sensor's samples as its file has them: rows in any order, in the file's units."""
+    """A sensor's samples as in its file: rows in any order, in the file's units."""
 
     name: str
     """gyro or accel, for messages."""
@@ -64,7 +66,7 @@ class Sensor(NamedTuple):
     stamps: Num[np.ndarray, " n"]
     values: Float[np.ndarray, "n 3"]
     row: Callable[[int], int] = from_one
-    """The row of the file that holds a sample, for messages."""
+    """A function from a sample to its row in the file, for messages."""
 
     def where(self, kept: Bool[np.ndarray, " n"]) -> Sensor:
         """The samples in these rows."""
@@ -77,62 +79,62 @@ class Sensor(NamedTuple):
 
 
 class Track(NamedTuple):
-    """A reference trajectory by the clock of the IMU's stamps."""
+    """A reference trajectory on the clock of the IMU's stamps."""
 
     name: str
-    """The file or topic, as the sequence's attribute `truth` has it."""
+    """The file or topic, as in the sequence's attribute `truth`."""
     poses: Poses
-    """Of the IMU in a z-up world, in s after `start`."""
+    """Poses of the IMU in a z-up world, in s after `start`."""
     start: Fraction
     """s."""
     named: bool = False
-    """The user asked for it: what is wrong with it is an error, and else a note."""
+    """Whether the user asked for it. A problem is then an error, and otherwise a note."""
 
 
 class Recording(NamedTuple):
-    """A recording as a reader gives it, before units, clocks and rates."""
+    """A recording from a reader, before the conversion of units, clocks and rates."""
 
     path: Path
-    """As the user named it."""
+    """Path, as the user named it."""
     gyro: Sensor
     accel: Sensor
     units: Units = Units()
     track: Track | None = None
     notes: tuple[str, ...] = ()
-    """What was recognised, chosen or left out, one sentence each."""
+    """Notes about what was recognised, chosen or left out, one sentence each."""
     raw_gyro: bool = False
-    """Whether it is known that the phone takes no bias off the gyro."""
+    """Whether it is known that the phone subtracts no bias from the gyro."""
 
 
 class Imported(NamedTuple):
     """A recording on a uniform clock."""
 
     sequence: Sequence
-    """With a reference where the recording has one."""
+    """The sequence, with a reference if the recording has one."""
     notes: tuple[str, ...]
-    """What was detected, assumed or repaired, one sentence each, to be shown to the user."""
+    """Notes for the user about what was detected, assumed or repaired, one sentence each."""
     warnings: tuple[str, ...] = ()
-    """What may make everything wrong that is computed from it, one sentence each."""
+    """Warnings about problems that may make all results wrong, one sentence each."""
 
 
 # --- from a table to the samples of a sensor
 
 
 class Layout(NamedTuple):
-    """How the rows of a text table are written."""
+    """The format of the rows of a text table."""
 
     separator: str
-    """" " stands for any run of blanks."""
+    """Separator of cells; " " means any run of blanks."""
     decimal: str
-    """A point, or the comma of loggers set to it."""
+    """Decimal mark: a point, or a comma, depending on the logger's settings."""
     labels: tuple[str, ...]
     """The cells of the first row, without quotes."""
 
 
 def table_layout(path: Path, content: bytes | None = None) -> Layout:
-    """The layout of a table, from its first rows: it is separated by the most frequent of comma,
-    semicolon and tab, or by blanks where there is none of them. `content` is what the file holds
-    where it is part of an archive. Raises `InputError` for what is no text."""
+    """The layout of a table, from its first rows. The separator is the most frequent of comma,
+    semicolon and tab, or blanks if there is none of them. `content` is the content of a file that
+    is part of an archive. Raises `InputError` if it is no text."""
     try:
         with open_text(path, content) as file:
             rows = (line for line in file if line.strip() and not line.startswith("#"))
@@ -149,7 +151,7 @@ def table_layout(path: Path, content: bytes | None = None) -> Layout:
 
 
 def read_table(path: Path, columns: tuple[str, ...] = (), content: bytes | None = None) -> Table:
-    """A logger's table; without a header where all `columns` that are wanted are places."""
+    """A logger's table; without a header if all wanted `columns` are numbers."""
     layout = table_layout(path, content)
     parts = [part.strip() for name in columns for part in name.split("+")]
     header = not (parts and all(part.isdigit() for part in parts))
@@ -158,7 +160,7 @@ def read_table(path: Path, columns: tuple[str, ...] = (), content: bytes | None 
 
 
 def _label(text: object) -> str:
-    """The name of a column: some begin with a byte order mark, some are quoted."""
+    """The name of a column, without a byte order mark or quotes."""
     return str(text).strip("\ufeff \"'\n\r")
 
 
@@ -166,7 +168,7 @@ def sensor_of(name: str, table: Table, time: str, *axes: str) -> Sensor:
     """The samples in the columns `time` and `axes` (x, y, z) of a table; each may be "a+b", the sum
     of two columns."""
     whole = time in table.columns and table.columns[time].dtype.kind in "iu"
-    # Columns that are shorter than others end in NaN, which is no sample.
+    # Columns that are shorter than others end with NaN, which is no sample.
     stamps = table.stamps(time) if whole else _column(table, time)
     values = np.stack([_column(table, axis) for axis in axes], axis=1)
     return Sensor(name, table.path, stamps, values, table.row)
@@ -182,8 +184,8 @@ def _column(table: Table, name: str) -> Float[np.ndarray, " n"]:
 
 
 def as_sequence(source: Recording, stated: Units, rate: float | None, name: str) -> Imported:
-    """What any format comes to; `stated` wins over what the format says of its units. Raises
-    `InputError`."""
+    """The sequence of a recording in any format; units in `stated` override those of the format.
+    Raises `InputError`."""
     notes, warnings = list(source.notes), []
     unit = stated.time or source.units.time
     gyro, accel = (_clocked(sensor, unit, notes) for sensor in (source.gyro, source.accel))
@@ -234,17 +236,18 @@ class _Clocked(NamedTuple):
     """s since `start`."""
     values: Float[np.ndarray, "n 3"]
     start: Fraction
-    """s: the first stamp, exactly, since unix time in a float is good to a quarter of a
+    """The exact first stamp, s, because unix time in a float has an accuracy of a quarter of a
     microsecond."""
 
 
 def _clocked(sensor: Sensor, unit: str | None, notes: list[str]) -> _Clocked:
-    """`unit` is that of the stamps, None detects it. What was detected or repaired is added to
-    `notes`."""
+    """The samples in order. `unit` is that of the stamps; None: it is detected. Notes about
+    detection and repairs are added to `notes`."""
     name, file = sensor.name, sensor.file
     empty = np.isnan(sensor.values).all(axis=1)
     if empty.any() and not empty.all():
-        # Loggers that write every sensor into one table leave the others' columns empty.
+        # Loggers that write all sensors into one table leave the columns of the other sensors
+        # empty.
         notes.append(
             f"{file.name}: {empty.sum()} of {len(empty)} rows have no value of {name} and "
             "are left out for it"
@@ -333,13 +336,13 @@ def _in_si(
 def _with_track(
     streams: Streams, rate: float | None, track: Track, start: Fraction, notes: list[str]
 ) -> Sequence | None:
-    """The recording with the reference; None where it can be none, or does not describe the motion
-    of the IMU."""
+    """The recording with the reference; None if that is no valid reference, or does not describe
+    the motion of the IMU."""
     poses = track.poses._replace(time=track.poses.time + float(track.start - start))
     about = streams.attributes | {"truth": track.name}
     try:
         (result,) = assemble(streams._replace(poses=poses, attributes=about), rate, whole=True)
-        # What the self-check would leave out is no reference.
+        # A reference that fails the self-check is not used.
         if failures := self_check(result, pedestrian=False).failures:
             raise InputError(
                 poses.source,

@@ -1,14 +1,15 @@
 """The IMU and the reference of a robot's recording: rosbag1, rosbag2 (a folder, or its .db3), MCAP.
 
 The library `rosbags` reads both kinds of bag and decodes messages, `mcap` reads MCAP, of ROS 1 too;
-both are in the extra `bags`. Messages are decoded by their standard definitions (ROS 1 Noetic,
-ROS 2 Humble), which are those of all distributions for the types that are read here; what a bag
-says of its own types is not needed.
+both are in the extra `bags`. Messages are decoded by their standard definitions (ROS 1 Noetic, ROS
+2 Humble), which are the same in all distributions for the types that are read here, so the
+definitions inside a bag are not needed.
 
 Conventions of ROS: `sensor_msgs/Imu` is in rad/s and m/s² with gravity (REP 145; a driver that
 gives g is recognised by its magnitude), poses map the body to a z-up world (REP 103). A first
 element of −1 in a covariance of `Imu` says that the quantity is not measured (sensor_msgs/Imu.msg).
-Samples are stamped by their headers, the sensor's clock; where headers are empty, by the bag.
+Samples have the stamps of their headers, the sensor's clock; if headers are empty, those of the
+bag.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ KINDS = {"rosbag1": "a ROS 1 bag", "rosbag2": "a ROS 2 bag", "mcap": "an MCAP"}
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a whole MCAP (mcap.dev/spec)."""
 LARGEST_CHUNK = 1 << 30
-"""Bytes to which a chunk of an MCAP may unpack; recorders cut them at some MiB (ours)."""
+"""Largest unpacked size of a chunk of an MCAP, bytes; recorders limit chunks to some MiB (ours)."""
 FAST_TRACKER = 20.0
-"""Hz from which a tracker's noise is smoothed and the gyro carries its attitude; below it its poses
-are taken as they are (ours)."""
+"""Rate from which a tracker's poses are smoothed and its attitude is carried by the gyro, Hz; below
+it poses are not changed (ours)."""
 SLOWEST = 4.0
-"""Hz below which a reference says too little of a walk (ours)."""
+"""Rate below which a reference describes a walk too coarsely, Hz (ours)."""
 IMU = "sensor_msgs/msg/Imu"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 POSES = (
@@ -55,22 +56,22 @@ POSES = (
 
 
 class Topics(NamedTuple):
-    """What the user names; None takes the only one."""
+    """Topics that the user names; None takes the only one."""
 
     imu: str | None = None
-    """Of sensor_msgs/Imu."""
+    """Topic of sensor_msgs/Imu."""
     accel: str | None = None
-    """The accelerometer's, where it is another one."""
+    """Topic of the accelerometer, if it is another one."""
     reference: str | None = None
-    """Of poses; "/tf:CHILD_FRAME" of transforms."""
+    """Topic of poses; "/tf:CHILD_FRAME" for transforms."""
 
 
 def read_bag(path: Path, kind: str, topics: Topics) -> Recording:
-    """The IMU of a bag of one of `KINDS`, and its reference where there is one.
+    """The IMU of a bag of one of `KINDS`, and its reference if there is one.
 
-    One topic of `sensor_msgs/Imu` is taken without being named, and so is one of poses; of several
-    the IMU must be named, and of the poses none is taken. Raises `InputError` that names the topics
-    there are.
+    A single topic of `sensor_msgs/Imu` need not be named, and neither need a single topic of poses.
+    If there are several, the IMU must be named, and no poses are taken. Raises `InputError` that
+    names the existing topics.
     """
     notes: list[str] = []
     with _opened(path, kind) as bag:
@@ -109,7 +110,7 @@ def read_bag(path: Path, kind: str, topics: Topics) -> Recording:
 class _Topic(NamedTuple):
     name: str
     type: str
-    """As in ROS 2: sensor_msgs/msg/Imu."""
+    """Type, as in ROS 2: sensor_msgs/msg/Imu."""
     count: int
     """Messages."""
 
@@ -120,8 +121,8 @@ class _Bag(NamedTuple):
     path: Path
     topics: dict[str, _Topic]
     messages: Callable[[Collection[str]], Iterator[tuple[str, int, Any]]]
-    """(topic, when it was recorded ns, decoded message) of each message of some topics. What fails
-    in a library on the way is an `InputError`."""
+    """A function that gives (topic, time of recording ns, decoded message) of each message of some
+    topics. A failure inside a library is an `InputError`."""
 
 
 @contextmanager
@@ -135,7 +136,8 @@ def _opened(path: Path, kind: str) -> Iterator[_Bag]:
 
 @contextmanager
 def _reading(path: Path, kind: str) -> Iterator[None]:
-    """What the libraries raise within is damage of the file: rosbags asserts what it expects."""
+    """Report errors of the libraries as damage of the file: rosbags also uses assertions for
+    this."""
     with parsed_as(path, KINDS[kind]):
         try:
             yield
@@ -163,7 +165,7 @@ def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
 
 def _check_compression(path: Path) -> None:
     """Raise `InputError` for a bag whose files are compressed as a whole: the library would unpack
-    them to the disk, whatever their size. (Single messages it unpacks in memory, one by one.)"""
+    them to the disk, at any size. (It unpacks single messages in memory, one by one.)"""
     with (path / "metadata.yaml").open(encoding="utf-8") as file:
         content = yaml.safe_load(file)
     about = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
@@ -214,8 +216,8 @@ def _mcap(path: Path, stack: ExitStack) -> _Bag:
 
 
 def _joined(found: Iterable[tuple[str, str, int]]) -> dict[str, _Topic]:
-    """The topics of connections or channels, of which a topic may have several: (topic, type,
-    messages) of each."""
+    """The topics of connections or channels, each (topic, type, messages). A topic may have
+    several."""
     topics: dict[str, _Topic] = {}
     for topic, kind, count in found:
         package, _, rest = kind.partition("/")
@@ -250,7 +252,7 @@ def _imu_topic(bag: _Bag, name: str | None) -> _Topic:
 
 
 def _reference_topic(bag: _Bag, name: str | None, notes: list[str]) -> tuple[_Topic | None, str]:
-    """The topic, and the child frame that is asked for ("" for any)."""
+    """The topic, and the requested child frame ("" for any)."""
     if name is not None:
         topic, _, child = name.partition(":")
         return _named(bag, topic, (*POSES, *TRANSFORMS), "pose"), child
@@ -292,18 +294,18 @@ class _Pose(NamedTuple):
     """One pose of a message."""
 
     stamp: int
-    """ns, 0 where the message has none."""
+    """Stamp of the message, ns; 0 if it has none."""
     logged: int
     """Stamp of the bag, ns."""
     parent: str
     child: str
-    """Frame of the body, "" where the message does not say."""
+    """Frame of the body; "" if the message does not name it."""
     values: tuple[float, ...]
     """Position m, quaternion wxyz."""
 
 
 class _Imu(NamedTuple):
-    """An IMU topic: numbers, since decoded messages take a kilobyte each."""
+    """An IMU topic as arrays of numbers, because a decoded message takes a kilobyte."""
 
     first: Any
     """Its first message."""
@@ -316,11 +318,11 @@ class _Imu(NamedTuple):
 
     @property
     def by_headers(self) -> bool:
-        """Stamped by its headers; else they are empty, and the bag's stamps are taken."""
+        """Whether the headers have stamps; otherwise the bag's stamps are used."""
         return bool(self.headers.all())
 
     def sensor(self, name: str, topic: str, path: Path) -> Sensor:
-        """Its gyro or accel, which the topic must have."""
+        """The gyro or accel, which the topic must have."""
         first = self.first
         gyro, accel = first.angular_velocity_covariance, first.linear_acceleration_covariance
         if (gyro if name == "gyro" else accel)[0] == -1.0:
@@ -332,13 +334,13 @@ class _Imu(NamedTuple):
 
 
 _Mounted = dict[tuple[str, str], SensorPose]
-"""(parent, child) -> the child in the parent, of static transforms."""
+"""(parent, child) -> pose of the child in the parent, from static transforms."""
 
 
 def _collected(
     bag: _Bag, imus: set[str], reference: _Topic | None
 ) -> tuple[dict[str, _Imu], list[_Pose], _Mounted]:
-    """(the IMU topics, the poses of the reference, the static transforms)."""
+    """The IMU topics, the poses of the reference, and the static transforms."""
     static = {name for name in bag.topics if name.endswith("tf_static")}
     of_poses = set() if reference is None else {reference.name}
     first: dict[str, Any] = {}
@@ -356,7 +358,7 @@ def _collected(
         if topic in static:
             for pose in _poses(message, logged):
                 place, turn = np.array(pose.values[:3]), np.array(pose.values[3:])
-                if abs(np.linalg.norm(turn) - 1.0) < UNIT_NORM_TOLERANCE:  # else it joins nothing
+                if abs(np.linalg.norm(turn) - 1.0) < UNIT_NORM_TOLERANCE:  # otherwise it is ignored
                     frames = _frame(pose.parent), _frame(pose.child)
                     mounted[frames] = SensorPose(rotations(turn), place)
     found = {}
@@ -375,7 +377,7 @@ def _stamp(message: Any) -> int:
 
 
 def _poses(message: Any, logged: int) -> Iterator[_Pose]:
-    """Those of a message of any type of `POSES` and `TRANSFORMS`."""
+    """The poses of a message of any type of `POSES` and `TRANSFORMS`."""
     if hasattr(message, "transforms"):
         for one in message.transforms:
             yield from _poses(one, logged)
@@ -405,7 +407,7 @@ def _track(
     path: Path,
     notes: list[str],
 ) -> Track:
-    """The poses of a topic, or of its frame `child`, as those of the IMU's frame."""
+    """The poses of a topic, or of its frame `child`, converted to those of the IMU's frame."""
     rows = [pose for pose in poses if child in ("", pose.child)]
     children = sorted({pose.child for pose in poses})
     if not rows or (len(children) > 1 and not child):
@@ -448,13 +450,13 @@ def _track(
 
 
 def _frame(name: str) -> str:
-    """ROS 1 allows a slash before a frame's name."""
+    """A frame's name without the slash that ROS 1 allows before it."""
     return name.lstrip("/")
 
 
 def _place(body: str, imu: str, mounted: _Mounted) -> SensorPose | None:
-    """The frame `imu` in the frame `body`, along the static transforms; None where they do not
-    join."""
+    """The pose of the frame `imu` in the frame `body`, along the static transforms; None if these
+    do not connect the frames."""
     reached, todo = {_frame(body): SensorPose()}, [_frame(body)]
     while todo:
         here = todo.pop()

@@ -1,4 +1,4 @@
-"""Units and signs that a header or the data tell, or that are refused as ambiguous."""
+"""Detection of units and signs from a header or from the data; ambiguous ones are refused."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ _SPELLINGS = {
     "us": ("us", "µs", "μs"),
     "ns": ("ns",),
 }
-"""Our names of units, and what headers call them, without blanks and in small letters."""
+"""Our names of units, and their names in headers, without blanks and in small letters."""
 _NAMED = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
 
 GRAVITY_RANGES = {"m/s2": (7.0, 13.0), "g": (0.7, 1.3), "mg": (700.0, 1300.0)}
-"""Median magnitude of the accelerometer, by which its unit is told."""
+"""Ranges of the accelerometer's median magnitude, by which its unit is recognised."""
 GYRO_RANGE = 35.0
-"""rad/s: no phone's gyro measures beyond 2000 deg/s."""
+"""Largest rate of a phone's gyro, rad/s: none measures more than 2000 deg/s."""
 CARRIED_TURN = 10.0
-"""deg/s: what somebody carries turns faster than this at times."""
+"""A phone that somebody carries sometimes turns faster than this, deg/s."""
 STEPS = 1.0
-"""m/s²: steps make the magnitude of the specific force vary by more (standard deviation)."""
+"""Standard deviation of the magnitude of the specific force, m/s², which steps exceed."""
 
 
 class Motion(NamedTuple):
@@ -53,8 +53,8 @@ class Motion(NamedTuple):
 
 
 def named_unit(label: str) -> str | None:
-    """The unit that a column's header names at its end, in round or square brackets: "rad/s" of
-    "Gyroscope x (rad/s)"; None where it names none that is known."""
+    """The unit at the end of a column's header, in round or square brackets, such as "rad/s" in
+    "Gyroscope x (rad/s)"; None if it names no known unit."""
     inside = re.search(r"[(\[]([^()\[\]]*)[)\]]\s*$", label)
     return _NAMED.get(re.sub(r"[\s*·]", "", inside[1]).lower()) if inside else None
 
@@ -68,7 +68,8 @@ def common_unit(labels: Iterable[str], known: Iterable[str]) -> str | None:
 def accel_scale(
     accel: Float[np.ndarray, "n 3"], unit: str | None, path: Path, notes: list[str]
 ) -> float:
-    """m/s² of one unit; None detects the unit. Raises `InputError` where it is ambiguous."""
+    """Value of one unit in m/s²; the unit None is detected. Raises `InputError` if it is
+    ambiguous."""
     if unit is not None:
         return TO_METRES_PER_SECOND_SQUARED[unit]
     size = float(np.median(np.linalg.norm(accel, axis=1)))
@@ -82,11 +83,11 @@ def accel_scale(
 
 
 def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> float:
-    """rad/s of one unit; None detects the unit. `imu.accel` is in m/s².
+    """Value of one unit in rad/s; the unit None is detected. `imu.accel` is in m/s².
 
-    Beyond `GYRO_RANGE` it is deg/s; else the turning of gravity in the accelerometer tells where
-    there is enough of it; else, if steps shake the recording, what never exceeds `CARRIED_TURN` is
-    rad/s. Raises `InputError` where it is ambiguous.
+    Beyond `GYRO_RANGE` it is deg/s. Otherwise the rotation of gravity in the accelerometer decides,
+    if it is large enough. Otherwise, if the recording has steps and never exceeds `CARRIED_TURN`,
+    it is rad/s. Raises `InputError` if it is ambiguous.
     """
     if unit is not None:
         return TO_RAD_PER_SECOND[unit]
@@ -100,7 +101,7 @@ def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> f
     elif fitting:
         unit, reason = fitting[0], f"gravity turns by {slope:.2g} of it"
     elif peak <= CARRIED_TURN and shaken:
-        reason = f"what is carried turns faster than {CARRIED_TURN:g} deg/s"
+        reason = f"a carried phone turns faster than {CARRIED_TURN:g} deg/s"
         unit, reason = "rad/s", f"it reaches {peak:.3g}, and {reason}"
     else:
         problem = f"the unit of field 'gyro' is ambiguous (it reaches {peak:.3g})"
@@ -110,8 +111,9 @@ def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> f
 
 
 def check_rad_per_second(imu: Motion, path: Path) -> None:
-    """Raise `InputError` where a gyro that a format or header gives a unit does not turn as gravity
-    does, but by the factor between rad and deg. `imu` is in SI units by that statement."""
+    """Raise `InputError` if a gyro whose unit a format or header states differs from the rotation
+    of gravity by the factor between rad and deg. `imu` is in SI units according to that
+    statement."""
     (slope, told), factor = _turning_of_gravity(imu), TO_RAD_PER_SECOND["deg/s"]
     for share, looks in ((slope / factor, "deg/s"), (slope * factor, "rad/s")):
         if told and 0.5 < share < 2.0:
@@ -121,8 +123,8 @@ def check_rad_per_second(imu: Motion, path: Path) -> None:
 
 
 def _turning_of_gravity(imu: Motion) -> tuple[float, bool]:
-    """(slope, whether it tells the unit) of the change of the smoothed specific force over a second
-    against −∫ω × f: 1 where ω is in rad/s. It tells where both correlate by more than 0.5."""
+    """Slope of the change of the smoothed specific force over a second against −∫ω × f, which is 1
+    if ω is in rad/s, and whether it shows the unit: if both correlate by more than 0.5."""
     step = float(np.median(np.diff(imu.time)))
     clock = np.arange(imu.time[0], imu.time[-1], step)
     if len(clock) < 3.0 / step:
@@ -131,14 +133,14 @@ def _turning_of_gravity(imu: Motion) -> tuple[float, bool]:
         gaussian_filter1d(interpolate(clock, imu.time, values), 0.5 / step, axis=0)
         for values in (imu.accel, imu.gyro)
     )
-    # A bias turns the same way all the time; what moves about its median is motion.
+    # A bias is a constant rate; deviations from the median are motion.
     rate = rate - np.median(rate, axis=0)
     turned = np.cumsum(-np.cross(rate, force), axis=0) * step
     turned = np.concatenate([np.zeros((1, 3)), turned])[:-1]
     second = max(round(1.0 / step), 1)
     change, expected = force[second:] - force[:-second], turned[second:] - turned[:-second]
     power, strength = float((expected**2).sum()), float((change**2).sum())
-    # Where gravity has not moved there is only noise and vibration.
+    # If gravity has not moved, there is only noise and vibration.
     if power == 0.0 or strength / len(change) < 0.1**2:
         return 0.0, False
     both = float((change * expected).sum())
@@ -150,8 +152,8 @@ def signed(
 ) -> Float[np.ndarray, "n 3"]:
     """`accel` with Android's sign: at rest, level, the up axis reads +1 g.
 
-    `sign` "ios" negates it, "detect" assumes that the screen (+z) points up more than down. Raises
-    `InputError` where that is ambiguous.
+    `sign` "ios" negates it, and "detect" assumes that the screen (+z) points up more than down.
+    Raises `InputError` if that is ambiguous.
     """
     if sign == "detect":
         up = float(np.median(accel[:, 2]) / np.median(np.linalg.norm(accel, axis=1)))
@@ -170,8 +172,8 @@ def signed(
 def note_gravity(
     time: Float[np.ndarray, " n"], accel: Float[np.ndarray, "n 3"], path: Path, notes: list[str]
 ) -> str:
-    """What the quietest second says of gravity, as notes; the axis that reads most of it is
-    returned, as "+z". Raises `InputError` where gravity is far off."""
+    """Add notes about gravity in the quietest second, and return the axis that reads most of it,
+    such as "+z". Raises `InputError` if gravity is far off."""
     second = min(max(round(1.0 / float(np.median(np.diff(time)))), 2), len(accel))
     starts = range(0, len(accel) - second + 1, max(second // 2, 1))
     seconds = [accel[start : start + second] for start in starts]

@@ -1,7 +1,8 @@
-"""A program as an ONNX model; the only importer of jax2onnx.
+"""A program as an ONNX model.
 
-jax2onnx replaces layers of Flax and functions of jax.numpy by its own while it traces. A program is
-therefore traced here, and jax2onnx sees primitives of JAX alone: what is converted is what runs.
+Only this module imports jax2onnx. While it traces, jax2onnx replaces layers of Flax and functions
+of jax.numpy by its own. A program is therefore traced here, and jax2onnx sees only primitives of
+JAX: it converts the program that runs.
 """
 
 # The extra `onnx` need not be installed where types are checked, and this folder has its name.
@@ -19,7 +20,7 @@ from gnio_jax.apps.onnx.programs import Program
 from gnio_jax.filtering.settings import FilterSetup
 
 OPSET = 18
-"""Of the ONNX operators: ONNX Runtime 1.14 or newer reads it."""
+"""Version of the ONNX operators, which ONNX Runtime 1.14 or newer reads."""
 
 
 def to_model(program: Program, setup: FilterSetup) -> bytes:
@@ -27,7 +28,7 @@ def to_model(program: Program, setup: FilterSetup) -> bytes:
     shapes and types.
 
     float64 stays float64. The metadata have the numbers that the loop around the models needs.
-    Raises what jax2onnx raises for an operation that it does not know.
+    Raises the error of jax2onnx for an operation that it does not know.
     """
     import onnx
     import onnx_ir
@@ -61,8 +62,8 @@ def to_model(program: Program, setup: FilterSetup) -> bytes:
 
 
 def _name_ends(graph: Any, program: Program) -> None:
-    """Give inputs and outputs their names, by copies at both ends: one value may be two outputs, or
-    an input too. ONNX Runtime removes the copies."""
+    """Give inputs and outputs their names, by copies at both ends, because one value may be two
+    outputs, or an input and an output. ONNX Runtime removes the copies."""
     from onnx import helper
 
     at_start = zip(program.inputs, graph.input, strict=True)

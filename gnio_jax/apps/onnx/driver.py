@@ -1,7 +1,7 @@
-"""Exported models driven by ONNX Runtime, as a program without JAX drives them.
+"""Exported models run by ONNX Runtime, as in a program without JAX.
 
 This is the loop that a user writes in another language; `examples/onnx/track.cpp` is the same in
-C++. It needs NumPy and ONNX Runtime alone, but for the shapes in its annotations.
+C++. It needs only NumPy and ONNX Runtime, except for the shapes in its annotations.
 """
 
 # The extra `onnx` need not be installed where types are checked.
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 STATE, NEXT, POSE = "state.", "next.", "pose."
-"""Begin the names of arrays of the state, of the state after a step, and of the pose."""
+"""Prefixes of the names of arrays of the state, of the state after a step, and of the pose."""
 
 
 class Models(NamedTuple):
@@ -32,10 +32,11 @@ class Models(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """What the models make of K clone intervals."""
+    """The results of the models for K clone intervals."""
 
     windows: Float[np.ndarray, "m n 6"]
-    """That the network saw: none in the first `first_measured` intervals, F, m = K − F."""
+    """Windows that the network saw: none in the first F = `first_measured` intervals, so m = K −
+    F."""
     displacement: Float[np.ndarray, "m 3"]
     """m."""
     position: Float[np.ndarray, "k 3"]
@@ -43,7 +44,7 @@ class Walked(NamedTuple):
     rotation: Float[np.ndarray, "k 3 3"]
     """Body → world."""
     covariance: Float[np.ndarray, "k 15 15"]
-    """Of θ, v, p, b_g, b_a."""
+    """Covariance of θ, v, p, b_g, b_a."""
 
 
 def open_models(folder: Path, threads: int = 1) -> Models:
@@ -74,7 +75,7 @@ def open_session(path: Path, threads: int = 1) -> Any:
 
 
 def run(session: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Outputs by name, of those arrays that the session takes."""
+    """Outputs by name; of `arrays` the session gets those that it takes."""
     inputs = {each.name: arrays[each.name] for each in session.get_inputs()}
     names = [each.name for each in session.get_outputs()]
     return dict(zip(names, session.run(names, inputs), strict=True))
@@ -86,7 +87,7 @@ def walk(
     gyro: Float[np.ndarray, "s 3"],
     accel: Float[np.ndarray, "s 3"],
 ) -> Walked:
-    """Filter K·n samples, rad/s and m/s², raw, from a state: that of `models.start`, or
+    """Filter K·n samples, rad/s and m/s², raw, from the state of `models.start` or
     `start_arrays`."""
     n = next(each.shape[0] for each in models.step.get_inputs() if each.name == "gyro")
     windows, displacements, poses = [], [], []
@@ -110,7 +111,7 @@ def walk(
 
 
 def measure(models: Models, window: Float[np.ndarray, "1 n 6"]) -> dict[str, np.ndarray]:
-    """The prediction of the network for a window, as the filter step takes it."""
+    """The prediction of the network for a window, in the form that the filter step takes."""
     predicted = run(models.network, {"window": window})
     log_std = np.maximum(predicted["log_std"][0].astype(float), models.log_std_min)
     displacement = predicted["displacement"][0].astype(float)

@@ -1,14 +1,14 @@
 """The functions that are exported, over named arrays: network, start, window, filter step.
 
-They put the package's own functions together and compute nothing themselves. A clone interval of a
+They combine the package's own functions and compute nothing themselves. A clone interval of a
 deployed filter is
 
     window = filter_window(state, gyro, accel),
     displacement, log_std = network(window),
     state, pose = filter_step(state, gyro, accel, displacement, covariance),
 
-with covariance = diag(exp(2 max(log_std, log_std_min))). The window is cut before the step: a step
-corrects neither the attitude of the oldest clone nor the biases before it measures.
+with covariance = diag(exp(2 max(log_std, log_std_min))). The window can be cut before the step,
+because a step changes neither the attitude of the oldest clone nor the biases before it measures.
 
 Other programs know no NamedTuples: the name of an array of the state is its path in it, e.g.
 `state.gate.converged`. The clones are a ring, as in `filtering.scan`: clone step k writes slot
@@ -39,11 +39,11 @@ from gnio_jax.models import Network
 from gnio_jax.types import Array
 
 STATE, NEXT, POSE = "state.", "next.", "pose."
-"""Begin the names of arrays of the state, of the state after a step, and of the fields of
+"""Prefixes of the names of arrays of the state, of the state after a step, and of the fields of
 `filtering.Pose`."""
 _READ_BY_WINDOW = ("clone_rotation", "gyro_bias", "accel_bias", "step", "samples")
 _OF_GAPS = ("imu.gyro", "imu.accel", "imu.missing")
-"""What bridges holes; the stream of a deployed filter has none."""
+"""Settings that bridge holes; the stream of a deployed filter has none."""
 
 Arrays = Mapping[str, Array]
 
@@ -57,15 +57,15 @@ class Program(NamedTuple):
 
     @property
     def outputs(self) -> dict[str, jax.ShapeDtypeStruct]:
-        """Shape and type of what the function returns."""
+        """Shapes and types of the function's results."""
         return jax.eval_shape(self.function, self.inputs)
 
 
 class DeployedState(NamedTuple):
-    """What one clone step hands to the next."""
+    """The state between two clone steps."""
 
     filter: FilterState
-    """Its clones are a ring."""
+    """The filter's state, whose clones are a ring."""
     samples: Float[Array, "r 6"]
     """The last `FilterConfig.reach` samples, gyro rad/s and accel m/s², raw; zeros at first."""
 
@@ -86,7 +86,7 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
         return _to_arrays(_started(state, setup))
 
     def window(arrays: Arrays) -> dict[str, Array]:
-        """`network_window` between the oldest clone that the next step will have and its end."""
+        """`network_window` from the oldest clone of the next step to the end of that step."""
         state = _from_arrays(arrays, shape)
         samples = _with_latest(state.samples, arrays)
         oldest = (state.filter.step + 1) % config.clones
@@ -129,9 +129,9 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
 
 
 def start_arrays(state: FilterState, setup: FilterSetup) -> dict[str, np.ndarray]:
-    """The arrays of a filter that begins with `state`, of `initial_state` or `level_state`.
+    """The arrays of a filter that begins with `state`, from `initial_state` or `level_state`.
 
-    Raises `ValueError` for a state that a run has left: its clones are ordered by age and measured
+    Raises `ValueError` for the final state of a run: its clones are ordered by age and measured
     from the present anchor, and are not the ring that the next step writes into.
     """
     if state.step > 0:
@@ -147,13 +147,13 @@ def _started(state: FilterState, setup: FilterSetup) -> DeployedState:
 
 
 def _with_latest(samples: Array, arrays: Arrays) -> Array:
-    """The stored samples moved on by those of a clone interval."""
+    """The stored samples, shifted by those of a clone interval."""
     latest = jnp.concatenate([arrays["gyro"], arrays["accel"]], axis=1)
     return jnp.concatenate([samples, latest])[len(latest) :]
 
 
 def _to_arrays(state: DeployedState) -> dict[str, Any]:
-    """The arrays of a state, or their shapes, by name: those that have entries and that a step
+    """The arrays of a state, or their shapes, by name; only those that have entries and that a step
     reads."""
     unread = {STATE + name for name in _OF_GAPS}
     leaves = _named_leaves(state).items()
@@ -161,7 +161,7 @@ def _to_arrays(state: DeployedState) -> dict[str, Any]:
 
 
 def _from_arrays(arrays: Arrays, shape: DeployedState) -> DeployedState:
-    """The state of these arrays. Those that are left out are zero: nothing may need them."""
+    """The state of these arrays. Arrays that are left out are zero, because nothing needs them."""
     leaves = [
         arrays[name] if name in arrays else jnp.zeros(leaf.shape, leaf.dtype)
         for name, leaf in _named_leaves(shape).items()

@@ -1,5 +1,5 @@
-"""One run to a folder of ONNX models that other programs read, with `export.json` about them and
-about how far they are from the package, over one synthetic walk of fixed seed."""
+"""Export of a run to a folder of ONNX models for other programs. `export.json` describes them, and
+states their deviation from the package over one synthetic walk of fixed seed."""
 
 from __future__ import annotations
 
@@ -32,11 +32,12 @@ from gnio_jax.models import Network
 
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
 SECONDS = 60.0
-"""Of the walk over which an export is measured."""
+"""Duration of the walk over which an export is measured, s."""
 SEED, PERSON, PLACEMENT = 9000, 900, "handheld"
-"""What that walk is drawn from; no split has these."""
+"""Seed, person and placement of that walk, which is in no split."""
 DISPLACEMENT_LIMIT, POSITION_LIMIT = 1e-5, 1e-3
-"""How far an export may be from the package, m: more is a fault of the conversion."""
+"""Largest deviation of an export from the package, m; a larger one is an error of the
+conversion."""
 FORMAT, VERSION = "gnio-export", 3
 CONVENTIONS = (
     "SI units. The world is z-up with gravity (0, 0, -9.81) m/s². Rotations are matrices body → "
@@ -49,14 +50,14 @@ CONVENTIONS = (
 
 
 class Deviation(NamedTuple):
-    """Of what was exported from the package's own odometry."""
+    """Deviation of the exported odometry from the package's own."""
 
     displacement_rms: float
-    """Of the network, over the windows of the walk, m."""
+    """Deviation of the network, over the windows of the walk, m."""
     displacement_largest: float
     """m."""
     position_largest: float
-    """Of the filter, m."""
+    """Deviation of the filter, m."""
     ate: float
     """Error of the exported odometry against the truth, m …"""
     ate_of_package: float
@@ -64,7 +65,7 @@ class Deviation(NamedTuple):
 
 
 class Exported(NamedTuple):
-    """What `export_run` left."""
+    """The result of `export_run`."""
 
     folder: Path
     bytes: dict[str, int]
@@ -75,11 +76,11 @@ class Exported(NamedTuple):
 def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Exported:
     """Export the network and the filter of a run or package into the folder `out`.
 
-    The filter is that of `gnio track`. The models are then driven over a simulated walk of so many
-    seconds, and `export.json` records how far they are from the package, beside the tensors, size
-    and SHA-256 of each model. The folder is written whole or not at all. JAX's x64 must be on.
-    Raises `InputError` for a run without a checkpoint, a folder that is there already, a package of
-    Python that is missing, or a conversion that is off.
+    The filter is that of `gnio track`. The models are then run over a simulated walk of this
+    duration, and `export.json` records their deviation from the package, with the tensors, size and
+    SHA-256 of each model. The folder is written whole or not at all. JAX's x64 must be on. Raises
+    `InputError` for a run without a checkpoint, a folder that exists already, a missing Python
+    package, or a conversion with a large deviation.
     """
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(out, "is there already", "name another --out, or remove it")
@@ -89,7 +90,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     network, setup = Network.of(run.model, run.variables), tracking_filter(run)
     with replacing_folder(out) as folder, ExitStack() as at_end:
         at_end.callback(logging.disable, logging.root.manager.disable)
-        logging.disable(logging.WARNING)  # Converters log what they do about every other node.
+        logging.disable(logging.WARNING)  # Converters write a log line for almost every node.
         files = {}
         for program in programs(network, setup):
             content = conversion.to_model(program, setup)
@@ -126,7 +127,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
 
 
 def _described(arrays: dict[str, jax.ShapeDtypeStruct]) -> list[dict[str, Any]]:
-    """Name, shape and type of what a model takes or gives."""
+    """Name, shape and type of the inputs or outputs of a model."""
     return [
         {"name": name, "shape": list(each.shape), "dtype": str(each.dtype)}
         for name, each in arrays.items()
@@ -134,7 +135,7 @@ def _described(arrays: dict[str, jax.ShapeDtypeStruct]) -> list[dict[str, Any]]:
 
 
 def _filter(setup: FilterSetup) -> dict[str, Any]:
-    """The filter as it is exported, whose settings cannot be changed any more."""
+    """The settings of the exported filter, which are fixed."""
     config = setup.config
     return {
         "rate": 1 / config.dt,
@@ -161,7 +162,7 @@ def draw_walk(windows: DataConfig, setup: FilterSetup, seconds: float) -> Record
 
 
 def deviation_of(found: Walked, own: Estimate) -> Deviation:
-    """Of the walk by the models from the package's own."""
+    """The deviation of the models' walk from the package's own."""
     ours, true = (each.position[1:] for each in (own.trajectory, own.reference))
     assert own.displacements is not None
     given = own.displacements.value[-len(found.displacement) :]
@@ -176,7 +177,7 @@ def deviation_of(found: Walked, own: Estimate) -> Deviation:
 
 
 def check(found: Deviation, where: Any) -> None:
-    """Raise `InputError` where an export is not the package's odometry."""
+    """Raise `InputError` if an export deviates from the package's odometry."""
     largest = found.displacement_largest, found.position_largest
     if not (largest[0] <= DISPLACEMENT_LIMIT and largest[1] <= POSITION_LIMIT):
         problem = f"the conversion is off by {largest[0]:.2g} m a window, {largest[1]:.2g} m a walk"
