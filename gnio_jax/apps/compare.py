@@ -1,6 +1,6 @@
 """Comparison of runs: the effect of a change, sequence by sequence, with its uncertainty.
 
-    find (the evaluations that the rows name) → check → make missing ones → compare → text
+find (the evaluations that the rows name) → check → make missing ones → compare → text
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""From the streams of a recording to sequences: the one path of every reader and importer.
+"""From the streams of a recording to sequences, for all readers and importers.
 
-A reader gives gyro and accelerometer, each on stamps of its own, and the reference there is: poses,
-waypoints, or nothing. `assemble` puts rows in order, checks units, rates and gaps, resamples to one
-uniform clock, and marks what can be trusted.
+A reader gives gyro and accelerometer, each on stamps of its own, and the reference, if there is
+one: poses or waypoints. `assemble` puts rows in order, checks units, rates and gaps, resamples to
+one uniform clock, and marks what can be trusted.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from gnio_jax.numerics import spans, stretches
 from gnio_jax.types import Sequence, Waypoints
 
 RECORDED_RATE = "recorded_rate"
-"""Attribute of every sequence that was assembled: Hz of the faster sensor, whatever the sequence's
-own clock became. Content above half of it is in no sample."""
+"""Attribute of every assembled sequence: the rate of the faster sensor, Hz, independent of the
+sequence's own clock. The samples have no content above half of it."""
 STAMP_ROUNDING = 1e-6
-"""s: what float64 leaves of differences of unix stamps, and more."""
+"""Tolerance for differences of unix stamps in float64, s."""
 
 
 class Samples(NamedTuple):
@@ -90,20 +90,21 @@ def assemble(
     self-checked.
 
     `divide`
-        Makes a sequence of each piece between gaps longer than a window (`WINDOW_SECONDS`), since a
-        filter integrates whatever lies between its first and last sample. Pieces that hold no
-        window with a valid reference are lost, and a warning says what was kept. Without it such a
-        gap is an error.
+        Makes a sequence of each piece between gaps longer than a window (`WINDOW_SECONDS`), because
+        a filter integrates everything between its first and last sample. Pieces without a window
+        that has a valid reference are lost, and a warning says what was kept. Without this option
+        such a gap is an error.
     `whole`
-        Keeps the IMU before the first pose and after the last, which else is cut away.
+        Keeps the IMU before the first pose and after the last, which is otherwise cut off.
     `max_speed`
-        m/s: around steps of the position that are faster, poses without a velocity are not valid.
+        Speed in m/s: near steps of the position that are faster, poses without a velocity are not
+        valid.
     `max_drift`
-        m: where position and integrated velocity of the poses disagree by more within a second,
-        they are not valid.
+        Distance in m: where position and integrated velocity of the poses differ by more within a
+        second, they are not valid.
 
-    Raises `InputError` naming the file where one is damaged, and `Refusal` for a recording of no
-    use: without a window of IMU and reference.
+    Raises `InputError` naming a damaged file, and `Refusal` for a recording without a window of IMU
+    and reference.
     """
     streams = ordered(streams)
     gyro, accel = streams.gyro, streams.accel
@@ -140,8 +141,8 @@ def assemble(
 
 
 def ordered(streams: Streams) -> Streams:
-    """Every stream by increasing stamps, poses within `FARTHEST` alone, and the counts of the
-    gyro's repaired rows. Raises `InputError` for samples that are none of an IMU in SI units."""
+    """Every stream sorted by stamps, only poses within `FARTHEST`, and the counts of the gyro's
+    repaired rows. Raises `InputError` for samples that cannot be those of an IMU in SI units."""
 
     def by_stamps(samples: Samples) -> tuple[Samples, dict[str, float]]:
         rows, repairs = in_order(samples.time, samples.values, samples.source)
@@ -156,7 +157,7 @@ def ordered(streams: Streams) -> Streams:
     check_gyro(gyro.values, gyro.source, gyro.time)
     poses, device = streams.poses, streams.device
     if poses is not None:
-        # A position that nobody can have would take the digits of every pose near it.
+        # An impossible position would cost all poses near it their digits.
         near = ~(np.abs(poses.position) > FARTHEST).any(axis=1)
         if not near.any():
             problem = f"field 'position' is beyond {FARTHEST:g} m in all rows"
@@ -179,7 +180,7 @@ def ordered(streams: Streams) -> Streams:
 
 
 def _shared_spans(streams: Streams, whole: bool) -> list[tuple[float, float]]:
-    """(first, last) of the stretches in which no stream pauses for longer than a window."""
+    """First and last time of the stretches in which no stream has a gap longer than a window."""
     gyro, accel, poses = streams.gyro, streams.accel, streams.poses
     clocks, outermost = [gyro.time, accel.time], (-np.inf, np.inf)
     both = gyro.time[(gyro.time >= accel.time[0]) & (gyro.time <= accel.time[-1])]
@@ -195,7 +196,7 @@ def _shared_spans(streams: Streams, whole: bool) -> list[tuple[float, float]]:
         unbroken = stretches(np.diff(time) > WINDOW_SECONDS)
         runs = [(time[run.start], time[run.stop - 1]) for run in unbroken]
         found = [(max(a, c), min(b, d)) for a, b in found for c, d in runs if min(b, d) > max(a, c)]
-    # Each begins and ends at a sample of the gyro, which the clock then shares.
+    # Each begins and ends at a sample of the gyro, so that the clock has the gyro's stamps.
     inside = [gyro.time[(gyro.time >= a - 1e-9) & (gyro.time <= b + 1e-9)] for a, b in found]
     return [(float(time[0]), float(time[-1])) for time in inside if len(time) > 1]
 
@@ -248,7 +249,7 @@ def _on_clock(
 
 
 def _seconds_of_use(streams: Streams, piece: Sequence, whole: bool) -> float:
-    """s of the longest stretch with the reference, or of all where the recording has none."""
+    """Duration of the longest stretch with a reference, s, or of the recording if it has none."""
     time, waypoints = piece.time, piece.waypoints
     if waypoints is not None and len(waypoints.time) < FEWEST_WAYPOINTS:
         return 0.0

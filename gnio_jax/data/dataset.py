@@ -1,4 +1,4 @@
-"""What a reader says of its dataset, the datasets by name, and where the folder of each is.
+"""The description of a dataset by its reader, the datasets by name, and their folders.
 
 A new dataset is one module in `readers` that ends with `DATASET = Dataset(...)`, and one line in
 `readers/__init__.py`.
@@ -17,8 +17,9 @@ from gnio_jax.types import Sequence
 
 
 class Refusal(InputError):
-    """A recording cannot be used, though its files can be read: a ruined clock, or a reference that
-    does not fit the IMU. The recording is left out with a warning, and the cache remembers why."""
+    """A recording cannot be used, although its files can be read: its clock is destroyed, or its
+    reference does not fit the IMU. The recording is left out with a warning, and the cache
+    remembers the reason."""
 
     def __init__(self, where: object, problem: str, remedy: str = "leave it out"):
         super().__init__(where, problem, remedy)
@@ -28,21 +29,21 @@ class Recording(NamedTuple):
     """One recording that was found, but not yet read. It can be sent to another process."""
 
     name: str
-    """Unique within a dataset; the name of its sequence, if it yields one."""
+    """Name that is unique within a dataset, and that of its sequence, if there is only one."""
     read: Callable[[], list[Sequence]]
-    """Makes its sequences: one, or the segments between its gaps. They are validated and on a
-    uniform clock, but not self-checked. Raises `InputError` where a file is damaged, `Refusal`
-    where the recording is of no use."""
+    """A function that makes its sequences: one, or the segments between its gaps. They are
+    validated and on a uniform clock, but not self-checked. It raises `InputError` for a damaged
+    file, and `Refusal` if the recording cannot be used."""
     files: tuple[Path, ...] = ()
-    """The files that its sequences are made of; some may be absent."""
+    """The files from which its sequences are made; some may be absent."""
     slow: bool = False
     """Whether `read` is slow. Then the cache keeps its result, and processes share the work."""
     attributes: dict[str, Any] = {}
-    """What lists and splits say of it; joins the attributes of its sequences."""
+    """Attributes from lists and splits, which are added to those of its sequences."""
     form: str = ""
-    """Which of several forms of the recording this is, as messages name it."""
+    """Name of this form in messages, if the recording has several."""
     fallback: Recording | None = None
-    """Another form of the same recording, read where this one is refused."""
+    """Another form of the same recording, which is read if this one is refused."""
 
 
 @dataclass(frozen=True)
@@ -52,40 +53,40 @@ class Dataset:
     name: str
     """The name of `--dataset`."""
     recordings: Callable[[Path, str], list[Recording]]
-    """(root, split) -> its recordings, not yet read. The split is one that may be asked for. Empty
-    where nothing of the dataset is there; raises `InputError` where only the split is missing."""
+    """(root, split) -> recordings, not yet read. The split must be a possible one. The result is
+    empty if there is nothing of the dataset; `InputError` is raised if only the split is
+    missing."""
     splits: tuple[str, ...]
     """Known splits."""
     rate: float
     """Native IMU rate, Hz."""
     source: str
-    """Where the public set is had."""
+    """Place of the public set."""
     layout: str
     """The expected layout below the root, in one line."""
     licence: str
     """Terms of the data, as their authors state them."""
     needs_root: bool = True
-    """False for a dataset that is computed, not read. Its reference is exact, so it is not
-    self-checked when it is loaded."""
+    """False for a dataset that is computed. Its reference is exact, so it is not self-checked when
+    it is loaded."""
     pedestrian: bool = True
     """False for drones and vehicles: the self-check then finds no speed implausible."""
     correlates: bool = True
-    """False where the horizontal accelerations of the positions need not correlate with the
-    accelerometer's: the positions are those of another body, or smoothed."""
+    """False if the horizontal accelerations of the positions need not correlate with the
+    accelerometer's, because the positions are those of another body, or smoothed."""
     needs_reference: bool = True
-    """False where recordings without any reference are of use."""
+    """False if recordings without any reference can be used."""
     list_splits: Callable[[Path], tuple[str, ...]] | None = None
-    """root -> splits, where lists at the root name them; there may be others than `splits`."""
+    """root -> splits, if lists at the root define them; these may differ from `splits`."""
     folders: tuple[str, ...] = ()
-    """Names that its folder may have; by default the dataset's own name."""
+    """Possible names of its folder; by default the dataset's own name."""
 
     def splits_at(self, root: Path) -> tuple[str, ...]:
         """The splits that may be asked for at this root."""
         return self.list_splits(root) if self.list_splits else self.splits
 
     def described(self, sequence: Sequence) -> Sequence:
-        """A sequence with the name and licence of its dataset; one that was converted keeps those
-        that it had."""
+        """A sequence with the name and licence of its dataset; a converted one keeps its own."""
         about = {"dataset": self.name, "licence": self.licence}
         return sequence._replace(attributes=about | sequence.attributes)
 
@@ -117,8 +118,8 @@ def get(name: str) -> Dataset:
 def find_root(name: str, root: str | os.PathLike[str] | None = None) -> Path:
     """The folder of dataset `name`: `root` if given, else $GNIO_DATA/<name>, else data/<name>.
 
-    Raises `InputError` when it is missing, saying how to name it, where the public set is had and
-    which layout is expected.
+    Raises `InputError` if it is missing, with the ways to name it, the place of the public set, and
+    the expected layout.
     """
     dataset = get(name)
     bases = [base for base in (os.environ.get("GNIO_DATA"), "data") if base]

@@ -1,8 +1,8 @@
 """Sequences as HDF5, the package's own file format, and the cache, whose entries are such files.
 
-The cache keeps what is slow to make: parsed text, aligned clocks. Its folder is $GNIO_CACHE, else
-$XDG_CACHE_HOME/gnio-jax, else ~/.cache/gnio-jax; it may be deleted at any time. It holds one entry
-of each recording and form: a new one takes the place of those that nothing would read any more.
+The cache keeps results that are slow to make: parsed text, aligned clocks. Its folder is
+$GNIO_CACHE, else $XDG_CACHE_HOME/gnio-jax, else ~/.cache/gnio-jax; it may be deleted at any time.
+It has one entry for each recording and form: a new entry replaces outdated ones.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def write_hdf5(path: str | os.PathLike[str], sequence: Sequence) -> None:
 
     The file holds one dataset for each field (contiguous, so that it can be memory-mapped), `name`
     and `format` as attributes, and the sequence's attributes on the group `attributes`. Waypoints
-    are the group `waypoints`. Raises `InputError` for an attribute that is no text, number or
+    are the group `waypoints`. Raises `InputError` for an attribute that is not a text, number or
     boolean.
     """
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:
@@ -79,7 +79,7 @@ _Stored = tuple[dict[str, Any], dict[str, np.ndarray | None], dict[str, Any]]
 
 
 def _stored(group: h5py.Group, path: Path) -> _Stored:
-    """Read a group, and judge nothing but its size: what fails here is the file's fault."""
+    """Read a group, and check only its size: a failure here is due to the file."""
     about, names = dict(group.attrs), (*_FIELDS, *_OPTIONAL_FIELDS, *_WAYPOINTS)
     ours = about.get("format") == _FORMAT
     fields = {name: hdf5_field(group, name, path) for name in names if ours}
@@ -95,7 +95,7 @@ def _sequence(stored: _Stored, path: Path) -> Sequence:
         raise InputError(path, problem, "convert the recording with gnio data convert")
 
     def values(field: str) -> np.ndarray:
-        """Booleans of what is valid, float64 of every other field."""
+        """A field: booleans if it is a mask, else float64."""
         kind, content = ("b", "booleans") if field.endswith("valid") else ("f", "numbers")
         found = fields[field]
         if found is not None and found.dtype.kind == kind and found.shape:
@@ -117,21 +117,22 @@ def _sequence(stored: _Stored, path: Path) -> Sequence:
 
 
 class Reading(NamedTuple):
-    """What reading a recording gave. Problems and warnings are values, since they may come from
-    another process or from the cache."""
+    """The result of reading a recording. Problems and warnings are values, because they may come
+    from another process or from the cache."""
 
     sequences: list[Sequence]
-    """Empty where the recording cannot be used."""
+    """The sequences; empty if the recording cannot be used."""
     notes: tuple[str, ...] = ()
-    """What the reader warned of, and why another form was used."""
+    """The reader's warnings, and reasons why another form was used."""
     refusals: tuple[str, ...] = ()
-    """Why the recording is of no use, one reason for each of its forms; empty if it is of use."""
+    """Reasons why the recording cannot be used, one for each of its forms; empty if it can be
+    used."""
     damage: InputError | None = None
-    """What is wrong with its files; None if nothing is."""
+    """The error of damaged files; None if there is none."""
 
 
 def cache_folder() -> Path:
-    """Where the cache lies; it need not exist."""
+    """Folder of the cache, which need not exist."""
     if chosen := os.environ.get("GNIO_CACHE"):
         return Path(chosen)
     base = os.environ.get("XDG_CACHE_HOME")
@@ -141,9 +142,9 @@ def cache_folder() -> Path:
 def cache_entry(name: str, files: Iterable[str | os.PathLike[str]]) -> Path:
     """The file that keeps the reading of the recording `name` (with its form) from these files.
 
-    It has another name as soon as a file has another path, size or modification time, comes or
-    goes, or a source file of the package that takes part in reading is another. What stands before
-    the "-" is that of the recording, told by its name and its first file.
+    Its name changes if a file has another path, size or modification time, is added or removed, or
+    if a source file of the package on which reading depends has changed. The part before the "-"
+    identifies the recording by its name and its first file.
     """
     states = []
     for path in (Path(file).absolute() for file in files):
@@ -159,7 +160,7 @@ def cache_entry(name: str, files: Iterable[str | os.PathLike[str]]) -> Path:
 
 @functools.cache
 def _sources() -> str:
-    """A digest of the source files that decide what a recording becomes."""
+    """A digest of the source files on which the reading of a recording depends."""
     package = Path(__file__).parents[1]
     base = [package / f"{name}.py" for name in ("decimation", "numerics", "types")]
     digest = hashlib.sha256()
@@ -170,7 +171,7 @@ def _sources() -> str:
 
 def write_reading(entry: Path, reading: Reading) -> None:
     """Keep a reading without damage, whole or not at all, in the place of earlier ones of the same
-    recording. Where nothing can be written, recordings are read every time."""
+    recording. If nothing can be written, recordings are read every time."""
     with contextlib.suppress(OSError), replacing(entry) as temporary:
         with h5py.File(temporary, "w") as file:
             file.attrs["notes"] = json.dumps(reading.notes)
@@ -179,13 +180,13 @@ def write_reading(entry: Path, reading: Reading) -> None:
                 _write(file.create_group(f"{number:04}"), sequence, entry)
     recording, _, _ = entry.name.partition("-")
     for other in entry.parent.glob(f"{recording}-*.h5"):
-        if other != entry:  # who reads it at this moment may finish, and who misses it reads anew
+        if other != entry:  # a process that reads it now finishes; others read anew
             with contextlib.suppress(OSError):
                 other.unlink()
 
 
 def read_reading(entry: Path) -> Reading | None:
-    """A reading that was kept; None where there is no sound one."""
+    """A reading from the cache; None if there is no intact one."""
     try:
         with parsed_as(entry, "HDF5"), h5py.File(entry, "r") as file:
             stored = [_stored(file[number], entry) for number in sorted(file)]

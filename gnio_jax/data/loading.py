@@ -28,12 +28,12 @@ from gnio_jax.types import Sequence
 
 Result = TypeVar("Result")
 Progress = Callable[[float], None]
-"""Called with the share that is done."""
+"""A function that is called with the finished share."""
 
 FEW = 8
-"""Recordings up to here are quicker read than processes are started."""
+"""Number of recordings up to which reading them is faster than starting processes."""
 CONVERSION = "conversion.json"
-"""File that says what a converted folder was made of."""
+"""File with the origin of a converted folder."""
 
 
 # --- the sequences of a split
@@ -50,10 +50,10 @@ def load(
     (`resample` changes that), in the order of its recordings. A split may be a fold, or all but a
     fold (see `splits.Fold`).
 
-    Recordings that are of no use, or fail the physical self-check, are left out with a warning.
-    With `workers` > 1 that many processes read the recordings that are slow to read and not in the
-    cache yet. Sequences, warnings and errors do not depend on their number. `progress` is told the
-    share of these recordings that is read. Raises `InputError` on an unknown name or split, a
+    Recordings that cannot be used, or that fail the physical self-check, are left out with a
+    warning. With `workers` > 1 that many processes read the recordings that are slow to read and
+    not in the cache yet. Sequences, warnings and errors do not depend on their number. `progress`
+    gets the finished share of these recordings. Raises `InputError` on an unknown name or split, a
     missing folder, a damaged file, two sequences of one name, or a split without a sequence.
     """
     return list(load_each(name, root, split, workers, progress))
@@ -66,11 +66,11 @@ def load_each(
     workers: int = 1,
     progress: Progress = lambda share: None,
 ) -> Iterator[Sequence]:
-    """The sequences of `load` one after another, for those that do not fit the memory together."""
+    """The sequences of `load` one after another, if together they do not fit into memory."""
     if fold := parse_fold(split):
         return iter(fold.select(load_each(name, root, fold.split, workers, progress)))
     dataset = get(name)
-    # Where lists at the root name the splits, the reader knows them.
+    # If lists at the root define the splits, the reader knows them.
     if dataset.list_splits is None:
         _check_split(dataset, split, dataset.splits)
     folder = find_root(name, root) if dataset.needs_root else Path(root or ".")
@@ -84,12 +84,12 @@ def read_split(
     workers: int = 1,
     progress: Progress = lambda share: None,
 ) -> Iterator[Sequence]:
-    """`load_each` of a dataset that is at hand."""
+    """`load_each` for a `Dataset`."""
     recordings = dataset.recordings(root, split)
     if not recordings:
         raise _nothing(dataset, root, split, "sequence")
     names, left_out = set(), []
-    refused: dict[str, list[str]] = {}  # why, without the file -> the whole line of each
+    refused: dict[str, list[str]] = {}  # reason without the file -> all whole lines
     for recording, reading in zip(
         recordings, _read_all(recordings, workers, progress), strict=True
     ):
@@ -124,7 +124,7 @@ def read_split(
 
 
 def _warn_of(refused: dict[str, list[str]]) -> None:
-    """A warning for each reason, with the number of recordings where it is that of several."""
+    """Warn once for each reason, with the number of recordings if there are several."""
     for lines in refused.values():
         several = f"{len(lines)} recordings are left out for the same reason, the first: "
         warnings.warn(f"{several if lines[1:] else ''}{lines[0]}", stacklevel=3)
@@ -142,8 +142,9 @@ def _check_split(dataset: Dataset, split: str, known: Iterable[str]) -> None:
 
 
 def _read_all(recordings: list[Recording], workers: int, progress: Progress) -> Iterator[Reading]:
-    """The reading of each of them, in their order: by processes of what is slow to read and not in
-    the cache. What is quick is not worth a process, and the pipe that its sequences come through.
+    """The reading of each of them, in their order. Processes read recordings that are slow to read
+    and not in the cache. For quick recordings a process and the transfer of their sequences would
+    take longer.
     """
     slow = [e for e in recordings if workers > 1 and e.slow and not _entry(e).is_file()]
     readings = in_processes(read_recording, [(each,) for each in slow], workers, progress)
@@ -152,12 +153,12 @@ def _read_all(recordings: list[Recording], workers: int, progress: Progress) -> 
         if id(recording) in sent and not died:
             try:
                 reading = next(readings)
-                if reading.damage is not None:  # an error of an item: nothing follows it
+                if reading.damage is not None:  # an error ends the work
                     with suppress(InputError):
                         readings.throw(reading.damage)
                 yield reading
                 continue
-            except ProcessDied:  # this process reads what is left
+            except ProcessDied:  # this process reads the remaining ones
                 died = True
         yield read_recording(recording)
 
@@ -166,7 +167,7 @@ def _read_all(recordings: list[Recording], workers: int, progress: Progress) -> 
 
 
 def read_recording(recording: Recording) -> Reading:
-    """Read a recording, or its fallback where it is refused, through the cache."""
+    """Read a recording, or its fallback if it is refused, through the cache."""
     form: Recording | None = recording
     before = Reading([])
     while form is not None:
@@ -184,7 +185,7 @@ def read_recording(recording: Recording) -> Reading:
 
 
 def _read_form(form: Recording) -> Reading:
-    """Read a recording in this form, from the cache where it is there."""
+    """Read a recording in this form, from the cache if it is there."""
     entry, reading = None, Reading([])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -205,7 +206,7 @@ def _read_form(form: Recording) -> Reading:
 
 
 def _entry(form: Recording) -> Path:
-    """Where the cache keeps this form of a recording."""
+    """The file of this form of a recording in the cache."""
     return cache_entry(f"{form.name} {form.form}", form.files)
 
 
@@ -213,7 +214,7 @@ def _entry(form: Recording) -> Path:
 
 
 class ProcessDied(InputError):
-    """A process ended without a word; most often the system has run out of memory."""
+    """A process ended without a message; most often the system has run out of memory."""
 
 
 def in_processes(
@@ -223,12 +224,12 @@ def in_processes(
     progress: Progress = lambda share: None,
 ) -> Generator[Result, None, None]:
     """`function(*item)` for every item, in their order, by `workers` processes; 1 starts none, and
-    None asks for as many as are worth starting. A process that may have no children does it itself.
+    None chooses a useful number. A process that may have no children does the work itself.
 
-    At most `workers` + 2 results are under way or wait, so that memory stays bounded. `progress` is
-    told the share that is finished. Function and items must survive pickling when there is more
-    than one process. After an error of an item those under way end first, for what they write is
-    to be whole; Ctrl-C and a caller that stops early end them at once. Raises `ProcessDied`.
+    At most `workers` + 2 results are in progress or waiting, so that memory is bounded. `progress`
+    gets the finished share. Function and items must be picklable if there is more than one process.
+    After an error of an item those in progress end first, so that their files are whole; Ctrl-C and
+    a caller that stops early end them at once. Raises `ProcessDied`.
     """
     if workers is None:
         workers = usable_cores() if len(items) > FEW else 1
@@ -244,10 +245,10 @@ def in_processes(
         TerminatedWorkerError,
     )
 
-    # A process that has grown is replaced, with the same results: nothing that a user could mend.
+    # A process that uses much memory is replaced, with the same results, so the user need not act.
     warnings.filterwarnings("ignore", "A worker was restarted", UserWarning, "loky")
-    # Python's own pool can wait for ever for a process that died while another one started. Ctrl-C
-    # is this process's to answer.
+    # Python's own pool can wait without end for a process that died while another one started. Only
+    # this process handles Ctrl-C.
     ignore = (signal.SIGINT, signal.SIG_IGN)
     pool = ProcessPoolExecutor(workers, initializer=signal.signal, initargs=ignore)
     left, waiting = iter(items), deque[Future[Result]]()
@@ -275,18 +276,18 @@ class Found(NamedTuple):
     """The recordings of one split, or of all."""
 
     recordings: dict[str, Recording]
-    """By name."""
+    """Recordings by name."""
     splits: dict[str, tuple[str, ...]]
     """Split -> the names of its recordings."""
     notes: list[str]
-    """What was warned of, and which splits hold nothing."""
+    """Warnings, and the splits that have no recording."""
 
 
 def find_recordings(dataset: Dataset, root: Path, wanted: str) -> Found:
     """The recordings of a split, or of every split: "all".
 
-    A dataset's own split of that name is every recording below the root. Raises `InputError` on an
-    unknown split, or when none of the splits holds a recording.
+    A dataset's own split of that name is every recording below the root. Raises `InputError` for an
+    unknown split, or if no split has a recording.
     """
     known = dataset.splits_at(root)
     _check_split(dataset, wanted, dict.fromkeys((*known, "all")))
@@ -304,7 +305,7 @@ def find_recordings(dataset: Dataset, root: Path, wanted: str) -> Found:
         for text in (str(each.message) for each in caught):
             found.notes.extend([text] if text not in found.notes else [])
     if not found.recordings and len(mistakes) == (len(known) if wanted == "all" else 1):
-        # Where a split takes everything, it says best why there is nothing.
+        # A split of all recordings gives the best reason why there are none.
         raise mistakes.get("all", next(iter(mistakes.values())))
     if not found.recordings:
         raise _nothing(dataset, root, wanted, "recording")
@@ -316,15 +317,15 @@ def find_recordings(dataset: Dataset, root: Path, wanted: str) -> Found:
 
 
 class Checked(NamedTuple):
-    """The self-check of one sequence, or why a recording has none."""
+    """The self-check of one sequence, or the reason why a recording has none."""
 
     name: str
     splits: tuple[str, ...]
-    """That it is in; "all" is named where there is no other."""
+    """Splits that contain it; "all" is named if there is no other."""
     check: SelfCheck | None
-    """None where it could not be read."""
+    """The self-check; None if the recording could not be read."""
     reason: str
-    """Why it is left out; empty where it is used."""
+    """Reason why it is left out; empty if it is used."""
 
 
 def check(
@@ -335,8 +336,8 @@ def check(
     workers: int | None = 1,
     progress: Progress = lambda share: None,
 ) -> tuple[list[Checked], list[str]]:
-    """Read every recording of a split (or of all) and check it: the sequences, and notes of the
-    readers and on what could not be found.
+    """Read every recording of a split (or of all) and check it. The result is the checked
+    sequences, notes of the readers, and notes about missing recordings.
 
     `pictures` is a folder for a picture of each. `workers` processes share the work.
     """
@@ -366,7 +367,7 @@ def _check_and_draw(
 
 
 def check_recording(recording: Recording, dataset: Dataset) -> tuple[list[Checked], Reading]:
-    """Read a recording and check its sequences; what is wrong with it is reported, not raised."""
+    """Read a recording and check its sequences; problems are reported, not raised."""
     reading = read_recording(recording)
     reading = reading._replace(sequences=[*map(dataset.described, reading.sequences)])
     checks = [(sequence.name, check_sequence(sequence, dataset)) for sequence in reading.sequences]
@@ -379,7 +380,7 @@ def check_recording(recording: Recording, dataset: Dataset) -> tuple[list[Checke
 
 
 class Converted(NamedTuple):
-    """What became of a dataset."""
+    """The result of a conversion."""
 
     sequences: dict[str, list[str]]
     """Split -> stems of its files."""
@@ -403,8 +404,8 @@ def convert(
 
     The folder `out` is written whole or not at all. It must be new or empty, or hold an earlier
     conversion of the same recordings with the same settings, which is then replaced. `rate`: Hz,
-    None keeps each recording's own. `workers` processes share the work. Raises `InputError` when
-    `out` holds anything else, two sequences would be one file, or none can be used.
+    None keeps each recording's own. `workers` processes share the work. Raises `InputError` if
+    `out` holds anything else, if two sequences would be one file, or if none can be used.
     """
     settings = {"dataset": dataset.name, "split": split, "rate": rate}
     if dataset.needs_root:
@@ -414,7 +415,7 @@ def convert(
     owners: dict[str, str] = {}
 
     def check_file(name: str, recording: str) -> None:
-        """No other recording may own the file of this sequence."""
+        """Check that no other recording has the file of this sequence."""
         stem = file_stem(name)
         if (other := owners.setdefault(stem, recording)) != recording:
             problem = f"'{other}' and '{recording}' would be one file, {stem}.h5"
@@ -450,7 +451,7 @@ def convert(
 
 
 def _check_target(out: Path, settings: dict) -> None:
-    """Raise `InputError` where a conversion must not be written to `out`."""
+    """Raise `InputError` if a conversion must not be written to `out`."""
     if out.exists() and not out.is_dir():
         raise InputError(out, "is a file", "name a folder")
     if settings.get("root") == str(out.resolve()):
@@ -469,9 +470,10 @@ def _check_target(out: Path, settings: dict) -> None:
 def _check_and_write(
     recording: Recording, dataset: Dataset, folder: Path, rate: float | None
 ) -> tuple[list[Checked], tuple[str, ...]]:
-    """The rows of one recording, whose sequences that pass are written, and the reader's notes."""
+    """Write the sequences of one recording that pass, and return its rows and the reader's
+    notes."""
     rows, reading = check_recording(recording, dataset)
-    # What the dataset asks of its recordings, for the self-check of the converted ones.
+    # Requirements of the dataset, for the self-check of the converted recordings.
     asked = {"check_pedestrian": dataset.pedestrian, "check_correlation": dataset.correlates}
     for sequence, row in zip(reading.sequences, rows, strict=False):
         if not row.reason:

@@ -1,5 +1,5 @@
-"""One picture of a recording, by which an eye sees what the self-check's figures cannot say. Only
-imported when one is asked for."""
+"""One picture of a recording, which shows more than the figures of the self-check. This module is
+only imported if a picture is requested."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from gnio_jax.types import Sequence
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
 UNTRUSTED = "#F3D9CC"
 POINTS = 3000
-"""A line of more points than the picture has pixels only makes the file larger."""
+"""Largest number of points of a line: more points than pixels only make the file larger."""
 COLOURS = 96
 
 
 def save(path: Path, figure: Figure) -> None:
-    """Write one figure as PNG, whole or not at all. A few colours make a third of the file: there
-    may be hundreds of them."""
+    """Write one figure as PNG, whole or not at all. Few colours reduce the file to a third, because
+    there may be hundreds of files."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     picture = (
@@ -42,8 +42,9 @@ def save(path: Path, figure: Figure) -> None:
 
 
 def overview(sequence: Sequence, check: SelfCheck) -> Figure:
-    """Trajectory from above, and over time: speed, |accel|, angle between integrated gyro and
-    reference. Shaded: not valid. Waypoints are drawn with the poses that training takes."""
+    """The trajectory from above, and over time the speed, |accel|, and the angle between integrated
+    gyro and reference. Invalid times are shaded. Waypoints are drawn with the poses that training
+    uses."""
     waypoints = sequence.waypoints
     if waypoints is not None:
         with suppress(InputError):
@@ -79,7 +80,7 @@ def overview(sequence: Sequence, check: SelfCheck) -> Figure:
 
 
 def _over_time(axes: Axes, sequence: Sequence, values: np.ndarray, **style: Any) -> None:
-    """One value a sample, of which as many are drawn as the picture has pixels."""
+    """Draw one value per sample, but at most as many as the picture has pixels."""
     every = max(len(values) // POINTS, 1)
     axes.plot((sequence.time - sequence.time[0])[::every], values[::every], **style)
 

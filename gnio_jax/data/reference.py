@@ -1,8 +1,8 @@
 """Tracked poses on the clock of an IMU.
 
 Trackers stamp their poses on a clock of their own, at 4 to 200 Hz, with gaps and jumps. Smooth
-poses follow splines; where they come without a velocity, it is that of the smoothed positions. Of
-noisy poses the gyro carries the attitude, and a smoother the position.
+poses are interpolated by splines; if they have no velocity, it is that of the smoothed positions.
+For noisy poses the attitude is carried by the gyro, and the position is smoothed.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from gnio_jax.numerics import (
 )
 
 LONGEST_BRIDGE = 0.1
-"""s between two poses up to which the reference between them can be trusted."""
+"""Largest time between two poses for which the reference between them can be trusted, s."""
 LOST_POSES = 2.5
-"""Poses up to this many intervals apart (one is lost) are interpolated, however slow they come;
-further apart gyro and smoother bridge those of a noisy tracker."""
+"""Poses up to this many intervals apart (one is lost) are interpolated, at any rate. Longer gaps of
+a noisy tracker are bridged by gyro and smoother."""
 SHORTEST_RUN = 8
-"""Poses in a row below which a stretch between gaps is not believed."""
+"""Smallest number of successive poses for which a stretch between gaps is used."""
 LARGEST_JUMP = 0.02
-"""m by which a step of the position may contradict the reference's own velocity, and smoothed
-positions the seen ones."""
+"""Largest difference of a step of the position from the reference's own velocity, and of smoothed
+positions from the measured ones, m."""
 JUMP_MARGIN = 0.1
-"""s around a jump of the position that are not believed."""
+"""Time around a jump of the position that is not used, s."""
 COURSE_SECONDS, FLIP_DEGREES, CORRECTION_SECONDS = 3.0, 15.0, 0.3
-"""Filter (standard deviation, s) of the correction's median course, how far off it a sample is a
-flip of the tracker, and the filter of the rest."""
+"""Filter (standard deviation, s) of the correction's median, distance from it beyond which a sample
+is a flip of the tracker, and filter of the other samples."""
 
 
 class Poses(NamedTuple):
@@ -53,15 +53,16 @@ class Poses(NamedTuple):
     attitude: Rotation
     """n rotations, IMU body → world."""
     position: Float[np.ndarray, "n 3"]
-    """Of the tracked point, m."""
+    """Position of the tracked point, m."""
     velocity: Float[np.ndarray, "n 3"] | None = None
-    """Of the tracked point, m/s; None: the tracker gives none."""
+    """Velocity of the tracked point, m/s; None: the tracker gives none."""
     lever: Float[np.ndarray, "3"] = np.zeros(3)
     """From the tracked point to the IMU, in the IMU's body, m."""
     noisy: bool = False
-    """A raw tracker: flips, single jumps, and noise that differences would amplify."""
+    """True for a raw tracker with flips, single jumps, and noise that differences would amplify."""
     ends_pieces: bool = False
-    """Odometry that may return in another world after a loss: such a loss divides a recording."""
+    """True for odometry that may continue in another world after a loss, so that a loss divides a
+    recording."""
     source: str = ""
     """File, for messages."""
 
@@ -75,7 +76,8 @@ class Poses(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """The reference of a sequence, at its stamps; anything where not `valid`."""
+    """The reference of a sequence, at its stamps; its values are arbitrary where it is not
+    `valid`."""
 
     orientation: Float[np.ndarray, "m 4"]
     position: Float[np.ndarray, "m 3"]
@@ -84,7 +86,7 @@ class Reference(NamedTuple):
 
     @classmethod
     def none(cls, count: int) -> Reference:
-        """Of so many stamps of which nothing is known."""
+        """The reference of `count` stamps without poses."""
         nothing = np.full((count, 4), np.nan)
         return cls(nothing, nothing[:, 1:], nothing[:, 1:], np.zeros(count, dtype=bool))
 
@@ -96,10 +98,11 @@ def reference_at(
     max_speed: float = np.inf,
     max_drift: float = np.inf,
 ) -> Reference:
-    """The poses of the IMU at the uniform stamps `clock` (s), `gyro` (rad/s) being its samples.
+    """The poses of the IMU at the uniform stamps `clock` (s); `gyro` (rad/s) has its samples.
 
-    Not valid across gaps, where poses without a velocity step faster than `max_speed` (m/s), and
-    where the velocity, integrated over a second, is off the position by more than `max_drift` (m).
+    They are not valid across gaps, where poses without a velocity have steps faster than
+    `max_speed` (m/s), and where the velocity, integrated over a second, differs from the position
+    by more than `max_drift` (m).
     """
     return (
         _fused(clock, gyro, poses) if poses.noisy else _splined(clock, poses, max_speed, max_drift)
@@ -110,7 +113,7 @@ def _splined(
     clock: Float[np.ndarray, " m"], poses: Poses, max_speed: float, max_drift: float
 ) -> Reference:
     """Splines within unbroken runs. A run also ends where the position contradicts the velocity,
-    since nothing is known between two such poses."""
+    because the motion between two such poses is not known."""
     stamps, step = poses.time, float(np.median(np.diff(clock)))
     steps = np.diff(stamps)
     broken = steps > longest_trusted(stamps)
@@ -119,10 +122,11 @@ def _splined(
         parts.append(poses.velocity)
         moved = midpoints(poses.velocity) * steps[:, None]
         contradiction = np.linalg.norm(np.diff(poses.position, axis=0) - moved, axis=1)
-        # Over long steps the trapezium is only a rough integral of the velocity.
+        # Over long steps the trapezoidal rule is only a rough integral of the velocity.
         broken |= contradiction > LARGEST_JUMP + 2.0 * steps**2
-    # Attitudes, too: at 30 Hz the shorter arc between two of them errs by half a degree in a
-    # walker's hand. The spline of quaternions is as exact there as one of rotations.
+    # Attitudes are interpolated by splines too: at 30 Hz the shorter arc between two of them has an
+    # error of half a degree in a walker's hand. There a spline of quaternions is as accurate as one
+    # of rotations.
     values = splined(stamps, np.concatenate(parts, axis=1), clock, broken)
     orientation, position, velocity = np.split(values, [4, 7], axis=1)
     orientation = orientation / np.linalg.norm(orientation, axis=1, keepdims=True)
@@ -147,8 +151,8 @@ def _splined(
 def _drifts(
     position: Float[np.ndarray, "m 3"], velocity: Float[np.ndarray, "m 3"], step: float, most: float
 ) -> Bool[np.ndarray, " m"]:
-    """True in every second in which position and integrated velocity disagree by more than `most`
-    (m), as where a satellite receiver corrects itself by jumps."""
+    """True in every second in which position and integrated velocity differ by more than `most`
+    (m), for example where a satellite receiver corrects itself by jumps."""
     second = round(1.0 / step)
     moved = np.cumsum(midpoints(velocity) * step, axis=0)
     error = position - np.concatenate([np.zeros((1, 3)), moved])
@@ -161,10 +165,11 @@ def _drifts(
 def _fused(
     clock: Float[np.ndarray, " m"], gyro: Float[np.ndarray, "m 3"], poses: Poses
 ) -> Reference:
-    """The gyro carries the attitude between the tracker's, and a smoother the position."""
+    """The reference with the attitude carried by the gyro between the tracker's, and with smoothed
+    positions."""
     usual, step = LOST_POSES * float(np.median(np.diff(poses.time))), float(clock[1] - clock[0])
     bridge = longest_trusted(poses.time)
-    # Single poses between gaps are those that the tracker hardly saw.
+    # Single poses between gaps are unreliable.
     runs = stretches(np.diff(poses.time) > usual)
     sure = [np.arange(run.start, run.stop) for run in runs if run.stop - run.start >= SHORTEST_RUN]
     poses = poses.rows(np.concatenate(sure)) if sure else poses
@@ -173,7 +178,7 @@ def _fused(
     if measured.sum() < SHORTEST_RUN:
         return unknown
     turned = slerp(clock, stamps, poses.attitude)
-    # The gyro's constant bias would bend the correction at its ends.
+    # The gyro's constant bias would distort the correction at its ends.
     both = measured[:-1] & measured[1:]
     drift = (midpoints(gyro) - turns_between(turned) / step)[both]
     rate = gyro - np.median(drift, axis=0) if len(drift) else gyro
@@ -181,19 +186,19 @@ def _fused(
     arm = fused.apply(poses.lever)
     place = splined(stamps, poses.position, clock, np.diff(stamps) > usual) + arm
     smoothed, velocity, kept = smooth_positions(place, measured & believed, step)
-    # What the smoother does not believe is no pose, and is bridged as a lost one is. Where few
-    # poses are left between gaps the smoother may swing; it must stay with what was seen.
+    # A pose that the smoother rejects is bridged like a lost one. If few poses are left between
+    # gaps, the smoother may oscillate; its result must stay near the measured poses.
     sure = np.flatnonzero(kept)
     if len(sure) < SHORTEST_RUN:
         return unknown
     close = np.linalg.norm(smoothed - interpolate(clock, clock[sure], place[sure]), axis=1)
-    gap = bridge + 2.0 * step  # between rows of the clock that lie beside the poses
+    gap = bridge + 2.0 * step  # between rows of the clock that are beside the poses
     bridged = known_at(clock[sure], clock, gap) & known_at(stamps, clock, bridge)
     return Reference(quaternions(fused), smoothed, velocity, bridged & (close < LARGEST_JUMP))
 
 
 def longest_trusted(stamps: Float[np.ndarray, " n"]) -> float:
-    """s between two poses up to which what lies between them can be trusted."""
+    """Largest time between two poses for which the poses between them can be trusted, s."""
     return max(LONGEST_BRIDGE, LOST_POSES * float(np.median(np.diff(stamps))))
 
 
@@ -207,12 +212,12 @@ def fuse_attitude(
     step: float,
 ) -> tuple[Rotation, Bool[np.ndarray, " n"]]:
     """Integrated attitude times a smooth correction towards the measured one, and where the
-    measured one was believed.
+    measured one was used.
 
-    The correction measured · integrated⁻¹ moves as slowly as the gyro's bias does. Samples more
-    than 15° off its median course (σ 3 s) are flips of the tracker; the rest is smoothed over
-    0.3 s (σ), with weights that fall with the residual. Where nothing was measured the
-    correction is interpolated, so that the gyro bridges the gap.
+    The correction measured · integrated⁻¹ changes as slowly as the gyro's bias. Samples more than
+    15° from its median (σ 3 s) are flips of the tracker. The others are smoothed over 0.3 s (σ),
+    with weights that decrease with the residual. Where nothing was measured the correction is
+    interpolated, so that the gyro bridges the gap.
     """
     correction = quaternions(measured * integrated.inv())
     correction[good] = one_sign(correction[good])
@@ -228,7 +233,8 @@ def fuse_attitude(
     ]:
         correction *= np.where((correction * course).sum(axis=1) < 0, -1.0, 1.0)[:, None]
         angle = 2.0 * np.arccos(np.clip((correction * course).sum(axis=1), -1.0, 1.0))
-        # Once flips are told, they stay so; a course that loses four fifths of all is none.
+        # Flips remain flips in later rounds; a median that rejects four fifths of all samples is
+        # not used.
         near = (good if flip < np.pi else believed) & (angle < flip)
         believed = near if near.sum() > 0.2 * good.sum() else good
         scale = max(3.0 * float(np.median(angle[believed])), least)
@@ -239,7 +245,8 @@ def fuse_attitude(
 
 
 def one_sign(wxyz: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 4"]:
-    """The same rotations; q and −q are one, and neighbours get the same sign."""
+    """The same rotations, with signs such that neighbours are near each other: q and −q are the
+    same rotation."""
     opposite = (wxyz[1:] * wxyz[:-1]).sum(axis=1) < 0
     return wxyz * np.cumprod(np.concatenate([[1.0], np.where(opposite, -1.0, 1.0)]))[:, None]
 
@@ -253,12 +260,12 @@ def smooth_positions(
     step: float,
     cutoff: float = 12.0,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Positions (m), velocities (m/s) and which measurements were believed.
+    """Positions (m), velocities (m/s) and which measurements were used.
 
-    The positions minimise Σ w |p − z|² + λ Σ |Δ³p|² (Whittaker's smoother): the response falls to
-    one half at `cutoff` Hz, a quarter of the rate at most, and stays 1 to 0.1 % below a third of
-    it. Weights fall with the residual, which removes single jumps; where nothing was measured the
-    smoother bridges with the smoothest acceleration.
+    The positions minimise Σ w |p − z|² + λ Σ |Δ³p|² (Whittaker's smoother). The response is one
+    half at `cutoff` Hz, which is at most a quarter of the rate, and it is 1 to 0.1 % below a third
+    of `cutoff`. Weights decrease with the residual, which removes single jumps. Where nothing was
+    measured the smoother bridges with the smoothest acceleration.
     """
     cutoff = min(cutoff, 0.25 / step)
     # Δ³ᵀΔ³ in SciPy's upper banded form: bands[3 − d, j] couples j and j − d.

@@ -1,4 +1,4 @@
-"""Samples on other stamps: splines within unbroken runs, and a low-pass before a lower rate."""
+"""Resampling: splines within unbroken runs, and a low-pass before a lower rate."""
 
 from __future__ import annotations
 
@@ -14,31 +14,32 @@ from gnio_jax.numerics import convolved, finite_rows, quaternions, rotations, st
 from gnio_jax.types import Sequence
 
 SPLINE_INTERVALS = 3.5
-"""Usual intervals of a sensor up to which a spline follows it between two samples; across more it
-would swing, and a line is drawn (ours)."""
+"""Largest number of usual intervals of a sensor between two samples that a spline interpolates;
+across more it would oscillate, and a line is used (ours)."""
 SHORTEST_SPLINE = 4
-"""Samples in a row below which straight lines stand in for a spline."""
+"""Number of successive samples below which straight lines replace a spline."""
 SAME_STAMP = 1e-6
 """s."""
 
 
 def longest_bridge(rate: float) -> float:
-    """s between two samples of an IMU at `rate` Hz up to which what lies between them counts as
-    measured (ours): clocks of phones jitter, and what is guessed of a few lost samples is right."""
+    """Largest time between two samples of an IMU at `rate` Hz for which interpolated samples count
+    as measured, s (ours): clocks of phones jitter, and the interpolation of a few lost samples is
+    accurate."""
     return max(0.1, 3.0 / rate)
 
 
 def is_uniform(time: Float[np.ndarray, " n"], rate: float) -> bool:
     """True if every interval is 1/rate to 0.1 % and the whole to 0.01 %.
 
-    Stamps rounded to a microsecond are.
+    This holds for stamps rounded to a microsecond.
     """
     intervals = np.diff(time) * rate
     return bool(np.abs(intervals - 1.0).max() < 1e-3 and abs(intervals.mean() - 1.0) < 1e-4)
 
 
 def uniform_clock(first: float, last: float, rate: float) -> Float[np.ndarray, " m"]:
-    """Stamps at `rate` Hz from `first`, as far as `last` reaches."""
+    """Stamps at `rate` Hz from `first` to at most `last`."""
     clock = first + np.arange(int(np.floor((last - first) * rate + 1e-6)) + 1) / rate
     clock[-1] = min(clock[-1], last)  # rounding must not extrapolate
     return clock
@@ -50,11 +51,11 @@ def resampled(
     clock: Float[np.ndarray, " m"],
     rate: float,
 ) -> tuple[Float[np.ndarray, "m w"], Bool[np.ndarray, " m"]]:
-    """(An IMU's samples at the uniform stamps `clock` of `rate` Hz, which of these are measured.)
+    """An IMU's samples at the uniform stamps `clock` of `rate` Hz, and which of these are measured.
 
-    Going to a lower rate the samples are band-limited first (zero-phase FIR, pass band to 0.8 of
-    the new Nyquist frequency), or vibrations would alias into the gait band. In gaps longer than
-    `longest_bridge` they are a line and not measured, and beyond the ends they are held.
+    For a lower rate the samples are band-limited first (zero-phase FIR, pass band to 0.8 of the new
+    Nyquist frequency), because vibrations would alias into the gait band. In gaps longer than
+    `longest_bridge` the samples are on a line and not measured, and beyond the ends they are held.
     """
     step = float(np.median(np.diff(time)))
     factor, broken = decimation_factor(1.0 / step, rate), np.diff(time) > SPLINE_INTERVALS * step
@@ -72,10 +73,10 @@ def resampled(
 def resample(sequence: Sequence, rate: float) -> Sequence:
     """`sequence` on a uniform clock of `rate` Hz that starts at its first stamp.
 
-    Unchanged if it is on such a clock already. The IMU goes as in `resampled`, position and
-    velocity follow splines, attitudes slerp along the shorter arc. `valid` is False between samples
-    of which one is invalid, and in gaps of the IMU; there `imu_valid` is False, too. A reference
-    value next to a NaN is NaN. Waypoints have stamps of their own and stay.
+    A sequence on such a clock is unchanged. The IMU is resampled by `resampled`, position and
+    velocity by splines, and attitudes by slerp along the shorter arc. `valid` is False between
+    samples of which one is invalid, and in gaps of the IMU, where `imu_valid` is also False. A
+    reference value next to a NaN is NaN. Waypoints have stamps of their own and do not change.
     """
     time, valid = sequence.time, sequence.valid
     if is_uniform(time, rate):
@@ -108,8 +109,8 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
 def between(
     time: Float[np.ndarray, " n"], clock: Float[np.ndarray, " m"]
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """(left row, right row, share of the way) of each stamp of `clock` between samples; left and
-    right are one where the stamp is a sample's own to 1 µs."""
+    """Left row, right row and relative position between them for each stamp of `clock`. Left and
+    right are the same if the stamp is that of a sample to 1 µs."""
     right = np.clip(np.searchsorted(time, clock), 1, len(time) - 1)
     left = np.where(time[right] - clock <= SAME_STAMP, right, right - 1)
     right = np.where(clock - time[left] <= SAME_STAMP, left, right)
@@ -124,7 +125,7 @@ def known_at(
     longest: float,
     known: Bool[np.ndarray, " n"] | bool = True,
 ) -> Bool[np.ndarray, " m"]:
-    """Where a clock lies between samples, both `known`, that are no more than `longest` (s)
+    """Where a clock is between two samples that are both `known` and at most `longest` (s)
     apart."""
     left, right, _ = between(time, clock)
     covered = (clock >= time[0] - SAME_STAMP) & (clock <= time[-1] + SAME_STAMP)
@@ -138,7 +139,7 @@ def runs_within(
     clock: Float[np.ndarray, " m"],
     shortest: int = SHORTEST_SPLINE,
 ) -> Iterator[tuple[slice, slice]]:
-    """(rows of `time`, rows of `clock` within them to 1 µs) of each unbroken run of at least
+    """Rows of `time`, and rows of `clock` within them to 1 µs, of each unbroken run of at least
     `shortest` samples."""
     for run in stretches(broken):
         if run.stop - run.start >= shortest:
@@ -166,7 +167,7 @@ def splined(
     lines = (1.0 - share) * values[left] + share * values[right]
     result = np.where(share > 0, lines, values[left])
     for run, there in runs_within(time, broken, clock):
-        # A spline starts at 0, or large stamps would cost its coefficients digits.
+        # A spline starts at 0, because large stamps would cost its coefficients digits.
         own = time[run] - time[run.start]
         at = np.clip(clock[there] - time[run.start], 0.0, own[-1])
         result[there] = CubicSpline(own, values[run], axis=0)(at)
@@ -176,8 +177,8 @@ def splined(
 def slerped(
     time: Float[np.ndarray, " n"], wxyz: Float[np.ndarray, "n 4"], clock: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m 4"]:
-    """Attitudes on the shorter arc between samples, whatever the signs of the quaternions; NaN
-    beside a NaN, and the outermost ones beyond the ends."""
+    """Attitudes on the shorter arc between samples, for any signs of the quaternions; NaN next to a
+    NaN, and the outermost attitudes beyond the ends."""
     left, right, share = between(time, clock)
     result = np.full((len(clock), 4), np.nan)
     known = finite_rows(wxyz[left]) & finite_rows(wxyz[right])

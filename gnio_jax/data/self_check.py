@@ -22,56 +22,56 @@ from gnio_jax.numerics import (
 from gnio_jax.types import GRAVITY, Sequence
 
 WINDOW_SECONDS = 10.0
-"""s over which the gyro is integrated."""
+"""Time over which the gyro is integrated, s."""
 LIVELY = 0.2
-"""m/s² rms of horizontal acceleration, above which the positions must show it, too."""
+"""Horizontal acceleration, m/s² rms, above which the positions must show it too."""
 TRIANGLE_SECONDS = 0.1
 """Half the width of the triangles over which accelerations are compared, s."""
 MOST_GRAVITY_ERROR, MOST_GYRO_DEGREES = 0.5, 5.0
-"""m/s² by which the mean of R·accel may be off gravity, and by how much the gyro may be off the
-reference's rotation in the median window."""
+"""Largest error of the mean of R·accel, m/s², and largest error of the gyro against the reference's
+rotation in the median window, degrees."""
 MOST_GYRO_SCALE = 0.01
-"""Share of what it turns by which a gyro may be off besides: a phone's reads 1 to 3 % too little or
-too much, which is 4° of the turns that a walker's hand makes in 10 s."""
+"""Additional error of the gyro, as a share of the angle turned: a phone's gyro reads 1 to 3 % too
+little or too much, which is 4° of the angle that a walker's hand turns in 10 s."""
 FASTEST_MEDIAN, LEAST_CORRELATION = 3.0, 0.3
-"""m/s of a pedestrian's median speed, and correlation of the horizontal accelerations."""
+"""Largest median speed of a pedestrian, m/s, and smallest correlation of the horizontal
+accelerations."""
 
 
 class SelfCheck(NamedTuple):
-    """Figures by which IMU and reference of one sequence vouch for each other; NaN where they
-    cannot be computed."""
+    """Figures that compare IMU and reference of one sequence; NaN if they cannot be computed."""
 
     duration: float
     """s."""
     rate: float
-    """Hz, from the median interval."""
+    """Rate from the median interval, Hz."""
     gravity_mean: Float[np.ndarray, "3"] = np.full(3, np.nan)
-    """Mean of R·accel in the world less the mean acceleration of the reference, (v_end −
-    v_start)/T, m/s²: (0, 0, 9.81). Of waypoints its length stands in z."""
+    """Mean of R·accel in the world minus the mean acceleration of the reference, (v_end −
+    v_start)/T, m/s², which should be (0, 0, 9.81). With waypoints its magnitude is in z."""
     gyro_consistency_degrees: float = np.nan
-    """Median angle between gyro-integrated and reference rotation over 10 s windows, one constant
-    bias removed. NaN for what is shorter than two windows: the bias would take up whatever is
-    wrong."""
+    """Median angle between gyro-integrated and reference rotation over 10 s windows, after one
+    constant bias is removed. NaN for a sequence shorter than two windows, because the bias would
+    absorb every error."""
     median_speed: float = np.nan
     """m/s."""
     accel_correlation_horizontal: float = np.nan
     """Correlation of the second difference of the position with R·accel + g, x and y together."""
     share_valid: float = np.nan
-    """Share of the samples whose reference can be trusted; NaN of waypoints."""
+    """Share of the samples whose reference can be trusted; NaN with waypoints."""
     failures: tuple[str, ...] = ()
-    """What is implausible, one sentence each; empty when the sequence may be used."""
+    """Reasons why the sequence is implausible, one sentence each; empty if it may be used."""
 
 
 def self_check(sequence: Sequence, pedestrian: bool = True, correlates: bool = True) -> SelfCheck:
     """Do IMU and reference describe the same motion? `sequence` must be on a uniform clock.
 
-    Fails: mean of R·accel off (0, 0, 9.81) and the reference's own mean acceleration by more than
-    0.5 m/s²; gyro off the reference orientation by more than 5° and 1 % of what it turns in the
-    median window; a pedestrian whose median speed exceeds 3 m/s; a horizontal acceleration above
-    0.2 m/s² rms that correlates with that of the positions by less than 0.3, where the dataset says
-    that it `correlates`.
-    Standing still is no failure: it is what the gate is for. Neither is being too short for the
-    gyro's windows. Of waypoints only gravity and the speed between them can be asked.
+    A sequence fails if the mean of R·accel, minus the reference's own mean acceleration, differs
+    from (0, 0, 9.81) by more than 0.5 m/s²; if the gyro differs from the reference orientation in
+    the median window by more than 5° plus 1 % of the angle turned; if the median speed of a
+    pedestrian exceeds 3 m/s; or if a horizontal acceleration above 0.2 m/s² rms correlates with
+    that of the positions by less than 0.3, unless the dataset says that they need not
+    (`correlates`). Standing still is no failure, and neither is a recording that is too short for
+    the gyro's windows. With waypoints only gravity and the speed between them can be checked.
     """
     step = float(np.median(np.diff(sequence.time)))
     check = SelfCheck(float(sequence.time[-1] - sequence.time[0]), 1.0 / step)
@@ -100,7 +100,7 @@ def self_check(sequence: Sequence, pedestrian: bool = True, correlates: bool = T
         failures.append(f"gyro is {off} in the median {window}, in which it turns {turned:.0f}°")
     if pedestrian and check.median_speed > FASTEST_MEDIAN:
         failures.append(f"median speed is {check.median_speed:.1f} m/s, too fast for a pedestrian")
-    # The correlation is NaN when the positions do not move at all.
+    # The correlation is NaN if the positions do not move at all.
     if correlates and strength > LIVELY and not correlation >= LEAST_CORRELATION:
         problem = f"correlates by only {correlation:.2f} with R·accel"
         failures.append(f"horizontal acceleration of the positions {problem}")
@@ -108,10 +108,10 @@ def self_check(sequence: Sequence, pedestrian: bool = True, correlates: bool = T
 
 
 def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
-    """`self_check` with what the dataset asks.
+    """`self_check` with the requirements of the dataset.
 
-    What a converted recording brings along as `check_pedestrian` and `check_correlation` wins: its
-    own dataset asked it.
+    The attributes `check_pedestrian` and `check_correlation` of a converted recording have
+    priority, because they are those of its original dataset.
     """
     about = sequence.attributes
     pedestrian = bool(about.get("check_pedestrian", dataset.pedestrian))
@@ -125,17 +125,16 @@ def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
 def _with_reference(
     check: SelfCheck, sequence: Sequence, step: float
 ) -> tuple[SelfCheck, float, bool]:
-    """(figures, horizontal acceleration by the accelerometer m/s² rms, whether the gyro could be
-    integrated over at least one window)."""
+    """The figures, the horizontal acceleration by the accelerometer (m/s² rms), and whether the
+    gyro could be integrated over at least one window."""
     valid, velocity = sequence.valid, sequence.velocity
     force = rotations(_held_attitude(sequence)).apply(sequence.accel)
-    # The reference's mean acceleration, by the velocities at the ends of its valid stretches.
+    # The reference's mean acceleration, from the velocities at the ends of its valid stretches.
     first, stop = spans(valid).T
     seconds = float((stop - 1 - first).sum()) * step
     gained = (velocity[stop - 1] - velocity[first]).sum(axis=0)
     starts, gyro_errors = gyro_windows(sequence)
-    # Windows that overlap throughout are one window, and one bias explains one window whatever it
-    # holds.
+    # Windows that all overlap count as one window, and one bias can explain any single window.
     apart = starts.size > 0 and float(np.ptp(starts)) > WINDOW_SECONDS - 0.5 * step
     correlation, strength = _accel_correlation(sequence, force, step)
     check = check._replace(
@@ -149,10 +148,11 @@ def _with_reference(
 
 
 def _with_waypoints(check: SelfCheck, sequence: Sequence, step: float) -> SelfCheck:
-    """The figures of a recording that has waypoints in the place of poses.
+    """The figures of a recording with waypoints instead of poses.
 
-    The mean specific force over a window, in the frame of its gyro-integrated attitude, is as long
-    as gravity: a walker gains hardly any velocity in it. Its direction is not known.
+    The mean specific force over a window, in the frame of its gyro-integrated attitude, must have
+    the magnitude of gravity, because a walker hardly changes velocity in it. Its direction is not
+    known.
     """
     assert sequence.waypoints is not None
     stamps, position = sequence.waypoints
@@ -167,7 +167,7 @@ def _with_waypoints(check: SelfCheck, sequence: Sequence, step: float) -> SelfCh
 
 
 def _held_attitude(sequence: Sequence) -> Float[np.ndarray, "n 4"]:
-    """The last valid attitude of each sample. Invalid rows are left out of every mean and only
+    """The last valid attitude at each sample. Invalid rows are left out of every mean; they only
     bridge the gyro's windows."""
     return sequence.orientation[last_true(sequence.valid)]
 
@@ -181,8 +181,8 @@ def gyro_windows(
     """(start s, degrees) of windows that start every half window.
 
     The degrees are the angle between the rotation integrated from the gyro and the reference's,
-    after the one constant bias that explains most of them. A recording shorter than a window is
-    one.
+    after the constant bias that explains most of them is removed. A recording shorter than a window
+    is one window.
     """
     time, valid = sequence.time, sequence.valid
     step = float(np.median(np.diff(time)))
@@ -198,7 +198,7 @@ def gyro_windows(
     # exp(J b) R ≈ rotation integrated from gyro + b, J = R_startᵀ Σ R_k dt
     summed = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(rotation * step, axis=0)])
     jacobian = np.einsum("wji,wjk->wik", rotation[starts], summed[starts + length] - summed[starts])
-    # A rate sampled at the stamps is worth most at the middle of the interval it drives.
+    # A rate sampled at the stamps is most accurate in the middle of its interval.
     middle, halves = midpoints(sequence.gyro), starts // half
     middle = middle[: len(middle) // half * half]
 
@@ -214,7 +214,7 @@ def gyro_windows(
 
 
 def _product(turns: Float[np.ndarray, "w n 4"]) -> Float[np.ndarray, "w 4"]:
-    """Products of n quaternions (wxyz): of pairs, and then of these."""
+    """Products of n quaternions (wxyz), computed pairwise."""
     turns = np.ascontiguousarray(turns.T)
     while (count := turns.shape[1]) > 1:
         paired = quaternion_product(turns[:, : count - 1 : 2], turns[:, 1::2], axis=0)
@@ -225,7 +225,8 @@ def _product(turns: Float[np.ndarray, "w n 4"]) -> Float[np.ndarray, "w 4"]:
 def _bias_correction(
     error: Float[np.ndarray, "w 3"], jacobian: Float[np.ndarray, "w 3 3"]
 ) -> Float[np.ndarray, "3"]:
-    """The bias b of least Σ|error − J b|, a sum of norms: one broken window must not bend it."""
+    """The bias b with the smallest Σ|error − J b|. A sum of norms is used, so that one bad window
+    does not change b much."""
     correction = np.zeros(3)
     for _ in range(10):
         weight = 1.0 / np.maximum(np.linalg.norm(error - jacobian @ correction, axis=1), 1e-3)
@@ -239,11 +240,11 @@ def _bias_correction(
 
 
 def _accel_correlation(sequence: Sequence, force: np.ndarray, step: float) -> tuple[float, float]:
-    """(correlation, rms m/s² of the inertial side) of horizontal accelerations over triangles of
+    """Correlation, and rms m/s² of the inertial side, of horizontal accelerations over triangles of
     ± `TRIANGLE_SECONDS`.
 
-    The second difference of the position over ± h is the acceleration weighted by the triangle of
-    that width, exactly.
+    The second difference of the position over ± h is exactly the acceleration weighted by the
+    triangle of that width.
     """
     h = max(round(TRIANGLE_SECONDS / step), 1)
     if len(sequence.time) < 4 * h:

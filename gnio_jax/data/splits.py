@@ -1,4 +1,4 @@
-"""Which recordings make a split: lists, folders by their names, people who are held out, and folds.
+"""The recordings of a split: lists, folders by their names, held-out people, and folds.
 
 `train+0of4` is the first of four folds of the split `train`, and `train-0of4` is all but that one.
 """
@@ -21,14 +21,15 @@ from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
 SEED = 20181130
-"""Of the hold-outs for validation."""
+"""Seed of the hold-outs for validation."""
 
 
 def find_folders(root: Path, is_recording: Callable[[Path], bool]) -> dict[str, Path]:
-    """Name -> folder of every recording anywhere below `root`, links followed: archives unpack to
-    folders of many names.
+    """Name -> folder of every recording anywhere below `root`, including linked folders, because
+    archives unpack to folders of many names.
 
-    Of several of one name the first in alphabetical order counts, the others are warned of.
+    If several have the same name, the first in alphabetical order is used, with a warning about the
+    others.
     """
     found: dict[str, Path] = {}
     seen, again = set(), []
@@ -49,7 +50,7 @@ def find_folders(root: Path, is_recording: Callable[[Path], bool]) -> dict[str, 
 
 def find_list(root: Path, name: str) -> Path:
     """The list file `name` at `root`, in its folder `lists`, or else anywhere below; `root / name`
-    where there is none."""
+    if there is none."""
     for place in (root / name, root / "lists" / name):
         if place.is_file():
             return place
@@ -57,12 +58,12 @@ def find_list(root: Path, name: str) -> Path:
 
 
 def held_out(people: Mapping[str, str], share: float = 0.1, most: float = 0.25) -> set[str]:
-    """Names of the recordings to validate with, from recording -> person: whole people, in an order
+    """Names of the recordings for validation, from recording -> person: whole people, in an order
     drawn with a fixed seed.
 
-    People are taken until they hold `share` of the recordings; who would bring it above `most` is
-    passed over. Where that leaves nobody (too few people), whole recordings are taken instead, and
-    none of fewer than four. Depends on the names alone.
+    People are taken until they have `share` of the recordings; a person with whom the share would
+    exceed `most` is skipped. If nobody remains (too few people), whole recordings are taken
+    instead, but none of fewer than four. The result depends only on the names.
     """
     for owner in (people, {name: name for name in people}):
         counts = Counter(owner.values())
@@ -78,17 +79,17 @@ def held_out(people: Mapping[str, str], share: float = 0.1, most: float = 0.25) 
 
 
 def drawn(seed: str, name: str) -> float:
-    """A number from 0 to 1, drawn by a name alone: what is shared out by it stays where it is,
-    whatever else a copy of the data holds."""
+    """A number from 0 to 1 that depends only on a name, so that splits by it are the same in every
+    copy of the data."""
     return int(hashlib.sha256(f"{seed} {name}".encode()).hexdigest()[:8], 16) / 2**32
 
 
 def listed(path: Path, find: Callable[[str], Path | None], root: Path, layout: str) -> list[Path]:
-    """What `find` says of the entries of a list file, one a line: the place of a recording, or None
-    where this copy lacks it.
+    """The recordings that `find` gives for the entries of a list file, one per line: the place of a
+    recording, or None if this copy lacks it.
 
-    Absent entries are warned of with their count. Raises `InputError` when the list cannot be read
-    or names nothing that is present.
+    A warning has the number of absent entries. Raises `InputError` if the list cannot be read or
+    names no recording that is present.
     """
     layout = f"expected layout: {layout}"
     try:
@@ -101,7 +102,7 @@ def listed(path: Path, find: Callable[[str], Path | None], root: Path, layout: s
     for entry in named:
         try:
             found[entry] = find(entry)
-        except OSError:  # too long for a name, for one
+        except OSError:  # for example, the name is too long
             found[entry] = None
     absent = [shortened(entry) for entry, place in found.items() if place is None]
     if len(absent) == len(found):
@@ -128,8 +129,8 @@ class Fold(NamedTuple):
     left_out: bool
 
     def select(self, sequences: Iterable[Sequence]) -> list[Sequence]:
-        """Those of the split's sequences that belong to it. All must be given: a fold depends on
-        the lengths of all. Raises `InputError` for a fold without a sequence."""
+        """The split's sequences that belong to the fold. All sequences must be given, because a
+        fold depends on the lengths of all. Raises `InputError` for a fold without a sequence."""
         every = list(sequences)
         fold_of = folds(every, self.count)
         if self.number not in fold_of.values():
@@ -140,9 +141,9 @@ class Fold(NamedTuple):
 
 
 def parse_fold(split: str) -> Fold | None:
-    """What the name of a split stands for; None for a split as the dataset has it.
+    """The fold that the name of a split describes; None for a split of the dataset itself.
 
-    Raises `InputError` for a fold that is not there.
+    Raises `InputError` for a fold that does not exist.
     """
     found = _NOTATION.fullmatch(split)
     if found is None:
@@ -155,15 +156,15 @@ def parse_fold(split: str) -> Fold | None:
 
 
 def group(sequence: Sequence) -> str:
-    """Whose recordings are not independent of each other: the loader's group, else the person, else
-    each on its own."""
+    """The group of a sequence, within which recordings are not independent: the loader's group,
+    else the person, else the sequence itself."""
     attributes = sequence.attributes
     return str(attributes.get("group") or attributes.get("subject") or sequence.name)
 
 
 def folds(sequences: Iterable[Sequence], count: int) -> dict[str, int]:
-    """Group -> its fold, 0 to `count` − 1. The longest group comes first, and each goes to the fold
-    that has the least time so far; a function of names and lengths alone (ours)."""
+    """Group -> its fold, 0 to `count` − 1. The longest group comes first, and each is assigned to
+    the fold with the least time so far. The result depends only on names and lengths (ours)."""
     seconds: dict[str, float] = {}
     for sequence in sequences:
         length = float(sequence.time[-1] - sequence.time[0])

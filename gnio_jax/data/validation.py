@@ -1,4 +1,4 @@
-"""What every sequence must satisfy before anything uses it."""
+"""Conditions that every sequence must satisfy before it is used."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from gnio_jax.errors import InputError
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
 FASTEST = 300.0
-"""m/s: faster than anything that carries such an IMU."""
+"""Largest speed, m/s, above that of every carrier of such an IMU."""
 FASTEST_WALKER = 6.0
-"""m/s: faster than this not a person walks but a visual odometry that relocalises."""
+"""Largest speed of a person, m/s; faster steps come from a visual odometry that relocalises."""
 LARGEST_STEP = 10.0
-"""m by which positions that were held for a while, or corrected, may jump all the same."""
+"""Largest jump of positions that were held for some time, or corrected, m."""
 FARTHEST = 1e8
-"""m from the world's origin, up to which a float64 has digits enough."""
+"""Largest distance from the world's origin at which a float64 has enough digits, m."""
 WINDOW_SECONDS = 1.0
-"""The network's window, s. A longer hole in the IMU is no jitter: readers divide the recording
-there (`assembly.assemble`), or refuse it."""
+"""The network's window, s. At a longer hole in the IMU readers divide the recording
+(`assembly.assemble`), or refuse it."""
 FEWEST_WAYPOINTS = 3
-"""Below which a track cannot be laid on them: a rotation and a shift take two."""
+"""Smallest number of waypoints to which a track can be aligned: a rotation and a shift need two."""
 UNIT_NORM_TOLERANCE = 1e-3
-"""Rounding in text files moves the norm of a quaternion by less."""
+"""Tolerance of the norm of a quaternion, which exceeds the rounding of text files."""
 
 
 def validate(sequence: Sequence, source: object) -> Sequence:
     """Return `sequence` if every consumer can rely on it.
 
-    Quaternions whose norm is off by no more than `UNIT_NORM_TOLERANCE` come back normalized. Raises
+    Quaternions whose norm differs from 1 by at most `UNIT_NORM_TOLERANCE` are normalized. Raises
     `InputError` naming `source`, the field and the remedy.
     """
     _check_shapes(sequence, source)
@@ -55,7 +55,7 @@ def validate(sequence: Sequence, source: object) -> Sequence:
 
 
 def from_one(index: int) -> int:
-    """The row that holds an entry where nothing stands before the first."""
+    """The row of an entry, counted from 1, if no row comes before the first entry."""
     return index + 1
 
 
@@ -67,14 +67,14 @@ def _refuse(
     remedy: str,
     row: Callable[[int], int] = from_one,
 ) -> None:
-    """Raise `InputError` where an entry is bad; `row` says which row of the file holds it."""
+    """Raise `InputError` if an entry is bad; `row` gives its row in the file."""
     if bad.any():
         rows = f"in {bad.sum()} rows, first in row {row(int(np.argmax(bad)))}"
         raise InputError(source, f"field '{field}' {problem} {rows}", remedy)
 
 
 def _check_shapes(sequence: Sequence, source: object) -> None:
-    """Files give these shapes, so that a wrong one is a user's error."""
+    """Check the shapes, which come from files, so that a wrong one is a user's error."""
     time = sequence.time
     count = time.shape[0] if time.ndim == 1 else -1
     if count < 2:
@@ -94,7 +94,7 @@ def _check_shapes(sequence: Sequence, source: object) -> None:
 
 
 def _check_motion(sequence: Sequence, source: object) -> None:
-    """Raise `InputError` where the valid reference moves as nothing does."""
+    """Raise `InputError` if the motion of the valid reference is impossible."""
     valid, position = sequence.valid, sequence.position
     if not valid.any():
         return
@@ -115,7 +115,8 @@ def _check_motion(sequence: Sequence, source: object) -> None:
 
 
 def _check_waypoints(sequence: Sequence, source: object) -> None:
-    """Three or more, finite, increasing, and on the sequence's clock to a sample."""
+    """Check that there are three or more waypoints, finite, increasing, and on the sequence's clock
+    to a sample."""
     if sequence.waypoints is None:
         return
     time, position = sequence.waypoints
@@ -141,8 +142,8 @@ def check_finite(
     source: object,
     row: Callable[[int], int] = from_one,
 ) -> None:
-    """Raise `InputError` where a column that must be complete holds NaN or Inf. `row` says which
-    row of the file holds an entry."""
+    """Raise `InputError` if a column that must be complete has NaN or Inf. `row` gives the row of
+    an entry in the file."""
     finite = np.isfinite(values)
     if not finite.all():
         bad = ~finite.reshape(len(values), -1).all(axis=1)
@@ -152,8 +153,8 @@ def check_finite(
 def check_increasing(
     time: Float[np.ndarray, "n"], source: object, row: Callable[[int], int] = from_one
 ) -> None:
-    """Raise `InputError` where the stamps (s) do not increase. `row` says which row of the file
-    holds an entry."""
+    """Raise `InputError` if the stamps (s) do not increase. `row` gives the row of an entry in the
+    file."""
     backward = np.concatenate([[False], np.diff(time) <= 0])
     remedy = "sort the rows and drop repeated ones"
     _refuse(backward, "time", "does not increase", source, remedy, row)
@@ -162,8 +163,8 @@ def check_increasing(
 def check_gyro(
     gyro: Float[np.ndarray, "n 3"], source: object, time: Float[np.ndarray, " n"] | None = None
 ) -> None:
-    """Raise `InputError` where the magnitudes say that a gyro is not in rad/s. Samples are named by
-    their stamps `time` (s), or else by their rows."""
+    """Raise `InputError` if the magnitudes show that a gyro is not in rad/s. Messages name samples
+    by their stamps `time` (s), or else by their rows."""
     turn = float(np.median(np.linalg.norm(gyro, axis=1)))
     if turn > 20.0:
         problem = f"field 'gyro' looks like deg/s (median magnitude {turn:.3g})"
@@ -174,7 +175,7 @@ def check_gyro(
 def check_accel(
     accel: Float[np.ndarray, "n 3"], source: object, time: Float[np.ndarray, " n"] | None = None
 ) -> None:
-    """The same of an accelerometer, m/s², gravity included."""
+    """The same for an accelerometer, m/s², including gravity."""
     force = float(np.median(np.linalg.norm(accel, axis=1)))
     problem, remedy = "", "give the specific force in m/s², gravity included"
     if 0.5 < force < 2.0:
@@ -208,14 +209,15 @@ def check_unit_norm(
 ) -> Float[np.ndarray, "n 4"]:
     """Quaternions, normalized where `where` holds.
 
-    Raises `InputError` if the norm of one of these is off by more than `UNIT_NORM_TOLERANCE`.
+    Raises `InputError` if the norm of one of these differs from 1 by more than
+    `UNIT_NORM_TOLERANCE`.
     """
     norm = np.linalg.norm(wxyz, axis=1)
     error = np.where(where, np.abs(norm - 1.0), 0.0)
     remedy = "check the column order and normalize, or mark the rows invalid"
     _refuse(error > UNIT_NORM_TOLERANCE, field, "is not a unit quaternion", source, remedy)
-    # What is exact to rounding stays bit for bit, so that writing and reading again changes
-    # nothing.
+    # Quaternions that are exact to rounding are not changed at all, so that writing and reading
+    # again changes nothing.
     rounded = error > 1e-12
     if not rounded.any():
         return wxyz
@@ -226,7 +228,7 @@ def check_unit_norm(
 def check_gaps(
     time: Float[np.ndarray, "n"], source: object, longest: float = WINDOW_SECONDS
 ) -> None:
-    """Raise `InputError` when two stamps lie further apart than `longest` (s)."""
+    """Raise `InputError` if two successive stamps are further apart than `longest` (s)."""
     gaps = np.diff(time)
     if gaps.size and gaps.max() > longest:
         row = int(np.argmax(gaps))

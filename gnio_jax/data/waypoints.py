@@ -1,15 +1,16 @@
-"""From waypoints to poses: what a walk with a phone before the body says of its every sample.
+"""From waypoints to poses at every sample of a walk with the phone held before the body.
 
 Surveyors hold a phone flat before them, and its +y axis (the long side, away from the body) points
-where they walk. The gyro, levelled slowly by gravity, gives the attitude but for one yaw, which
-lays the y axis along the legs. Positions are interpolated between the taps. All of it is ours.
+in the direction of walking. The gyro, levelled slowly by gravity, gives the attitude except for one
+yaw, which is chosen so that the y axis points along the legs. Positions are interpolated between
+the taps. All of this is ours.
 
-The bounce of the steps would tell more of the speed within a leg, and taps that are early or late
-could be moved to where it fits: waypoints that are left out then lie closer. But networks that
-learn from such speeds make 0.71 of the path of strangers who walk slowly, and 0.96 of it with
+The bounce of the steps would give more information about the speed within a leg, and early or late
+taps could be moved to fit it: left-out waypoints are then nearer. But the paths of networks that
+learn from such speeds are 0.71 of the true length for unseen people who walk slowly, and 0.96 with
 interpolation.
 
-Points of the plane are complex numbers here: x + iy, and the ratio of two legs is a scale and a
+Points of the plane are complex numbers x + iy here, and the ratio of two legs is a scale and a
 turn.
 """
 
@@ -30,61 +31,61 @@ from gnio_jax.types import Sequence, Waypoints
 
 LEVEL_SECONDS = 4.0
 """Standard deviation of the filter of the specific force that levels the gyro's attitude, s: over
-its reach a walker gains no velocity to speak of."""
+this time a walker hardly changes velocity."""
 BOUNCE_SECONDS, SWAY_SECONDS = 0.4, 1.5
-"""s: standard deviations of the filter under which the size of the vertical acceleration is the
-bounce, and of the one whose output is no bounce but the walker's slower motion."""
+"""Standard deviations of two filters, s: one averages the size of the vertical acceleration to the
+bounce, and the output of the other is the walker's slower motion, which is subtracted."""
 STEPPING = 0.3
-"""m/s² rms of bounce, below which nobody walks; and the share of a walk's usual bounce below which
-the walker stands. At twice that share the speed is the bounce's square root."""
+"""Bounce below which nobody walks, m/s² rms, and share of a walk's usual bounce below which the
+walker stands. From twice that share on the speed is the square root of the bounce."""
 
 SHORTEST_LEG, FASTEST_LEG = 1.0, 2.5
-"""m and m/s: a leg beyond these is not a walk from tap to tap."""
+"""Limits of a leg, m and m/s; a leg beyond these is not a walk from tap to tap."""
 MOST_TURN, LEAST_STRAIGHT = np.radians(45.0), 0.5
-"""rad by which a leg may be off the phone's direction, and how far it must come of its reckoned
-length: beyond these the phone was not held ahead."""
+"""Largest angle between a leg and the phone's direction, rad, and smallest share of its reckoned
+length; beyond these the phone did not point ahead."""
 FEWEST_LEGS = 2
-"""Below which no walk's yaw is believed."""
+"""Smallest number of legs for which a walk's yaw is used."""
 MOST_RESIDUAL = 20.0
-"""Degrees by which the y axis may be off the median leg."""
+"""Largest angle between the y axis and the median leg, degrees."""
 SHORTEST_SECONDS = 1.0
-"""s of poses in a row below which a walk is of no use."""
+"""Shortest continuous time of poses for which a walk is used, s."""
 
 
 class Walk(NamedTuple):
-    """Dead reckoning by the phone alone, in a level frame of any yaw."""
+    """Dead reckoning by the phone alone, in a level frame of arbitrary yaw."""
 
     time: Float[np.ndarray, " n"]
     """s."""
     way: Complex[np.ndarray, " n"]
-    """Integral of the velocity along the y axis, of which 1 is the walk's usual speed, s."""
+    """Integral of the velocity along the y axis, in units of the walk's usual speed, s."""
     length: Float[np.ndarray, " n"]
-    """The integral of its size, s."""
+    """Integral of the size of this velocity, s."""
 
     def at(self, stamps: Float[np.ndarray, " k"], values: np.ndarray) -> np.ndarray:
-        """Values at its samples, at other stamps (s)."""
+        """Values given at the walk's samples, interpolated at other stamps (s)."""
         return np.asarray(np.interp(stamps, self.time, values))
 
 
 class Legs(NamedTuple):
-    """A walk's dead reckoning beside its waypoints."""
+    """A walk's dead reckoning, compared with its waypoints."""
 
     fits: Bool[np.ndarray, " k"]
-    """Whether the reckoned leg is the one on the map but for scale and a small turn."""
+    """Whether the reckoned leg equals the leg on the map, except for scale and a small turn."""
     yaw: float
     """The walk's turn onto the map, rad."""
     residual: float
-    """Median size of what the legs' turns differ from it, degrees."""
+    """Median size of the differences of the legs' turns from it, degrees."""
 
 
 def with_poses(sequence: Sequence) -> Sequence:
     """A sequence with waypoints as one with poses too, valid on its legs.
 
-    Positions are in the map's frame, z is 0. Not valid are legs on which nobody walked with the
-    phone ahead (`Legs.fits`), what lies before the first tap and after the last, and what was not
-    measured. The attribute `yaw_residual_degrees` is the median angle between y axis and legs.
+    Positions are in the map's frame, and z is 0. Legs on which the phone did not point ahead
+    (`Legs.fits`), times before the first tap and after the last, and samples that were not measured
+    are not valid. The attribute `yaw_residual_degrees` is the median angle between y axis and legs.
 
-    Raises `Refusal` where that is above `MOST_RESIDUAL`, or too little of the walk is left.
+    Raises `Refusal` if this is above `MOST_RESIDUAL`, or if too little of the walk is left.
     """
     waypoints = sequence.waypoints
     assert waypoints is not None
@@ -117,10 +118,11 @@ def with_poses(sequence: Sequence) -> Sequence:
 def levelled(
     gyro: Float[np.ndarray, "n 3"], accel: Float[np.ndarray, "n 3"], step: float
 ) -> Rotation:
-    """Attitudes body → a level world of any yaw: the integrated gyro, its slow tilt taken out.
+    """Attitudes body → a level world of arbitrary yaw: the integrated gyro without its slow tilt.
 
-    In the frame of the first attitude the specific force, filtered over `LEVEL_SECONDS`, points up;
-    each sample is turned by the smallest rotation that lays it on z. `step` is the interval, s.
+    In the frame of the first attitude the specific force, filtered over `LEVEL_SECONDS`, points up.
+    Each sample is turned by the smallest rotation that aligns this force with z. `step` is the
+    interval, s.
     """
     turned = integrate_gyro(gyro, step)
     force = turned.apply(accel)
@@ -147,10 +149,10 @@ def reckoned(
 
 
 def legs_on(walk: Walk, waypoints: Waypoints) -> Legs:
-    """The dead reckoning laid on the waypoints.
+    """The dead reckoning aligned with the waypoints.
 
-    The yaw is that of the legs that were walked, weighted by their lengths, and the less the
-    further they are off (Cauchy's weights about the weighted median).
+    The yaw is that of the legs that were walked, weighted by their lengths, and with smaller
+    weights for legs that differ more (Cauchy's weights about the weighted median).
     """
     walked, far = (np.diff(walk.at(waypoints.time, each)) for each in (walk.way, walk.length))
     chord = np.diff(_plane(waypoints.position))
@@ -174,8 +176,8 @@ def legs_on(walk: Walk, waypoints: Waypoints) -> Legs:
 
 
 def _speed(vertical: Float[np.ndarray, " n"], step: float) -> Float[np.ndarray, " n"]:
-    """Speed over the walk's usual one, by the bounce of the vertical specific force (m/s²): an
-    inverted pendulum's grows with the square of the speed."""
+    """Speed relative to the walk's usual speed, from the bounce of the vertical specific force
+    (m/s²), which for an inverted pendulum grows with the square of the speed."""
     fast = vertical - gaussian_filter1d(vertical, SWAY_SECONDS / step, mode="nearest")
     bounce = np.sqrt(gaussian_filter1d(fast**2, BOUNCE_SECONDS / step, mode="nearest"))
     walking = bounce > STEPPING

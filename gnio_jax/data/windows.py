@@ -3,7 +3,7 @@ random changes.
 
 Overlapping windows are never copied: a second of IMU belongs to ten windows and is stored once.
 `window_source` prepares the recordings on the host. `shift_windows`, `gather`, `low_pass` and
-`augment` act inside the jitted step, and `gnio_jax.windows` says what a window is.
+`augment` are called inside the jitted step, and `gnio_jax.windows` defines a window.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class WindowSource(NamedTuple):
     """All recordings of a split, end to end, and where windows may start in them. float32."""
 
     imu: Float[Array, "t 6"]
-    """[accel m/s², gyro rad/s], as `gnio_jax.windows.AlignedRecording` has it."""
+    """[accel m/s², gyro rad/s], as in `gnio_jax.windows.AlignedRecording`."""
     start: Int[Array, "m"]
     """Row of `imu` at which each window begins, with its context."""
     rotation: Float[Array, "m 3 3"]
@@ -52,9 +52,9 @@ class WindowSource(NamedTuple):
     unyaw: Float[Array, "m 2"]
     """Cosine and sine of the yaw that `rotation` removes: from the world to the window's frame."""
     stretch: Int[Array, "m 2"]
-    """First and last row of the stretch without an invalid sample that each window is cut from."""
+    """First and last row of the stretch without an invalid sample from which each window is cut."""
     visited: Int[Array, "v"]
-    """Numbers of the windows an epoch visits: all of them, unless they are to be shifted (see
+    """Numbers of the windows that an epoch visits: all of them, unless they are shifted (see
     `shift_windows`)."""
 
 
@@ -63,11 +63,11 @@ def window_source(
 ) -> WindowSource:
     """Cut `sequences` (all at `config.rate`) into windows every `stride` samples.
 
-    With `shift` there is a window at every sample, for those of an epoch to be shifted to. A window
-    of C + N samples from i, context included, needs the reference at i … i+C+N, all of it
+    With `shift` there is a window at every sample, to which those of an epoch can be shifted. A
+    window of C + N samples from i, context included, needs the reference at i … i+C+N, all of it
     valid, and no sample across a gap of the IMU. Attitude and biases come from the reference
     (biases zero). Differences of positions are taken in float64, before they are stored in float32.
-    Raises `InputError` when not a single window fits.
+    Raises `InputError` if no window fits.
     """
     found: list[WindowSource] = []
     for sequence in sequences:
@@ -84,7 +84,7 @@ def window_source(
 
 
 def joined(sources: list[WindowSource]) -> WindowSource:
-    """The recordings of each after those of the one before, as host arrays."""
+    """The recordings of all sources, one source after the other, as host arrays."""
     found: list[WindowSource] = []
     rows = windows = 0
     for source in sources:
@@ -114,8 +114,8 @@ def _recording_windows(
     # Stretches without an invalid sample begin and end where this changes.
     changes = np.flatnonzero(np.diff(usable, prepend=False, append=False)).reshape(-1, 2)
     stretch = changes[np.searchsorted(changes[:, 0], start, "right") - 1] - [0, 1]
-    # An invalid row may hold NaN. No window touches it, nor does the margin of one, so any rotation
-    # will do there.
+    # An invalid row may have NaN. No window and no margin of a window touches it, so its rotation
+    # may be arbitrary.
     orientation = np.where(sequence.valid[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
     attitude, after_context = rotations(orientation).as_matrix(), start + config.context
     imu, rotation = align_recording(
@@ -148,7 +148,7 @@ def gather(
     first, last = source.stretch[which].T[:, :, None]
     imu = source.imu[jnp.clip(rows, first, last) if margin else rows]
     cosine, sine = source.unyaw[which][:, :, None].swapaxes(0, 1)
-    # The compiler drops the steps where nobody looks at them.
+    # The compiler removes the steps if they are not used.
     x, y, z = jnp.moveaxis(source.step[window_rows(start, length)], -1, 0)
     return Windows(
         imu=rotate_channels(source.rotation[which], imu),
@@ -173,16 +173,17 @@ def shift_windows(
 
 
 def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: float) -> Windows:
-    """Windows without the margins of `low_pass_margin`, a random share of them low-passed (ours).
+    """Windows without the margins of `low_pass_margin`, of which a random share is low-passed
+    (ours).
 
-    What the filter of a phone leaves of the spectrum must not tell the network which dataset it
-    looks at. Accelerometer and gyro pass the same Butterworth filter forward and back,
+    The network must not recognise a dataset by the spectrum that a phone's filter leaves.
+    Accelerometer and gyro pass the same Butterworth filter forward and back,
     |H(f)|² = 1/(1 + (f/f_c)^2n), of order n from 1 to 3 and cut-off f_c uniform in its logarithm,
     drawn anew for every window. Its phase is zero although a phone's filter is causal: readers
-    align the clocks of IMU and reference by their motion, which takes out a constant delay, and a
-    delay of the IMU alone would set the window against its displacement. The samples are those of
-    `gather`, already rotated: attitude changes slowly beside 4 Hz, gravity stays as it is, and
-    biases, tilt and yaw may come after the filter.
+    align the clocks of IMU and reference by their motion, which removes a constant delay, and a
+    delay of the IMU alone would shift the window relative to its displacement. The samples are
+    those of `gather`, already rotated. Attitude changes slowly compared with 4 Hz, gravity is not
+    changed, and biases, tilt and yaw may come after the filter.
     """
     margin = low_pass_margin(config, rate)
     if not margin:
@@ -203,21 +204,22 @@ def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: f
 
 
 def low_pass_margin(config: AugmentConfig, rate: float) -> int:
-    """Samples on either side of a window that `low_pass` needs: 0.25 s, beyond which lie at most
-    2.4 % of the impulse response (of its absolute values) from 4 Hz on, and 6.6 % at 3 Hz. 0
-    without the filter."""
+    """Number of samples on either side of a window that `low_pass` needs: 0.25 s, beyond which
+    there are at most 2.4 % of the impulse response (of its absolute values) from 4 Hz on, and 6.6 %
+    at 3 Hz. 0 without the filter."""
     return math.ceil(0.25 * rate) if config.low_pass_share else 0
 
 
 def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windows:
-    """The random changes that `config` (static) switches on, in TLIO's order, each by its own key;
-    GNIO's paper is silent on them.
+    """The random changes that `config` (static) switches on, in TLIO's order, each with its own
+    key. GNIO's paper does not mention any.
 
-    A share of the windows is of a phone at rest, and each sensor has a scale factor (both ours). A
-    constant bias for each window, uniform in ± its half-width on each axis. A tilt by up to
-    `tilt_degrees` about a random horizontal axis, a wrong direction of gravity, under which the
-    target stays. A uniform yaw of window and target together: the network must not depend on the
-    choice of heading. White noise last. float32 throughout.
+    A share of the windows is of a phone at rest, and each sensor has a scale factor (both ours).
+    Each window has a constant bias, uniform in ± its half-width on each axis. It is tilted by up to
+    `tilt_degrees` about a random horizontal axis, which is an error of gravity's direction and does
+    not change the target. Window and target are turned together by a uniform yaw, because the
+    network must not depend on the choice of heading. White noise is added last. Everything is
+    float32.
     """
     bias_key, tilt_key, yaw_key, noise_key = jax.random.split(key, 4)
     if config.rest_share:
@@ -250,7 +252,8 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
 
 
 def _at_rest(key: PRNGKeyArray, windows: Windows, share: float) -> Windows:
-    """A random share of the windows as of a phone that lies still, which measures gravity alone."""
+    """The windows, with a random share of them replaced by those of a phone at rest, which measures
+    only gravity."""
     lies = jax.random.bernoulli(key, jnp.float32(share), (len(windows.imu), 1, 1))
     still = jnp.array([[[0, 0, GRAVITY, 0, 0, 0]]], jnp.float32)
     return Windows(
@@ -266,5 +269,5 @@ def _channels(gyro: float, accel: float) -> Float[jax.Array, "1 1 6"]:
 
 
 def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], low: float, high: float) -> jax.Array:
-    # Plain numbers as limits would be float64 inside where that is switched on.
+    # Plain numbers as limits would be float64 inside if x64 is switched on.
     return jax.random.uniform(key, shape, jnp.float32, jnp.float32(low), jnp.float32(high))

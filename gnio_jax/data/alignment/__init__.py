@@ -1,1 +1,1 @@
-"""An IMU laid on what a tracker saw of it: clocks, mounting and attitude from one recording."""
+"""Alignment of an IMU with a tracker: clocks, mounting and attitude from one recording."""

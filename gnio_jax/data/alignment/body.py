@@ -1,9 +1,9 @@
-"""Where an IMU sits on a tracked body, and by how much their clocks differ.
+"""The pose of an IMU on a tracked body, and the difference of their clocks.
 
 An optical tracker gives the poses of a *marker body* on its own clock in its own, slightly tilted
-world. The IMU is bolted somewhere else on that body, turned against it, on another clock. `align`
-estimates all of it at once from one recording. With the tracker's attitude R and position p of the
-marker body at its time t, the two equations are, in the marker body,
+world. The IMU is mounted somewhere else on that body, with another orientation and another clock.
+`align` estimates all of this together from one recording. With the tracker's attitude R and
+position p of the marker body at its time t, the two equations are, in the marker body,
 
     ω(t)                        = Rx (gyro(t + lag(t)) − b_g)
     Rᵀ (p̈ + R̈ l + g u)          = Rx (accel(t + lag(t) + δ) − b_a)
@@ -13,12 +13,12 @@ the extrinsic rotation Rx (IMU → marker body), the lever arm l (in the marker 
 and b_a, the upward direction u in the tracker's world, a lag that is piecewise linear in time, and
 a delay δ of the accelerometer against the gyro (phones filter it: 10 to 50 ms).
 
-Both sides pass the same Gaussian filter once, before anything is fitted; the lag moves so slowly
-that it commutes with the filter. First guesses of the lag are the peaks of the correlation of the
+Both sides pass the same Gaussian filter once, before the fit; the lag changes so slowly that it
+commutes with the filter. First guesses of the lag are the peaks of the correlation of the
 magnitudes of both angular rates, ranked by how well one rotation explains the angular rates
-(Wahba's problem). A robust least-squares fit starts from each of the best, and the one that leaves
-least of the signals' power unexplained is repeated with all its knots. The model of the errors and
-the choice of the fit are ours.
+(Wahba's problem). A robust least-squares fit starts from each of the best guesses. The fit that
+leaves the smallest share of the signals' power unexplained is repeated with all its knots. The
+model of the errors and the choice of the fit are ours.
 """
 
 from __future__ import annotations
@@ -52,60 +52,67 @@ from gnio_jax.numerics import (
 from gnio_jax.types import GRAVITY
 
 RATE = 100.0
-"""Hz of the clocks on which both sides are filtered."""
+"""Rate of the clocks on which both sides are filtered, Hz."""
 FILTER_SECONDS = 0.03
-"""Standard deviation of the Gaussian filter: a pass band of 5 Hz holds the motion of a gait."""
+"""Standard deviation of the Gaussian filter, s: its pass band of 5 Hz contains the motion of a
+gait."""
 ROW_SECONDS = 0.05
-"""Errors are taken this far apart: the filter leaves little between them."""
+"""Time between errors of the fit, s: the filter leaves little information between them."""
 THINNED = 3
-"""Every so many of them choose between first guesses."""
+"""Every n-th of these errors is used to choose between first guesses."""
 MARGIN = 0.2
-"""s at the ends of the IMU's samples that are not used: the filter's reach and the delay."""
+"""Time at the ends of the IMU's samples that is not used, s: the filter's reach and the delay."""
 SHORTEST_OVERLAP = 10.0
-"""s of usable poses below which nothing is fitted."""
+"""Shortest time of usable poses for a fit, s."""
 
 STARTS = 3
-"""Peaks of the correlation from which a fit starts, with a knot of the lag per 30 s."""
+"""Number of peaks of the correlation from which a fit starts. These fits have a knot of the lag per
+30 s."""
 SAME_LAG = 0.15
-"""s by which two fits may differ in lag and be one: less than half a step of a runner."""
+"""Largest difference of the lags of two fits that count as the same, s: less than half a step of a
+runner."""
 FASTEST_TURN = 6.0
-"""rad/s; flips of the tracker make rates that no hand makes, so rates are compared up to here."""
+"""Largest rate that is compared, rad/s: flips of the tracker give rates beyond those of a hand."""
 TRUSTED_SHARE = 0.9
-"""Share of the rows by whose errors a fit is judged; the worst are the tracker's flips."""
+"""Share of the rows whose errors decide about a fit; the worst rows are the tracker's flips."""
 
 PRIOR_STD = np.repeat([0.05, 0.15, 0.2, 0.05, 0.05], [3, 3, 3, 2, 1])
-"""Weak priors around zero settle what a recording cannot tell: biases of a phone (rad/s, m/s²), a
-lever on the hand (m), a world that is nearly level (rad), the accelerometer's delay (s)."""
+"""Standard deviations of weak priors around zero for unknowns that a recording does not determine:
+biases of a phone (rad/s, m/s²), a lever arm on the hand (m), the tilt of the world (rad), the
+accelerometer's delay (s)."""
 TURN_STEP, LAG_STEP = 0.2, 0.05
-"""rad and s within which the errors are about linear; with `PRIOR_STD` the trust region's scale."""
+"""Ranges within which the errors are about linear, rad and s; with `PRIOR_STD` the scale of the
+trust region."""
 LAG_BEND_STD = 0.02
-"""s; clocks run straight: second difference of the lag from knot to knot."""
+"""Standard deviation of the second difference of the lag from knot to knot, s: clocks have almost
+constant rates."""
 BLOCK_SECONDS = 2.0
-"""Errors within this time share an offset."""
+"""Time within which errors share an offset, s."""
 LONGEST_POSE_LAG = 0.4
-"""s, to either side, by which poses of the IMU's own body may be late."""
+"""Largest lag of poses of the IMU's own body, s, in either direction."""
 POSE_LAG_FILTER_SECONDS = 0.05
-"""Standard deviation of the Gaussian filter of both angular rates in `pose_lag`."""
+"""Standard deviation of the Gaussian filter of both angular rates in `pose_lag`, s."""
 MOST_UNEXPLAINED = {"turning": 0.1, "acceleration": 0.5}
-"""Shares of the signals' power that the fit of a phone to its own tracker may leave. The largest of
-OxIOD and Tyrex are 0.011, and 0.19 on a trolley, which shakes more than it accelerates. Another
-walk's tracker leaves 0.6 of the turning and more."""
+"""Largest shares of the signals' power that may remain unexplained in the fit of a phone to its own
+tracker. The largest in OxIOD and Tyrex are 0.011 for the angular rate, and 0.19 for the
+acceleration on a trolley, which mainly vibrates. With another walk's tracker 0.6 and more of the
+angular rate remains."""
 OUTLIER = 10.0
-"""Robust standard deviations beyond which a row takes no part in the next fit."""
+"""Number of robust standard deviations beyond which a row is not used in the next fit."""
 
 TURN, GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
 LEVER, TILT, DELAY, LAG = slice(9, 12), slice(12, 14), 14, slice(15, None)
-"""Where the unknowns stand in a fit's vector: the turn from the first guess of the rotation (a
+"""Entries of the unknowns in a fit's vector: the turn from the first guess of the rotation (a
 rotation vector, rad), biases, lever, horizontal part of the upward direction over its vertical
 part, the accelerometer's delay, and the lag at each knot."""
 
 
 class TooLittle(ValueError):
-    """Too little of the track overlaps the IMU's recording."""
+    """The overlap of the track and the IMU's recording is too short."""
 
 
 class BodyFit(NamedTuple):
-    """What `align` estimates; SI units."""
+    """The result of `align`, in SI units."""
 
     extrinsic: Rotation
     """IMU → marker body."""
@@ -118,28 +125,29 @@ class BodyFit(NamedTuple):
     lag: Float[np.ndarray, " k"]
     """Time of the IMU minus time of the tracker for the same event, at even knots, s."""
     accel_delay: float
-    """How much later than the gyro the accelerometer reports the same event, s."""
+    """Delay of the accelerometer relative to the gyro, s."""
     gyro_residual: float
     """Robust standard deviation of the filtered angular rate's error, rad/s."""
     accel_residual: float
     """Robust standard deviation of the filtered acceleration's error, m/s²."""
     gyro_unexplained: float
-    """Power of the filtered angular rate's error over that of the tracker's angular rate; 0 is a
-    perfect fit, 1 explains nothing."""
+    """Power of the filtered angular rate's error over that of the tracker's angular rate: 0 for a
+    perfect fit, 1 for one that explains nothing."""
     accel_unexplained: float
-    """The same of the acceleration, without gravity."""
+    """The same for the acceleration, without gravity."""
     runner_up: float
-    """What this fit leaves unexplained over what the best fit with another lag does; 0 where there
-    is no other, 1 where both are as good."""
+    """The unexplained share of this fit over that of the best fit with another lag; 0 if there is
+    no other, 1 if both are equally good."""
     turn_std: float
-    """Standard deviation of the extrinsic rotation about the axis that the motion tells least of,
-    rad: large where the body rests, or turns about the vertical alone."""
+    """Standard deviation of the extrinsic rotation about its least certain axis, rad: large if the
+    body rests, or turns only about the vertical."""
     poses: Poses
-    """The tracker's poses as those of the IMU, noisy still: its attitude in a level world on its
-    own clock, with the lever to it. Poses that contradict its acceleration grossly are left out."""
+    """The tracker's poses as poses of the IMU, with their noise: its attitude in a level world on
+    its own clock, with the lever arm to it. Poses that strongly contradict its acceleration are
+    left out."""
 
     def figures(self) -> dict[str, float]:
-        """What the attributes of a sequence keep of the fit."""
+        """The figures of the fit for the attributes of a sequence."""
         vectors = {"lever": self.lever, "gyro_bias": self.gyro_bias, "accel_bias": self.accel_bias}
         return {
             "lag": float(np.mean(self.lag)),
@@ -168,7 +176,7 @@ def laid_on(
     closest_runner_up: float = 1.0,
 ) -> Streams:
     """A phone with a tracker's poses as its own, without the accelerometer's delay, and with the
-    fit's figures among its attributes. Raises `Refusal` where they do not fit together."""
+    fit's figures among its attributes. Raises `Refusal` if they do not fit together."""
     try:
         fit = align(phone, track, knot_seconds, search_seconds)
     except TooLittle as error:
@@ -189,10 +197,9 @@ def align(
 ) -> BodyFit:
     """The mounting of an IMU on a body whose noisy poses are `track`, both on clocks of their own.
 
-    `knot_seconds` is the spacing of the lag's knots; first guesses of the lag lie within
-    ± `search_seconds`. Raises `TooLittle` where too little of the track is usable,
-    and `InputError` for stamps that are damaged. Whether the best fit is a good one is for
-    `check_fit` to judge.
+    `knot_seconds` is the spacing of the lag's knots; first guesses of the lag are within ±
+    `search_seconds`. Raises `TooLittle` if too little of the track is usable, and `InputError` for
+    damaged stamps. `check_fit` decides whether the best fit is good enough.
     """
     imu = ordered(imu._replace(poses=track))
     assert imu.poses is not None
@@ -242,9 +249,9 @@ def check_fit(
     limits: Mapping[str, tuple[float, str]],
     closest_runner_up: float = 1.0,
 ) -> None:
-    """Raise `Refusal` naming the tracker's file `source` where a fit does not explain the motion
-    (`MOST_UNEXPLAINED`), finds more than `limits` (most, unit) allow (no phone on its body), or is
-    hardly better than one with another lag."""
+    """Raise `Refusal` naming the tracker's file `source` if a fit does not explain the motion
+    (`MOST_UNEXPLAINED`), exceeds the `limits` (most, unit) of a phone on its body, or is hardly
+    better than a fit with another lag."""
     remedy = "check that both files are of one walk"
     shares = {"turning": fit.gyro_unexplained, "acceleration": fit.accel_unexplained}
     for what, share in shares.items():
@@ -282,7 +289,7 @@ def _degrees_off(cosine: float) -> float:
 def _poses_of_the_imu(
     fit: _Fit, knots: Float[np.ndarray, " k"], track: Poses, level: Rotation
 ) -> Poses:
-    # A track that contradicts the accelerometer grossly has jumped.
+    # A track that strongly contradicts the accelerometer has jumped.
     contradiction = np.linalg.norm(fit.accel, axis=1)
     jumps = fit.seen.time[contradiction > max(6.0, 8.0 * robust_std(fit.accel))]
     kept = track.rows(np.flatnonzero(~near_any(track.time, jumps, jumps, 0.1)))
@@ -297,7 +304,7 @@ def _poses_of_the_imu(
 
 def without_jumps(poses: Poses, fastest_turn: float, fastest: float) -> Poses:
     """The poses that are not within 0.1 s of a step faster than `fastest_turn` (rad/s) or `fastest`
-    (m/s), which nobody makes."""
+    (m/s), which is impossible for a person."""
     steps = np.diff(poses.time)
     angle = np.linalg.norm(turns_between(poses.attitude), axis=1)
     distance = np.linalg.norm(np.diff(poses.position, axis=0), axis=1)
@@ -335,10 +342,11 @@ class _Felt(NamedTuple):
     accel: CubicSpline
     """m/s²."""
     unknown: list[tuple[np.ndarray, np.ndarray]]
-    """Of each sensor: where its gaps begin and end, with what lies before and after its samples."""
+    """For each sensor, the beginnings and ends of its gaps, including the times before and after
+    its samples."""
 
     def covers(self, time: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
-        """Where both sensors were measured, and `MARGIN` around."""
+        """Whether both sensors were measured at a time and within `MARGIN` of it."""
         return ~np.any([near_any(time, *gaps, MARGIN) for gaps in self.unknown], axis=0)
 
 
@@ -383,11 +391,11 @@ def _first_guesses(seen: _Seen, felt: _Felt, search_seconds: float) -> list[tupl
     """(lag s, extrinsic rotation) where the magnitudes of both angular rates correlate better than
     nearby, the most plausible first.
 
-    Whoever walks in rounds or in figures of eight makes several such peaks, and the highest need
-    not be the right one: a constant lag is judged by the share of the turning that it leaves
-    unexplained, after the rotation that explains most (Wahba's problem).
+    A walk in circles or figures of eight has several such peaks, and the highest need not be the
+    right one. A constant lag is therefore rated by the share of the angular rate that remains
+    unexplained after the best rotation (Wahba's problem).
     """
-    # It takes half a second to import.
+    # This import takes half a second.
     from scipy.signal import correlate, correlation_lags, find_peaks
 
     grid = np.arange(seen.time[0] - search_seconds, seen.time[-1] + search_seconds, 1.0 / RATE)
@@ -420,9 +428,9 @@ def _first_guesses(seen: _Seen, felt: _Felt, search_seconds: float) -> list[tupl
 class _Fit(NamedTuple):
     extrinsic: Rotation
     unknowns: Float[np.ndarray, " u"]
-    """As the slices above say; `TURN` is taken up in `extrinsic`."""
+    """The vector with the slices above; `TURN` is included in `extrinsic`."""
     seen: _Seen
-    """In the rows that the IMU covers at the start."""
+    """The tracker's side in the rows that the IMU covers at the start."""
     gyro: Float[np.ndarray, "n 3"]
     """Errors of the angular rate in these rows, rad/s."""
     accel: Float[np.ndarray, "n 3"]
@@ -432,8 +440,8 @@ class _Fit(NamedTuple):
 
     @property
     def unexplained(self) -> float:
-        """Geometric mean of the shares of both signals' power: with noise of unknown size the fit
-        with the least is likeliest."""
+        """Geometric mean of the shares of both signals' power. For noise of unknown size the fit
+        with the smallest mean is the most likely."""
         turning = unexplained(self.gyro, self.seen.rate)
         return float(np.sqrt(turning * unexplained(self.accel, self.seen.acceleration)))
 
@@ -447,8 +455,8 @@ def _fit(
 ) -> _Fit:
     """The unknowns that explain both signals best, from a first guess.
 
-    Two rounds: scale of the errors, variance of their offsets (`_Noise`) and outliers are those of
-    the round before, or of the guess. Raises `TooLittle`.
+    There are two rounds. Scale of the errors, variance of their offsets (`_Noise`) and outliers are
+    those of the round before, or of the guess. Raises `TooLittle`.
     """
     hats = hat_functions(seen.time, knots)
     covered = felt.covers(seen.time + hats @ unknowns[LAG])
@@ -481,10 +489,11 @@ def _fit(
 
 
 def _turn_std(jacobian: Float[np.ndarray, "r u"], rows: int) -> float:
-    """Standard deviation of the turn about its least certain axis, rad, whatever the other unknowns
-    are: by the derivatives of residuals of unit variance.
+    """Standard deviation of the turn about its least certain axis, rad, for unknown values of the
+    other unknowns, from the derivatives of residuals of unit variance.
 
-    The sensors' own noise seems to tell of the turn, too, by 2 a row and sensor, and does not.
+    The sensors' own noise seems to give information about the turn, 2 for each row and sensor, but
+    it gives none; this part is subtracted.
     """
     information = jacobian.T @ jacobian
     turn, mixed, others = (
@@ -513,7 +522,7 @@ class Problem(NamedTuple):
     def errors(
         self, x: Float[np.ndarray, " u"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """In the marker body, the tracker's side minus the IMU's: rad/s and m/s²."""
+        """The tracker's side minus the IMU's, in the marker body: rad/s and m/s²."""
         extrinsic = self.guess * Rotation.from_rotvec(x[TURN])
         there = self.seen.time + self.hats @ x[LAG]
         rate = self.felt.gyro(there) - x[GYRO_BIAS]
@@ -525,9 +534,10 @@ class Problem(NamedTuple):
     def jacobians(
         self, x: Float[np.ndarray, " u"]
     ) -> tuple[Float[np.ndarray, "n 3 u"], Float[np.ndarray, "n 3 u"]]:
-        """Derivatives of `errors` by the unknowns: differences would take three times as long."""
+        """Derivatives of `errors` by the unknowns; finite differences would take three times as
+        long."""
         rotation = (self.guess * Rotation.from_rotvec(x[TURN])).as_matrix()
-        # Of the rotation vector, to the second order of the turn.
+        # Derivative by the rotation vector, to the second order of the turn.
         turned = np.eye(3) - hat(x[TURN]) / 2.0 + hat(x[TURN]) @ hat(x[TURN]) / 6.0
         there = self.seen.time + self.hats @ x[LAG]
         late = there + x[DELAY]
@@ -555,16 +565,17 @@ class Problem(NamedTuple):
         return self._whitened(self.jacobians(x), np.eye(len(x)))
 
     def _whitened(self, sides: tuple[np.ndarray, np.ndarray], x: np.ndarray) -> np.ndarray:
-        """Rows of both sides and of the priors: of the errors, or of their derivatives."""
+        """Rows of both sides and of the priors, for the errors or their derivatives."""
         rows = (noise.whitened(side) for noise, side in zip(self.noises, sides, strict=True))
         prior = (x[3:15].T / PRIOR_STD).T
         return np.concatenate([*rows, prior, np.diff(x[LAG], 2, axis=0) / LAG_BEND_STD])
 
 
 class _Noise(NamedTuple):
-    """Errors that are white but for an offset that each block of them shares: a gyro's bias drifts,
-    and a tracker's attitude is off by some tenths of a degree that depend on the place. White noise
-    would take a minute at rest for thousands of proofs of one direction."""
+    """Errors that are white except for an offset that each block of them shares: a gyro's bias
+    drifts, and a tracker's attitude has an error of some tenths of a degree that depends on the
+    place. With white noise a minute at rest would count as thousands of independent measurements of
+    one direction."""
 
     scale: float
     """Standard deviation of the white part."""
@@ -608,13 +619,13 @@ def unexplained(error: Float[np.ndarray, "n 3"], signal: Float[np.ndarray, "n 3"
 
 
 class PoseLag(NamedTuple):
-    """What `pose_lag` estimates."""
+    """The result of `pose_lag`."""
 
     lag: float
-    """By how much a pose is stamped later than the IMU's sample of the same event, s."""
+    """Stamp of a pose minus stamp of the IMU's sample of the same event, s."""
     correlation: float
-    """Of the angular rates once the lag is taken out, all axes together; 1 where nothing turns and
-    nothing can be found out."""
+    """Correlation of the angular rates after the lag is removed, all axes together; 1 if nothing
+    turns, so that no lag can be found."""
 
 
 def pose_lag(
@@ -623,10 +634,10 @@ def pose_lag(
     stamps: Float[np.ndarray, " m"],
     attitude: Rotation,
 ) -> PoseLag:
-    """By how much poses of the IMU's body are late, from the angular rates of both.
+    """Lag of poses of the IMU's body, from the angular rates of both.
 
-    `time`, `stamps` s; `gyro` rad/s; `attitude` m rotations body→world. The lag that lets gyro(t) −
-    bias and rate(t + lag) differ least in the mean of their sizes, both smoothed over 0.05 s (σ).
+    `time`, `stamps` s; `gyro` rad/s; `attitude` m rotations body→world. It is the lag with the
+    smallest mean size of gyro(t) − bias − rate(t + lag), both smoothed over 0.05 s (σ).
     """
     steps, middle = np.diff(stamps), midpoints(stamps)
     margin = round((LONGEST_POSE_LAG + 0.1) * RATE)
@@ -662,14 +673,14 @@ def pose_lag(
 
 
 def check_lengths(seconds: float, *streams: Samples | Poses) -> None:
-    """Raise `TooLittle` where one of the streams is shorter than this."""
+    """Raise `TooLittle` if one of the streams is shorter than this."""
     for each in streams:
         if len(each.time) < 2 or each.time[-1] - each.time[0] < seconds:
             raise TooLittle(f"less than {seconds:g} s are recorded in {each.source}")
 
 
 def gaps(time: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " i"]:
-    """Which intervals between samples are too long to be followed."""
+    """Which intervals between samples are too long to be interpolated."""
     return np.diff(time) > longest_trusted(time)
 
 
@@ -679,14 +690,15 @@ def near_any(
     ends: Real[np.ndarray, " k"],
     around: float,
 ) -> Bool[np.ndarray, " n"]:
-    """Where a time is within an interval from one of `starts` to its end, or `around` it: a start
-    is passed by then, and its end is not. Both increase."""
+    """Whether a time is within an interval from one of `starts` to its end, extended by `around`.
+    Starts and ends increase."""
     begun = np.searchsorted(starts, time + around, side="right")
     return begun != np.searchsorted(ends, time - around)
 
 
 def smooth(values: np.ndarray, sigma: float) -> np.ndarray:
-    """Rows filtered by a Gaussian of `sigma` samples; the ends are held."""
+    """Rows filtered by a Gaussian of `sigma` samples; the first and last row are repeated beyond
+    the ends."""
     return gaussian_filter1d(values, sigma, axis=0, mode="nearest")
 
 
@@ -694,7 +706,7 @@ def second_difference(values: Float[np.ndarray, "n *w"], step: float) -> Float[n
     """Second derivative of uniform samples by central differences; the ends repeat their
     neighbours.
 
-    It is zero to the last bit of a constant, unlike a sampled derivative of a Gaussian.
+    For a constant it is exactly zero, unlike a sampled derivative of a Gaussian.
     """
     inner = (values[2:] - 2.0 * values[1:-1] + values[:-2]) / step**2
     return np.concatenate([inner[:1], inner, inner[-1:]])

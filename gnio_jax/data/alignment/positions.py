@@ -1,13 +1,14 @@
-"""A phone and the positions of another device that moves with it, whose attitude is unknown.
+"""Alignment of a phone with the positions of another device that moves with it, whose attitude is
+unknown.
 
-`align_positions` finds by how much the clocks of both differ and which way the phone points in the
-tracker's level world, from accelerations alone: those of the phone, turned by its own integrated
-gyro, against the second difference of the positions.
+`align_positions` finds the difference of both clocks and the phone's attitude in the tracker's
+level world, from accelerations alone: those of the phone, rotated by its own integrated gyro, are
+compared with the second difference of the positions.
 
-The first guess of the lag is the one at which both accelerations correlate best. The vertical ones
-need no heading and show every step; the horizontal ones, compared within stretches in which the
-yaw hardly drifts, tell one step from the next. Then one robust least-squares fit finds a rotation
-and a lag, both of which vary slowly. All of this is ours.
+The first guess of the lag is the one at which both accelerations correlate best. The vertical
+accelerations need no heading and show every step. The horizontal ones, compared within stretches in
+which the yaw hardly drifts, distinguish one step from the next. Then one robust least-squares fit
+finds a rotation and a lag, both of which vary slowly. All of this is ours.
 """
 
 from __future__ import annotations
@@ -50,46 +51,47 @@ from gnio_jax.numerics import (
 from gnio_jax.types import GRAVITY
 
 STEP_FILTER_SECONDS, SLOW_FILTER_SECONDS = 0.08, 0.25
-"""Standard deviations of the Gaussian filters: one keeps the steps, whose vertical acceleration
-tells the lag; the other leaves no gait, which differs between two devices in two hands."""
+"""Standard deviations of the Gaussian filters, s: one keeps the steps, whose vertical acceleration
+shows the lag; the other removes the gait, which differs between two devices in two hands."""
 SHORTEST_OVERLAP = 20.0
-"""s of usable positions below which nothing is fitted."""
+"""Shortest time of usable positions for a fit, s."""
 STRETCH_SECONDS = 15.0
-"""Length of the stretches whose horizontal accelerations are compared: in it the yaw hardly
+"""Length of the stretches whose horizontal accelerations are compared, s, in which the yaw hardly
 drifts."""
 LAG_STEP, SEARCH_SECONDS = 0.02, 4.0
-"""s between the constant lags that are tried, and how far they go to either side."""
+"""Step and largest size of the constant lags that are tried, s."""
 TURN_KNOT_SECONDS, LAG_KNOT_SECONDS = 10.0, 30.0
-"""Spacing of the knots of the rotation and of the lag."""
+"""Spacing of the knots of the rotation and of the lag, s."""
 DRIFT_STD = np.array([0.05, 0.05, 0.02])
-"""rad by which the gyro's drift about x, y and z may change from one interval of 10 s to the next:
-0.005 rad/s in tilt and 0.002 rad/s in yaw."""
+"""Standard deviation of the change of the gyro's drift about x, y and z from one interval of 10 s
+to the next, rad: 0.005 rad/s in tilt and 0.002 rad/s in yaw."""
 STEPS = 0.3, 0.03
-"""rad and s within which the fit is about linear: the trust region's scale."""
+"""Ranges within which the fit is about linear, rad and s: the scale of the trust region."""
 UPWARD = np.array([0.0, 0.0, GRAVITY])
-"""What an accelerometer at rest feels in a level world, m/s²."""
+"""Specific force at rest in a level world, m/s²."""
 CUTOFF = 2.0
-"""Hz, half response of the smoother of the positions: what is faster is the tracker's noise and the
-sway of the other device. OxIOD's walks on two floors disagree: with 4 Hz three of them would
-correlate with the accelerometer by 0.81 in place of 0.77, and three by 0.28 in place of 0.35."""
+"""Frequency at which the smoother of the positions has half response, Hz. Faster motion is the
+tracker's noise and the sway of the other device. OxIOD's walks on two floors disagree: with 4 Hz
+three of them would correlate with the accelerometer by 0.81 in place of 0.77, and three by 0.28 in
+place of 0.35."""
 
 
 class PositionsFit(NamedTuple):
-    """What `align_positions` estimates; SI units."""
+    """The result of `align_positions`, in SI units."""
 
     lag: Float[np.ndarray, " k"]
     """Time of the IMU minus time of the tracker for the same event, at knots over the recording,
     s."""
     yaw_drift: float
-    """Range of the yaw by which the device's own attitude is off, rad."""
+    """Range of the yaw error of the device's own attitude, rad."""
     correlation: float
-    """Of the vertical accelerations at the best constant lag."""
+    """Correlation of the vertical accelerations at the best constant lag."""
     runner_up: float
-    """What the best constant lag leaves unexplained over what the second best does; 1 where both
-    are as good."""
+    """The unexplained share of the best constant lag over that of the second best; 1 if both are
+    equally good."""
     poses: Poses
-    """Of the IMU, on its own clock: its attitude, with the tracker's smoothed positions and their
-    velocities."""
+    """Poses of the IMU on its own clock: its attitude, with the tracker's smoothed positions and
+    their velocities."""
 
 
 class _Signals(NamedTuple):
@@ -97,7 +99,7 @@ class _Signals(NamedTuple):
 
     clock: Float[np.ndarray, " n"]
     felt: Float[np.ndarray, "n 3"]
-    """By the device's own attitude, without gravity."""
+    """The IMU's acceleration by the device's own attitude, without gravity."""
     grid: Float[np.ndarray, " m"]
     tracked: Float[np.ndarray, "m 3"]
     """Second difference of the positions."""
@@ -105,13 +107,13 @@ class _Signals(NamedTuple):
     """False near positions that are missing, and where the tracker relocalised."""
 
     def filtered(self, seconds: float) -> _Signals:
-        """Both accelerations behind a Gaussian filter."""
+        """Both accelerations after a Gaussian filter."""
         felt, tracked = (smooth(each, seconds * RATE) for each in (self.felt, self.tracked))
         return self._replace(felt=felt, tracked=tracked)
 
     def in_step(self, lag: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(good rows of the grid that the IMU covers at a constant lag, what was felt there, what
-        was tracked there)."""
+        """Good rows of the grid that the IMU covers at a constant lag, and the accelerations of the
+        IMU and of the tracker there."""
         there = self.grid + lag
         covered = self.good & (there > self.clock[0]) & (there < self.clock[-1])
         rows = np.flatnonzero(covered)
@@ -119,12 +121,12 @@ class _Signals(NamedTuple):
 
 
 def align_positions(imu: Streams, track: Samples) -> PositionsFit:
-    """Attitude and clock of an IMU, whose device gives an attitude of its own, against positions
-    (m) in a level world.
+    """Attitude and clock of an IMU, whose device gives an attitude of its own, from positions (m)
+    in a level world.
 
-    That attitude takes part of each stride's acceleration for gravity: up to 6° of tilt, and it
-    drifts in yaw. Over minutes, though, gravity tells it the gyro's bias in tilt. Raises
-    `TooLittle` where both share less than 20 s.
+    The device's attitude treats part of each stride's acceleration as gravity, which gives up to 6°
+    of tilt, and its yaw drifts. Over minutes, however, it finds the gyro's bias in tilt from
+    gravity. Raises `TooLittle` if both share less than 20 s.
     """
     imu = ordered(imu)
     rows, _ = in_order(track.time, track.values, track.source)
@@ -143,7 +145,7 @@ def align_positions(imu: Streams, track: Samples) -> PositionsFit:
     position = splined(stamps, values, grid, gaps(stamps))
     seen = known_at(stamps, grid, longest_trusted(stamps))
     tracked = second_difference(position, 1.0 / RATE)
-    # Accelerations that no pedestrian makes are jumps.
+    # Accelerations beyond those of a pedestrian are jumps.
     strength = np.linalg.norm(smooth(tracked, STEP_FILTER_SECONDS * RATE), axis=1)
     usual = float(np.median(strength[seen])) if seen.any() else 0.0
     jumps = strength > 8.0 * max(usual, 0.1)
@@ -177,8 +179,8 @@ def align_positions(imu: Streams, track: Samples) -> PositionsFit:
 
 
 def _gyro_bias(gyro: Float[np.ndarray, "n 3"], device: Rotation) -> Float[np.ndarray, "3"]:
-    """What the gyro turns by beyond the device's attitude, rad/s, but for a constant drift of that
-    about the vertical, which is the device's own fault."""
+    """Mean rate of the gyro minus that of the device's attitude, rad/s, without a constant drift
+    about the vertical, which is an error of the device."""
     beyond = midpoints(gyro) - turns_between(device) * RATE
     up = device[:-1].inv().apply([0.0, 0.0, 1.0])
     system = len(up) * np.eye(4)
@@ -188,16 +190,16 @@ def _gyro_bias(gyro: Float[np.ndarray, "n 3"], device: Rotation) -> Float[np.nda
 
 
 def _constant_lag(signals: _Signals) -> tuple[float, float, float]:
-    """(best constant lag, correlation of the vertical accelerations at it, what it leaves
-    unexplained over what the next best peak leaves)."""
+    """The best constant lag, the correlation of the vertical accelerations at it, and its
+    unexplained share over that of the next best peak."""
     from scipy.signal import find_peaks  # takes half a second to import
 
     signals = signals.filtered(STEP_FILTER_SECONDS)
     stretch = np.floor((signals.grid - signals.grid[0]) / STRETCH_SECONDS).astype(int)
 
     def correlations(lag: float) -> tuple[float, float]:
-        """Of the vertical accelerations, and of the horizontal ones whatever the yaw of each
-        stretch (the mean square, by the time that both share)."""
+        """Correlations of the vertical accelerations, and of the horizontal ones for any yaw of
+        each stretch (the mean square, by the time that both share)."""
         rows, own, seen = signals.in_step(lag)
         if len(rows) < SHORTEST_OVERLAP * RATE:
             return 0.0, 0.0
@@ -237,7 +239,7 @@ def _yaw(signals: _Signals, knots: Float[np.ndarray, " k"], lag: float) -> Float
     rows, own, seen = signals.filtered(SLOW_FILTER_SECONDS).in_step(lag)
     near = np.abs(signals.grid[rows, None] + lag - knots) < 1.5 * STRETCH_SECONDS
     along, across = _both_ways(own, seen)
-    told = near.any(axis=0)  # in a gap of the tracker nothing tells the yaw
+    told = near.any(axis=0)  # in a gap of the tracker the yaw is unknown
     yaw = np.unwrap(np.arctan2(across @ near, along @ near)[told])
     return np.interp(knots, knots[told], yaw)
 
@@ -250,11 +252,11 @@ def _fit(
     correction: Rotation,
     lags: Float[np.ndarray, " l"],
 ) -> tuple[Rotation, Float[np.ndarray, " l"]]:
-    """The corrections of the integrated gyro at the knots and the lags at theirs that lead the
-    accelerations onto each other, from a first guess.
+    """The corrections of the integrated gyro at the knots, and the lags at their knots, that align
+    the accelerations, from a first guess.
 
-    The vertical accelerations of the steps, by the device's own attitude, decide about the lag; the
-    slow ones, in all axes, about the attitude.
+    The vertical accelerations of the steps, by the device's own attitude, determine the lag; the
+    slow ones, in all axes, determine the attitude.
     """
     clock, count = signals.clock, len(knots)
     there = clock - lags.mean()

@@ -1,1 +1,1 @@
-"""What files say, as numbers: tables of every format, and stamps."""
+"""Contents of files as numbers: tables of every format, and stamps."""

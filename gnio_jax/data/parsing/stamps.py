@@ -1,4 +1,4 @@
-"""Stamps as files give them: their unit, their rate, and rows that are out of order."""
+"""Stamps in files: their unit, their rate, and rows that are out of order."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ from jaxtyping import Float, Int, Real
 from gnio_jax.errors import InputError
 
 RATES = (10.0, 2000.0)
-"""Hz; between these lies every IMU one walks with."""
+"""Smallest and largest rate of an IMU for walking, Hz."""
 PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """Units of stamps."""
 MOST_DAYS = 30.0
-"""Longer recordings are mistaken stamps; float64 holds the ns of as many days to the last digit."""
+"""Largest duration of a recording, days; longer ones have wrong stamps. Up to this, float64 holds
+ns exactly."""
 MOST_REPEATED = 0.01
-"""Share of the rows that may give the stamp of another row other values: stamps rounded to a coarse
-unit fall together now and then (ours)."""
+"""Largest share of rows that have the stamp of another row with other values: coarsely rounded
+stamps sometimes coincide (ours)."""
 MOST_APART = 10
-"""Neighbours in time that are none in the file, for each step back in time, above which samples of
-two clocks lie among each other (ours). A block of rows in the wrong place has three."""
+"""Number of neighbours in time that are not neighbours in the file, per step back in time, above
+which samples of two clocks are mixed (ours). A block of rows in the wrong place has three."""
 
 
 def time_unit(stamps: Real[np.ndarray, " n"]) -> tuple[str | None, float]:
-    """(unit by which the stamps run at `RATES` or None, Hz if they were seconds); the ranges of the
-    units do not overlap."""
+    """The unit with which the rate of the stamps is within `RATES`, or None, and the rate in Hz if
+    they were seconds. The ranges of the units do not overlap."""
     steps = np.diff(np.sort(stamps))
     steps = steps[steps > 0]
     step = float(np.median(steps)) if steps.size else np.inf
@@ -32,13 +33,13 @@ def time_unit(stamps: Real[np.ndarray, " n"]) -> tuple[str | None, float]:
 
 
 def is_rate(rate: float) -> bool:
-    """Whether an IMU runs at so many Hz. A rate at the edge is inside, whatever the last digits of
-    its stamps."""
+    """Whether this is a rate of an IMU, Hz. A rate at the limit is allowed, independently of the
+    rounding of stamps."""
     return RATES[0] * 0.99 <= rate <= RATES[1] * 1.01
 
 
 def check_seconds(time: Float[np.ndarray, " n"], source: object) -> None:
-    """Raise `InputError` where stamps in seconds would not be an IMU's."""
+    """Raise `InputError` if stamps in seconds cannot be those of an IMU."""
     unit, rate = time_unit(time)
     if unit == "s":
         return
@@ -50,17 +51,17 @@ def check_seconds(time: Float[np.ndarray, " n"], source: object) -> None:
 
 
 def rounded_rate(time: Float[np.ndarray, " n"]) -> float:
-    """Hz, to four digits: stamps are never as exact as the clock they come from."""
+    """Rate, Hz, to four digits, because stamps are less exact than their clock."""
     return float(f"{1.0 / float(np.median(np.diff(time))):.4g}")
 
 
 def first_stamp(
     stamps: Real[np.ndarray, " n"], unit: str, source: object, field: str = "time"
 ) -> float | int:
-    """The earliest of the stamps (in `unit`), from which a recording counts its time.
+    """The earliest of the stamps (in `unit`), which is time 0 of a recording.
 
-    Raises `InputError` where they span more than `MOST_DAYS`: a damaged stamp would take the digits
-    of all others.
+    Raises `InputError` if they span more than `MOST_DAYS`: a damaged stamp would cost all others
+    their digits.
     """
     first, last = stamps.min(), stamps.max()
     days = (float(last) - float(first)) / PER_SECOND[unit] / 86400
@@ -74,16 +75,16 @@ def first_stamp(
 def seconds(
     stamps: Real[np.ndarray, " n"], start: float | int, unit: str = "ns"
 ) -> Float[np.ndarray, " n"]:
-    """s since the stamp `start`. Integers are subtracted as such: unix time in ns has more digits
-    than a float."""
+    """Time since the stamp `start`, s. Integers are subtracted as integers, because unix time in ns
+    has more digits than a float."""
     return np.asarray((stamps - start) / PER_SECOND[unit], dtype=np.float64)
 
 
 def distinct(
     stamps: Real[np.ndarray, " n"], source: object, field: str = "time"
 ) -> Int[np.ndarray, " m"]:
-    """The first row of each stamp, in their order, of a logger that writes some rows late and some
-    twice. Raises `InputError` where fewer than half of the rows have a stamp of their own."""
+    """The first row of each stamp, in their order, for a logger that writes some rows late and some
+    twice. Raises `InputError` if fewer than half of the rows have a stamp of their own."""
     rows = np.unique(stamps, return_index=True)[1]
     if len(rows) < 0.5 * len(stamps):
         problem = f"holds only {len(rows)} different stamps in {len(stamps)} rows"
@@ -94,12 +95,12 @@ def distinct(
 def in_order(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n w"], source: object
 ) -> tuple[Int[np.ndarray, " m"], dict[str, float]]:
-    """(rows sorted by their stamps (s), of those that share a stamp the first; the counts
-    `rows_sorted` and `rows_repeated` where they are not zero).
+    """Rows sorted by their stamps (s), with the first of those that share a stamp, and the counts
+    `rows_sorted` and `rows_repeated` if they are not zero.
 
-    Raises `InputError` where the clock was set back, since the samples before and after it would
-    lie among each other, and where more than `MOST_REPEATED` of the rows give the stamp of another
-    row other values.
+    Raises `InputError` if the clock was set back, because the samples before and after this would
+    be mixed, and if more than `MOST_REPEATED` of the rows have the stamp of another row with other
+    values.
     """
     steps = np.diff(time)
     if (steps > 0).all():

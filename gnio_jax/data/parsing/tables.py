@@ -1,8 +1,8 @@
-"""Tables of numbers as files hold them: text, HDF5, NumPy's formats, feather; and JSON.
+"""Tables of numbers from files: text, HDF5, NumPy's formats, feather; and JSON.
 
-A `Table` answers three questions of a column in one place: is it there, is it of numbers, is it
-complete. Rows are counted from 1 in every message, as an editor shows a text file, header and
-comments included.
+A `Table` checks a column in one place: whether it exists, whether it has numbers, and whether it is
+complete. Rows are counted from 1 in every message, as in an editor, with header and comments
+included.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ if TYPE_CHECKING:
     import h5py
 
 LARGEST_RATIO = 100
-"""A compressed field of HDF5 may be so many times larger in memory than in the file."""
+"""Largest ratio of the size of a compressed field of HDF5 in memory to that in the file."""
 OURS = (AssertionError, NameError, ImportError)
-"""What no damaged file makes a parser raise: it is a mistake of ours, or of the installation."""
+"""Errors that no damaged file causes in a parser: they are ours, or those of the installation."""
 
 
 def shortened(text: object, most: int = 80) -> str:
-    """What a file says, as far as a message can quote it: one line of printable characters, at most
-    `most` of them."""
+    """A text from a file in a form that a message can quote: one line of at most `most` printable
+    characters."""
     line = "".join(c if c.isprintable() else "\ufffd" for c in str(text)[: 4 * most])
     return line if len(str(text)) <= most else line[: most - 3] + "..."
 
 
 def damaged(path: object, problem: str) -> InputError:
-    """The error of a file whose content cannot be what was published."""
+    """The error for a file whose content cannot be the published one."""
     return InputError(path, problem, "copy it again")
 
 
 @contextmanager
 def parsed_as(path: Path, kind: str) -> Iterator[None]:
-    """What a parser raises within becomes an `InputError`. Nothing but the parser's own calls
-    belongs within, or a mistake of ours would be called damage of the file."""
+    """Convert errors of a parser to an `InputError`. Only the parser's own calls belong inside,
+    because otherwise our own errors would be reported as damage of the file."""
     try:
         yield
     except (InputError, *OURS):
@@ -57,38 +57,39 @@ def parsed_as(path: Path, kind: str) -> Iterator[None]:
     except MemoryError:
         problem = f"does not fit into memory as {kind}"
         raise InputError(path, problem, "if it should be smaller, copy it again") from None
-    except Exception as error:  # a damaged file makes a parser fail in any other way
+    except Exception as error:  # a damaged file may cause any other error in a parser
         reason = f"it may be cut short ({shortened(error, 200)})"
         raise damaged(path, f"cannot be read as {kind}, {reason}") from None
 
 
 class Table(NamedTuple):
-    """Columns of one file: by name, or by their places from 0 where no header names them."""
+    """Columns of one file: by name, or by their places from 0 if there is no header."""
 
     path: Path
     columns: Mapping[Any, Any]
-    """Series of text and feather; arrays of NumPy's formats and HDF5, also of several axes."""
+    """Series for text and feather; arrays for NumPy's formats and HDF5, which may have several
+    axes."""
     kind: str = "column"
-    """What messages call one: a column or a field."""
+    """Word for one of them in messages: column or field."""
     before: int = 0
-    """Lines before the first row, of a text file."""
+    """Number of lines before the first row of a text file."""
     content: bytes | None = None
-    """What a text file holds where it is part of an archive."""
+    """Content of a text file that is part of an archive."""
 
     def renamed(self, names: Iterable[str]) -> Table:
         """The columns of a text under these names, in their order."""
         return self._replace(columns=pd.DataFrame(self.columns).set_axis([*names], axis=1))
 
     def width(self) -> int:
-        """How many columns there are."""
+        """Number of columns."""
         return len(list(self.columns))
 
     def take(self, *names: Any, width: int | None = None, gaps: bool = False) -> np.ndarray:
         """Float64 of one column (n,), of several side by side (n, k), or of one field with `width`
         axes (n, width).
 
-        Raises `InputError` where one is missing, holds no numbers or has another shape, and, but
-        for `gaps`, where one is NaN or infinite.
+        Raises `InputError` if one is missing, has no numbers or another shape, and without `gaps`
+        also if one is NaN or infinite.
         """
         axes = () if width is None else (width,)
         parts = [self._numbers(name, axes) for name in names]
@@ -108,8 +109,8 @@ class Table(NamedTuple):
         return self.take(*(prefix + letter for letter in letters), gaps=gaps)
 
     def stamps(self, name: Any) -> Num[np.ndarray, " n"]:
-        """A column of stamps, complete. Integers stay: ns of unix time have more digits than a
-        float."""
+        """A complete column of stamps. Integers remain integers, because ns of unix time have more
+        digits than a float."""
         column = self._column(name)
         whole = column.ndim == 1 and column.dtype.kind in "iu"
         return np.asarray(column) if whole else self.take(name)
@@ -121,12 +122,12 @@ class Table(NamedTuple):
         start: float | int | None = None,
         repeats: Literal["refused", "dropped", "kept"] = "refused",
     ) -> tuple[Float[np.ndarray, " m"], float | int, slice | Int[np.ndarray, " m"]]:
-        """(s since `start`, `start`, rows) of a column of stamps in `unit`; `start` is the earliest
-        stamp where none is given.
+        """Time (s since `start`), `start` and rows of a column of stamps in `unit`; `start` is the
+        earliest stamp if none is given.
 
-        Of rows that repeat a stamp or come late `repeats` says whether they are an error, whether
-        the first of each stamp is taken, in their order, or whether they stay for `assemble`.
-        Raises `InputError` for that, and where the stamps span too much (`first_stamp`).
+        `repeats` decides about rows that repeat a stamp or come late: they are an error, or the
+        first row of each stamp is taken, in their order, or they remain for `assemble`. Raises
+        `InputError` for this error, and if the stamps span too much time (`first_stamp`).
         """
         stamps, field = self.stamps(name), name if isinstance(name, str) else "time"
         first = first_stamp(stamps, unit, self.path, field)
@@ -144,8 +145,8 @@ class Table(NamedTuple):
         scalar_first: bool = True,
         rows: slice | Bool[np.ndarray, " n"] | Int[np.ndarray, " m"] = slice(None),
     ) -> Rotation:
-        """Rotations of unit quaternions in these rows. Raises `InputError` as `take` does, and
-        where a norm is off 1 by more than `UNIT_NORM_TOLERANCE`."""
+        """Rotations of unit quaternions in these rows. Raises `InputError` as `take` does, and if a
+        norm differs from 1 by more than `UNIT_NORM_TOLERANCE`."""
         wxyz = self.take(*names, width=width, gaps=True)
         own = np.arange(len(wxyz))[rows]
         norm = np.linalg.norm(wxyz[own], axis=1)
@@ -161,7 +162,7 @@ class Table(NamedTuple):
         return rotations(wxyz[own] if scalar_first else wxyz_from_xyzw(wxyz[own]))
 
     def row(self, index: int) -> int:
-        """The row of the file, from 1, that holds entry `index` of every column."""
+        """The row of the file, counted from 1, with entry `index` of every column."""
         if not self.before and self.content is None:
             return index + 1
         with open_text(self.path, self.content) as file:
@@ -180,12 +181,12 @@ class Table(NamedTuple):
         return column
 
     def _numbers(self, name: Any, axes: tuple[int, ...]) -> np.ndarray:
-        """A column, with as many rows as the first, two or more, and these axes."""
+        """A column with these axes and as many rows as the first one, at least two."""
         column, what = self._column(name), f"{self.kind} '{name}'"
         if not isinstance(column, np.ndarray):
-            try:  # the columns of a frame are of one length
+            try:  # the columns of a frame have the same length
                 return column.to_numpy(dtype=np.float64, na_value=np.nan)
-            except (TypeError, ValueError, OverflowError):  # Python's integers have no end
+            except (TypeError, ValueError, OverflowError):  # Python's integers may be of any size
                 cells = pd.to_numeric(column.astype(str), errors="coerce")
                 bad = ~np.isfinite(pd.Series(cells, dtype=np.float64).to_numpy())
                 row = int(np.argmax(bad & column.notna().to_numpy()))
@@ -204,7 +205,7 @@ class Table(NamedTuple):
 
 
 def text_of(path: Path) -> str:
-    """What a file of text holds, without a byte order mark."""
+    """The content of a text file, without a byte order mark."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -214,7 +215,7 @@ def text_of(path: Path) -> str:
 
 
 def open_text(path: Path, content: bytes | None = None) -> io.TextIOWrapper:
-    """The text of a file, or `content` in its place; a byte order mark is dropped."""
+    """The text of a file, or `content` instead; a byte order mark is dropped."""
     if content is None:
         return path.open(encoding="utf-8-sig")
     return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig")
@@ -231,12 +232,12 @@ def read_text(
     """The columns of a text file by their names (stripped of blanks), or by their places from 0
     without a `header`.
 
-    Lines that begin with '#' are comments. The first other line names the columns, unless it holds
-    a number: then the last comment before it that has as many cells does, or else the numbers are
-    the names. `separator` " " stands for any run of blanks.
-    `content` is what the file holds where it is part of an archive; `path` is then its name in
-    messages. Raises `InputError` naming the file when it is missing, empty or no table, or where
-    its number of columns is none of `widths`.
+    Lines that begin with '#' are comments. The first other line names the columns, unless it
+    contains a number. Then the last comment before it with the same number of cells names them, or
+    otherwise the numbers are the names. `separator` " " means any run of blanks. `content` is the
+    content of a file that is part of an archive; `path` is then its name in messages. Raises
+    `InputError` naming the file if it is missing, empty or no table, or if its number of columns is
+    none of `widths`.
     """
     try:
         before, first = [], ""
@@ -303,7 +304,7 @@ def _is_number(cell: str, decimal: str) -> bool:
 
 
 def hdf5_node(group: h5py.Group, name: str, path: Path) -> Any:
-    """What an HDF5 group holds under a name ("group/field"); None where there is nothing. Raises
+    """The node of an HDF5 group with this name ("group/field"); None if there is none. Raises
     `InputError` for a link to another place."""
     import h5py
 
@@ -318,10 +319,10 @@ def hdf5_node(group: h5py.Group, name: str, path: Path) -> Any:
 
 
 def hdf5_field(group: h5py.Group, name: str, path: Path) -> np.ndarray | None:
-    """The array under a name; None where there is none.
+    """The array with this name; None if there is none.
 
-    It lies in the file itself: raises `InputError` for a link to another place, and for what would
-    be far larger in memory than in the file.
+    Raises `InputError` for a link to another place, and for an array that would be far larger in
+    memory than in the file.
     """
     import h5py
 
@@ -336,7 +337,7 @@ def hdf5_field(group: h5py.Group, name: str, path: Path) -> np.ndarray | None:
 
 
 def read_hdf5_fields(path: Path, names: Iterable[str]) -> Table:
-    """Those of the fields `names` (of any depth, "group/field") that an HDF5 file has."""
+    """The fields `names` (at any depth, "group/field") that exist in an HDF5 file."""
     import h5py
 
     with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
@@ -352,9 +353,9 @@ def read_npz(path: Path) -> Table:
 
 
 def read_npy(path: Path, names: Mapping[str, slice], width: int) -> Table:
-    """The table (N, `width`) of floats of an npy, its fields by name; one column is (N,)."""
+    """The fields, by name, of the table (N, `width`) of floats in an npy; one column is (N,)."""
     with parsed_as(path, "a NumPy array"):
-        # Mapped, since a damaged header may name more rows than there is memory.
+        # The file is mapped, because a damaged header may state more rows than fit into memory.
         table = np.load(path, mmap_mode="r", allow_pickle=False)
     if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
         problem = f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})"
@@ -372,12 +373,12 @@ def read_feather(path: Path) -> Table:
     if not path.exists():
         raise InputError(path, "no such file")
     with parsed_as(path, "feather"):
-        # What pandas noted of its own index when it wrote the file is of no use here.
+        # The metadata of pandas about its index are not needed here.
         return Table(path, feather.read_table(str(path)).to_pandas(ignore_metadata=True))
 
 
 def json_object(path: Path, remedy: str = "copy it again") -> dict[str, Any]:
-    """The object that a JSON file holds; `remedy` is what to do where it cannot be opened."""
+    """The object in a JSON file; `remedy` is the advice if it cannot be opened."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

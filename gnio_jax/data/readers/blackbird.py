@@ -7,9 +7,9 @@ ones minus one bias each) and `traj_target`, position m and quaternion xyzw of t
 `stamped_groundtruth_imu.txt` beside it repeats the poses (stamp, position, quaternion xyzw) and
 adds the velocity, whose three columns its header does not name.
 
-The body is front, right, *down*: level at rest the accelerometer reads −9.81 on z. It stays so,
-since the orientation tells. Which way the world's z points is read off the data, by the mean
-specific force in it: a world whose z points down is turned by a half turn about x.
+The body is front, right, *down*: level at rest the accelerometer reads −9.81 on z. This is not
+changed, because the orientation describes it. The direction of the world's z axis is found from the
+mean specific force in the world: a world with z down is turned by a half turn about x.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
 def _velocity(
     path: Path, time: Float[np.ndarray, " n"], start: float
 ) -> Float[np.ndarray, "n 3"] | None:
-    """The velocities of the text beside the table, whose stamps are `time` (s) since `start`; None
-    where there is no text or it has none."""
+    """The velocities in the text file beside the table, whose stamps are `time` (s) since `start`;
+    None if there is no text file or it has none."""
     if not path.is_file():
         return None
     # Stamp, position, quaternion and, in some, velocity.

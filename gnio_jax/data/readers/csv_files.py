@@ -1,10 +1,10 @@
-"""One's own recordings: a folder of CSV files or of the package's HDF5.
+"""Your own recordings: a folder of CSV files or of the package's HDF5 files.
 
 A CSV has a header that names, in any order, `time` s, `gyro_x..z` rad/s, `accel_x..z` m/s²
 (specific force), and optionally a reference: `qw..qz` (body→world), `px..pz` m, `vx..vz` m/s in a
-z-up world; other columns are ignored. Any rate. Without a reference the sequence holds NaN there
-and `valid` is False; velocities that are not given are those of the smoothed positions. Rows may
-leave the reference empty: up to 0.1 s of that are bridged, more is not valid.
+z-up world; other columns are ignored. Any rate is allowed. Without a reference the sequence has NaN
+there and `valid` is False; velocities that are not given are those of the smoothed positions. The
+reference may be empty in some rows: gaps up to 0.1 s are bridged, and longer ones are not valid.
 
 `gnio data import` brings the files of a phone's logger into this form.
 """
@@ -48,9 +48,9 @@ _FILES = (".csv", *HDF5)
 
 def recordings(root: Path, split: str) -> list[Recording]:
     """The recordings of a split, in the order of their names: those that <root>/<split>.txt lists,
-    or all as `test` where there is no list.
+    or all as `test` if there is no list.
 
-    Raises `InputError` where two files would go by the same name.
+    Raises `InputError` if two files would have the same name.
     """
     if split not in SPLITS and not _is_list(root / f"{split}.txt"):
         known = f"known splits: {', '.join(SPLITS)}, or that of a list {split}.txt there"
@@ -71,14 +71,14 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
 
 def files_of(root: Path) -> list[Path]:
-    """The files that are recordings of a folder without lists."""
+    """The recordings in a folder without lists."""
     files = (path for path in root.glob("[!.]*") if path.suffix.lower() in _FILES)
     return sorted(path for path in files if path.is_file())
 
 
 def list_splits(root: Path) -> tuple[str, ...]:
-    """The splits that the lists <root>/<split>.txt name; `test` alone where there is none. A text
-    of another name that names no recording there is no list."""
+    """The splits that the lists <root>/<split>.txt define; only `test` if there is none. A text
+    file with another name that lists no existing recording is not a list."""
     lists = {path.stem for path in root.glob("*.txt") if _is_list(path)}
     usual = [split for split in SPLITS if split in lists]
     return (*usual, *sorted(lists - set(SPLITS))) or ("test",)
@@ -95,7 +95,7 @@ def _is_list(path: Path) -> bool:
 
 
 def _find(root: Path, entry: str) -> Path | None:
-    """The file of a list's entry, which may lack the suffix."""
+    """The file of a list's entry, which may be without the suffix."""
     candidates = [root / entry, *(root / f"{entry}{suffix}" for suffix in _FILES)]
     files = (path for path in candidates if path.suffix.lower() in _FILES and path.is_file())
     return next(files, None)
@@ -134,8 +134,8 @@ def _streams(table: Table) -> Streams:
 
 
 def reference(table: Table, time: Float[np.ndarray, " n"]) -> Poses | None:
-    """The poses in a table's columns `REFERENCE`, at the stamps `time` (s) of its rows; None where
-    it has none. A field of the reference has all its columns, or none."""
+    """The poses in a table's columns `REFERENCE`, at the stamps `time` (s) of its rows; None if it
+    has none. A field of the reference must have all its columns, or none."""
     given = {}
     for field, columns in REFERENCE.items():
         present = [name for name in columns if name in table.columns]
@@ -161,8 +161,8 @@ def reference(table: Table, time: Float[np.ndarray, " n"]) -> Poses | None:
 def check_columns(
     path: Path, found: Iterable[object], wanted: Mapping[str, str], remedy: str
 ) -> None:
-    """Raise `InputError` where a file lacks columns, `wanted` being our names and the file's: all
-    that are missing at once, and after `remedy` the words that name them."""
+    """Raise `InputError` if a file lacks columns; `wanted` has our names and the file's. The
+    message has all missing columns, and after `remedy` the words that name them."""
     names = [str(name) for name in found]
     missing = [ours for ours, theirs in wanted.items() if theirs not in names]
     if missing:
@@ -179,11 +179,11 @@ _LIKE = {
     "gyro": r"(gyro\w*|gyr|g|omega|angular\w*|rotation\w*|w)[_ .]*",
     "accel": r"(accel\w*|acce|acc|linear\w*|a)[_ .]*",
 }
-"""What loggers call the columns, without unit and in small letters; the axis follows."""
+"""Names of the columns in loggers, without unit and in small letters; the axis follows."""
 
 
 def _guess(ours: str, names: list[str]) -> str:
-    """The column that is likely meant, or a word in its place."""
+    """The column that is probably meant, or a placeholder."""
     sensor, _, axis = ours.partition("_")
     pattern = _LIKE[ours] if ours in _LIKE else _LIKE[sensor] + axis
     for name in names:

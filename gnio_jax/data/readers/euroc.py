@@ -5,24 +5,24 @@ Layout: <root>/.../<sequence>/mav0/imu0/data.csv (stamp ns, gyro rad/s, accel m/
 beside `imu0` a reference, the first of
 
 - `state_groundtruth_estimate0/data.csv`: stamp ns, position m, quaternion wxyz, velocity m/s,
-  biases. A smoothed estimate of the IMU body from tracker and IMU, at 200 Hz (some copies: 20 Hz).
-  Splines interpolate it to the IMU's stamps.
-- `mocap0/data.csv`: stamp ns, position m, quaternion wxyz: what the tracker saw at 120 Hz, with
-  noise (0.1°, 0.4 mm), flips near its gaps, and gaps of seconds, or of minutes where TUM-VI leaves
-  the room. The gyro carries the orientation, a smoother the position (half response at 12 Hz), and
-  velocity is its derivative (`reference.reference_at`).
+  biases. It is a smoothed estimate of the IMU body from tracker and IMU, at 200 Hz (some copies: 20
+  Hz). Splines interpolate it at the IMU's stamps.
+- `mocap0/data.csv`: stamp ns, position m, quaternion wxyz. These are the tracker's poses at 120 Hz,
+  with noise (0.1°, 0.4 mm), flips near its gaps, and gaps of seconds, or of minutes where TUM-VI
+  leaves the room. The orientation is carried by the gyro, the position is smoothed (half response
+  at 12 Hz), and the velocity is its derivative (`reference.reference_at`).
 
-Either is valid only within gaps of 0.1 s and away from jumps; elsewhere the sequence holds NaN. A
+Both are valid only within gaps of 0.1 s and away from jumps; elsewhere the sequence has NaN. A
 recording is cut to the span of its reference and put on a uniform 200 Hz clock (TUM-VI's IMU runs
 at 199.4 Hz).
 
-Both clocks are one in the published sets. Where `sensor.yaml` stands beside a `data.csv`, its
-`T_BS` (sensor in body) turns and shifts the reference from its sensor's place to the IMU's. The
-bodies are left as they are: in EuRoC the IMU's x axis points up.
+Both clocks are the same in the published sets. If there is a `sensor.yaml` beside a `data.csv`, the
+reference is moved by its `T_BS` (sensor in body) from its sensor to the IMU. The body axes are not
+changed: in EuRoC the IMU's x axis points up.
 
-No split is published; ours are below. `unseen` holds whole environments out: the second Vicon room
-of EuRoC, everything of TUM-VI that leaves the room (its truth begins and ends in it). Recordings of
-other names, one's own in this layout, are in `test` alone.
+No split is published; ours are below. `unseen` has whole environments: the second Vicon room of
+EuRoC, and all recordings of TUM-VI that leave the room (their truth begins and ends in it).
+Recordings with other names, such as your own in this layout, are in `test` alone.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ TUMVI_SPLITS = {
 
 REFERENCES = ("state_groundtruth_estimate0", "mocap0")
 LONGEST_LEVER = 100.0
-"""m; no sensor is further away from its body."""
+"""Largest distance of a sensor from its body, m."""
 
 STAMP = "timestamp"
 GYRO, ACCEL, _POSITION, _VELOCITY = (
@@ -79,7 +79,7 @@ _SHORT = {
     **dict(zip(("qw", "qx", "qy", "qz"), _QUATERNION, strict=True)),
     **dict(zip(("vx", "vy", "vz"), _VELOCITY, strict=True)),
 }
-"""Other names in use, and the authors', both without unit and in small letters."""
+"""Other names of columns → the authors' names, both without unit and in small letters."""
 
 
 def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording]:
@@ -104,13 +104,13 @@ def _recording(folder: Path, dataset: str) -> Recording:
 def find_sequences(root: Path) -> dict[str, Path]:
     """Short name -> folder of every sequence below `root`.
 
-    TUM-VI is published in two sizes of the images, `dataset-room1_512_16` and
-    `dataset-room1_1024_16`: the walk is the same, and is taken once.
+    TUM-VI is published with two sizes of the images, `dataset-room1_512_16` and
+    `dataset-room1_1024_16`. The walk is the same, and it is taken once.
     """
     found: dict[str, Path] = {}
     for depth in ("", "*/", "*/*/", "*/*/*/"):
         for mav in sorted(root.glob(f"{depth}mav0")):
-            # TUM-VI's calibration recordings shake a camera in front of a board: no walk.
+            # TUM-VI's calibration recordings are of a camera in front of a board and have no walk.
             if (mav / "imu0" / "data.csv").is_file() and not mav.parent.name.startswith(
                 "dataset-calib"
             ):
@@ -119,7 +119,7 @@ def find_sequences(root: Path) -> dict[str, Path]:
 
 
 def short_name(folder: str) -> str:
-    """`room1` of `dataset-room1_512_16`; EuRoC's names stay."""
+    """`room1` for `dataset-room1_512_16`; EuRoC's names are unchanged."""
     match = re.fullmatch(r"dataset-(\w+?)_(?:512|1024)_16", folder)
     return match[1] if match else folder
 
@@ -128,7 +128,7 @@ def short_name(folder: str) -> str:
 
 
 def read(folder: Path, dataset: str = "euroc") -> list[Sequence]:
-    """One sequence of its folder (the one that holds `mav0`). Raises `InputError` naming file and
+    """One sequence from its folder (the one with `mav0`). Raises `InputError` naming file and
     field."""
     mav, name = folder / "mav0", short_name(folder.name)
     path = mav / "imu0" / "data.csv"
@@ -149,7 +149,7 @@ def read(folder: Path, dataset: str = "euroc") -> list[Sequence]:
 
 
 def read_table(path: Path) -> Table:
-    """A data.csv, its columns by the authors' names without unit, in small letters."""
+    """A data.csv, with columns by the authors' names without unit, in small letters."""
     table = read_text(path)
     plain = (re.sub(r"[\[(].*", "", str(name)).strip().lower() for name in table.columns)
     names = [_SHORT.get(name, name) for name in plain]
@@ -160,7 +160,7 @@ def read_table(path: Path) -> Table:
 
 
 def read_reference(mav: Path, start: float | int) -> Poses | None:
-    """Poses of the IMU by the first reference that is there, in s after the stamp `start` (ns);
+    """Poses of the IMU from the first reference that exists, in s after the stamp `start` (ns);
     rows without a pose are left out."""
     sensor = next((mav / name for name in REFERENCES if (mav / name / "data.csv").is_file()), None)
     if sensor is None:
@@ -200,7 +200,7 @@ class SensorPose(NamedTuple):
     rotation: Rotation = Rotation.identity()
     """Sensor → body."""
     translation: np.ndarray = np.zeros(3)
-    """Of the sensor in the body, m."""
+    """Position of the sensor in the body, m."""
 
     def seen_from(self, other: SensorPose) -> SensorPose:
         """This sensor in the frame of another one."""
@@ -210,14 +210,15 @@ class SensorPose(NamedTuple):
 
 
 def sensor_pose(path: Path) -> SensorPose:
-    """T_BS of a sensor.yaml; the identity where there is no file or it names none."""
+    """T_BS of a sensor.yaml; the identity if there is no file or it has none."""
     content = _yaml(path) if path.is_file() else None
     entry = content.get("T_BS") if isinstance(content, dict) else None
     if entry is None:
         return SensorPose()
     try:
         rows = entry["data"] if isinstance(entry, dict) else entry
-        # One by one, since aliases can make a few lines of YAML a list of billions.
+        # The values are read one by one, because aliases can turn a few lines of YAML into
+        # billions.
         values = [float(x) for row in rows for x in (row if isinstance(row, list) else [row])]
         matrix = np.array(values).reshape(4, 4)
         turn, translation = matrix[:3, :3], matrix[:3, 3]
@@ -233,14 +234,14 @@ def sensor_pose(path: Path) -> SensorPose:
 
 
 def moved_to(imu: SensorPose, poses: Poses) -> Poses:
-    """Poses of the IMU, which sits at `imu` in the tracked sensor's frame."""
+    """Poses of the IMU, whose pose in the tracked sensor's frame is `imu`."""
     lever = imu.rotation.inv().apply(imu.translation)
     return poses._replace(attitude=poses.attitude * imu.rotation, lever=lever)
 
 
 def _yaml(path: Path) -> Any:
-    with parsed_as(path, "YAML"):  # tags fail in any way
-        # Some exports carry OpenCV's header and tag, which are no YAML.
+    with parsed_as(path, "YAML"):  # tags may raise any error
+        # Some exports have OpenCV's header and tag, which are not YAML.
         text = path.read_text(encoding="utf-8")
         return yaml.safe_load(re.sub(r"(?m)^%YAML.*$|!!opencv-matrix", "", text))
 

@@ -2,19 +2,19 @@
 Kitani, AAAI 2021).
 
 Layout: building{1,2,3}/{train,known,unknown}/<k>.feather (train in building1 alone) and
-metadata.json beside them, {"<k>": {"subjectID": …, "calibration": …}}. One table a walk, 100 Hz,
-whose columns are read by name, since their order varies.
+metadata.json beside them, {"<k>": {"subjectID": …, "calibration": …}}. There is one table per walk,
+at 100 Hz, whose columns are read by name, because their order varies.
 
-The IMU stays the phone's: iOS reports −f in G. The table's attitude is the *rig's*; the phone is
-bolted to it by about half a turn about z. The world of the lidar's map is tilted by up to 8°: it is
-levelled with the mean of R·stencilAcc, the rig's own accelerometer, less what the positions gain in
-speed. In some recordings the poses are late by 0.03 to 0.19 s: the lag is estimated by laying the
-turning of the poses over the gyro. The position is the rig's, less than a phone's length away, and
-the authors smoothed it: no gait is left in it.
+The IMU is that of the phone: iOS reports −f in G. The table's attitude is that of the *rig*; the
+phone is mounted on it, turned by about half a turn about z. The world of the lidar's map is tilted
+by up to 8°. It is levelled with the mean of R·stencilAcc, the rig's own accelerometer, minus the
+mean acceleration of the positions. In some recordings the poses are late by 0.03 to 0.19 s; this
+lag is estimated from the angular rates of the poses and of the gyro. The position is that of the
+rig, less than a phone's length away, and the authors smoothed it until it contained no gait.
 
 The folders are the splits: `known` (also `seen`, `test`) are people of `train`, `unknown` (also
-`unseen`) are others. For validation people are held out of `train`: a person is drawn by a hash of
-the name, hence validates in every copy of the data or in none.
+`unseen`) are others. For validation people are held out of `train`. They are drawn by a hash of the
+name, so they are the same in every copy of the data.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from gnio_jax.types import STANDARD_G, Sequence
 
 RATE = 100.0
 SEED, HELD_OUT = "idol 56", 0.12
-"""Of the draw of people, and the share that validates: the first seed that takes one of the
-subjects 0 to 4, and one of each ten up to 39."""
+"""Seed of the draw of people, and the share for validation. It is the first seed that takes one of
+the subjects 0 to 4, and one of each ten up to 39."""
 
 PHONE_TO_RIG = Rotation.from_rotvec([-0.01853, 0.02801, 3.12916])
-"""How the phone is bolted on, from gyro and reference of the whole set; the authors' own words are
-x → −x, y → −y."""
+"""Mounting of the phone, from gyro and reference of the whole set; the authors state x → −x, y →
+−y."""
 SHORTEST = 10.0
-"""s of poses, and of the rig's accelerometer, that tell level and lag."""
+"""Shortest time of poses, and of the rig's accelerometer, that determines level and lag, s."""
 MAX_TILT = 20.0
-"""Degrees by which the map may be tilted; beyond, the attitude is not what it should be."""
+"""Largest plausible tilt of the map, degrees; beyond it, the attitude is wrong."""
 
 _SPLITS = {
     "train": "train",
@@ -83,7 +83,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
 def find_walks(root: Path, folder: str) -> list[Recording]:
     """The recordings in `folder` ("train", "known", "unknown") of every building; the buildings may
-    lie a folder or two deeper."""
+    be a folder or two deeper."""
     walks: list[Recording] = []
     nameless: list[Path] = []
     for building in _BUILDINGS:
@@ -100,7 +100,7 @@ def find_walks(root: Path, folder: str) -> list[Recording]:
                     nameless.append(path)
                 else:
                     subject = shortened(f"subject{person}")
-                # When the rig was turned about its axes: start, end, ...
+                # Times at which the rig was turned about its axes: start, end, ...
                 known = {"calibration": shortened(entry.get("calibration", "unknown"))}
                 known |= {"subject": subject, "group": subject}
                 walks.append(
@@ -121,11 +121,11 @@ def _name(path: Path) -> str:
 
 
 def read(path: Path) -> list[Sequence]:
-    """One walk at 100 Hz: levelled, the reference turned to the phone and shifted onto its clock.
+    """One walk at 100 Hz: levelled, with the reference turned to the phone and shifted to its
+    clock.
 
-    Level and lag are those of the whole walk, which is divided where a gap is longer than a window.
-    Raises `InputError` naming file and column, and `Refusal` when its reference cannot be that of
-    the phone.
+    Level and lag are those of the whole walk, which is divided at gaps longer than a window. Raises
+    `InputError` naming file and column, and `Refusal` if its reference cannot be that of the phone.
     """
     table = read_feather(path)
     stamps = table.take("timestamp")
@@ -139,7 +139,7 @@ def read(path: Path) -> list[Sequence]:
         raise damaged(path, problem)
     orientation = table.axes("orient", "WXYZ", gaps=True)[rows]
     position = table.axes("processedPos", "XYZ", gaps=True)[rows]
-    # A quaternion of zeros is no attitude, as little as NaN is.
+    # Neither a quaternion of zeros nor NaN is an attitude.
     known = orientation.any(axis=1) & finite_rows(orientation) & finite_rows(position)
     if known.sum() < max(fewest, 0.5 * len(rows)):
         problem = f"hold a pose in only {known.sum()} of {len(rows)} rows"
@@ -157,10 +157,10 @@ def read(path: Path) -> list[Sequence]:
         raise Refusal(path, problem)
     attitude = level * rig * PHONE_TO_RIG
 
-    # A gap tells nothing of the lag, however long it is: here it lasts as long as a window.
+    # A gap gives no information about the lag, so it is shortened to a window here.
     closed = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(time), WINDOW_SECONDS))])
     fit = pose_lag(closed, gyro, closed[known], attitude)
-    if not fit.correlation >= 0.5:  # NaN when the poses do not turn at all
+    if not fit.correlation >= 0.5:  # NaN if the poses do not turn at all
         problem = f"do not turn as 'iphoneGyro' does (they correlate by {fit.correlation:.2f})"
         raise Refusal(path, f"columns 'orient' {problem}")
     if abs(fit.lag) >= LONGEST_POSE_LAG:
@@ -191,11 +191,11 @@ def read(path: Path) -> list[Sequence]:
 def _gravity(
     time: Float[np.ndarray, " n"], force: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "3"]:
-    """The mean force in the map's world, less the mean acceleration of the positions, m/s².
+    """The mean force in the map's world minus the mean acceleration of the positions, m/s².
 
-    Positions and twice integrated force part by a parabola. Its bend is the difference of two
-    speeds, of the first and the last of each unbroken run: medians over a second of what is gone
-    in a second, which no single pose can move.
+    The difference of the positions and the twice integrated force is a parabola. Its curvature is
+    the difference of two velocities, at the beginning and at the end of each unbroken run. These
+    are medians over a second of displacements over a second, which no single pose can change.
     """
     mean, second = force.mean(axis=0), round(RATE)
     gained, seconds = np.zeros(3), 0.0
@@ -215,8 +215,8 @@ def _gravity(
 
 
 def _device(table: Table, time: Float[np.ndarray, " n"], rows: np.ndarray) -> Samples | None:
-    """CoreMotion's attitude where the table gives it; rows without one are left out, and a table
-    that mostly lacks it has none."""
+    """CoreMotion's attitude, if the table has it. Rows without one are left out; None if most rows
+    have none."""
     if not {f"iphoneOrient{axis}" for axis in "WXYZ"} <= set(table.columns):
         return None
     wxyz = table.axes("iphoneOrient", "WXYZ", gaps=True)[rows]
@@ -235,5 +235,5 @@ DATASET = Dataset(
     layout="<root>/building{1,2,3}/{train,known,unknown}/<k>.feather "
     "with metadata.json beside them",
     licence="CC BY 4.0",
-    correlates=False,  # the authors' positions are smoothed: no gait is left in them
+    correlates=False,  # the authors' smoothed positions contain no gait
 )

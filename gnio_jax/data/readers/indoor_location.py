@@ -4,15 +4,16 @@ malls with a phone held flat before the body. There is no pose, but waypoints th
 Layout: `<site>/<floor>/path_data_files/<id>.txt`. Lines that begin with '#' name device, sensors,
 start and end; every other is `unix ms, type, values` between tabs: TYPE_ACCELEROMETER (m/s²,
 Android's sign) and TYPE_GYROSCOPE (rad/s), each xyz and an accuracy, and TYPE_WAYPOINT, x and y in
-m of the floor's map. All else is passed over. Where a newline is missing, two lines stand in one;
-they are divided before the second's stamp.
+m of the floor's map. Other lines are ignored. If a newline is missing, two lines are joined; they
+are divided before the second stamp.
 
-Both sensors of the phone share their stamps, whole ms at about 50 Hz, and come back at 50 Hz.
+Both sensors of the phone share their stamps, whole ms at about 50 Hz, and sequences have 50 Hz.
 Walkers are not named; a floor is a `group`.
 
 A sequence has `waypoints` and no poses (`data.waypoints` makes some). Surveyors walk straight from
-tap to tap, and a tap is up to a second early or late; the first comes 0.1 to 0.4 s before the first
-sample. A tap within a second of the IMU's ends is taken at the end.
+tap to tap, and a tap is up to a second early or late; the first tap comes 0.1 to 0.4 s before the
+first sample. A tap up to a second before the first sample or after the last one is moved to that
+sample.
 """
 
 from __future__ import annotations
@@ -34,15 +35,16 @@ from gnio_jax.types import Sequence
 RATE = 50.0
 """Hz."""
 FLOORS = {"B1": "train", "F1": "train", "F2": "train", "F3": "val", "F4": "test"}
-"""Floor -> split. Other floors are in `all` alone."""
+"""Floor -> split. Other floors are only in `all`."""
 TAP_SECONDS = 1.0
-"""s by which a tap may be early or late."""
+"""Largest time before or after the IMU's samples at which a tap is accepted, s."""
 
 _GYRO, _ACCEL, _WAYPOINT = "TYPE_GYROSCOPE", "TYPE_ACCELEROMETER", "TYPE_WAYPOINT"
 _VALUES = {_GYRO: 3, _ACCEL: 3, _WAYPOINT: 2}
-"""Numbers of a line that are read."""
+"""Number of values of a line that are read."""
 _MERGED = re.compile(r"(?<!^)(?=\d{13}\tTYPE_)")
-"""Where a line begins within another; stamps of unix ms have 13 digits until the year 2286."""
+"""Pattern of the beginning of a line inside another one; stamps of unix ms have 13 digits until the
+year 2286."""
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
@@ -70,10 +72,9 @@ def _name(path: Path) -> str:
 
 
 def read(path: Path) -> list[Sequence]:
-    """One walk of its file, at 50 Hz, with waypoints in the place of poses.
+    """One walk from its file, at 50 Hz, with waypoints instead of poses.
 
-    Raises `InputError` naming file and field, and `Refusal` for a walk of fewer waypoints than can
-    be used.
+    Raises `InputError` naming file and field, and `Refusal` for a walk with too few waypoints.
     """
     header, found = read_lines(path)
     for kind, table in found.items():
@@ -126,10 +127,10 @@ def _taps(taps: Samples, gyro: Samples, accel: Samples) -> Samples:
 
 
 def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
-    """(lines that begin with '#', kind of line -> table of its stamps (unix ms), under the name of
-    the kind, and its `values`).
+    """The lines that begin with '#', and kind of line -> table of its stamps (unix ms), under the
+    name of the kind, and its `values`.
 
-    Raises `InputError` where a line is cut short, or the file holds two recordings.
+    Raises `InputError` if a line is cut short, or if the file has two recordings.
     """
     lines = [*_lines(text_of(path))]
     header = "\n".join(line for _, line in lines if line.startswith("#"))
@@ -170,7 +171,7 @@ def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
 
 
 def _lines(text: str) -> Iterator[tuple[int, str]]:
-    """(number from 1, line), lines that were merged divided."""
+    """(number from 1, line) of all lines; joined lines are divided."""
     for number, line in enumerate(text.split("\n"), 1):
         parts = _MERGED.split(line) if line.count("TYPE_") > 1 else (line,)
         yield from ((number, part) for part in parts)

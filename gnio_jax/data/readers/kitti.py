@@ -3,10 +3,10 @@
 Two layouts are read, also side by side:
 
 1. *Text as published*: `<root>/<date>/<drive>_extract/oxts/{timestamps.txt,data/<row>.txt}`, one
-   packet of 30 values a file at 100 Hz. Stamps are unix time to the nanosecond by the recording
-   computer; rows come out of order, some stamps twice, and packets are lost. Rows are sorted, of
-   equal stamps the first is kept, and the drive is divided where more than 0.1 s is missing. The
-   `_sync` export carries 10 Hz, too slow for an IMU: it is refused.
+   packet of 30 values a file at 100 Hz. Stamps are unix time of the recording computer, in ns. Some
+   rows are out of order, some stamps occur twice, and some packets are lost. Rows are sorted, the
+   first of equal stamps is kept, and the drive is divided where more than 0.1 s is missing. The
+   `_sync` export has 10 Hz, which is too slow for an IMU, and is refused.
 2. `<root>/*__<drive>_extract<piece>.npz`: t s, p_gt m, ang_gt roll-pitch-yaw rad, v_gt m/s
    east-north-up, u = [gyro rad/s, accel m/s²].
 
@@ -14,15 +14,15 @@ The body is the car's: x forward, y left, z up. World: east, north, up from the 
 by a Mercator projection whose scale is that latitude's. Orientation: Rz(yaw) Ry(pitch) Rx(roll),
 yaw from east, counter-clockwise.
 
-Truth and IMU are one INS, so the IMU is compensated with the reference's biases
-(`imu_compensated`), and its positions are corrected by jumps: where position and integrated
-velocity disagree by more than half a metre over a second, the reference is not valid. The rates are
-published behind a low-pass of first order (0.06 s, against the derivative of the attitudes); they
-are given as they are.
+Truth and IMU come from one INS, so the IMU is compensated with the reference's biases
+(`imu_compensated`). The INS corrects its positions by jumps: where position and integrated velocity
+differ by more than half a metre over a second, the reference is not valid. The published rates have
+passed a low-pass of first order (0.06 s, compared with the derivative of the attitudes); they are
+not changed.
 
-Splits are ours, as none is published for the raw drives: a drive is drawn by a hash of its name
-(70/10/20 % of the names), hence always falls into the same split whatever else a copy holds, and
-pieces of one drive are never divided between splits.
+Splits are ours, because none is published for the raw drives. A drive is assigned by a hash of its
+name (70/10/20 % of the names), so it is in the same split in every copy, and pieces of one drive
+are never in different splits.
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 RATE = 100.0
 SPLITS = ("train", "val", "test")
 SEED = "kitti raw 28"
-"""Of the draw of drives: of a few the one whose shares of the drives' time came nearest to the
-shares of the names."""
+"""Seed of the draw of drives. Of a few seeds it is the one for which the shares of the drives' time
+are nearest to the shares of the names."""
 
 LONGEST_GAP = 0.1
 """A drive is divided where packets are missing for longer than this, s."""
 SLOWEST_STEP = 0.05
-"""s between packets, half of what the 10 Hz export has."""
+"""Largest median time between packets, s: half of that of the 10 Hz export."""
 SHORTEST_PIECE = 3.0
-"""s; what is shorter holds too few windows to be worth a sequence."""
+"""Shortest piece that becomes a sequence, s; shorter ones have too few windows."""
 LARGEST_JUMP = 0.5
-"""m within a second by which position and integrated velocity may disagree."""
+"""Largest difference of position and integrated velocity within a second, m."""
 EARTH_RADIUS = 6378137.0
-"""m, of the sphere of the projection."""
+"""Radius of the sphere of the projection, m."""
 
 _DRIVE = re.compile(r"\d{4}_\d{2}_\d{2}_drive_\d{4}")
 _STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d+)?")
@@ -75,14 +75,15 @@ _VALUES = (
 _MOST = np.array(
     [85.0, 180.0, 1e5, *[10.0] * 3, *[FASTEST] * 5, *[STRONGEST_FORCE] * 6, *[FASTEST_TURN] * 3]
 )
-"""Magnitudes of the values up to `wz` beyond which a packet is damaged; the rest is not used."""
+"""Largest magnitudes of the values up to `wz`, beyond which a packet is damaged; the others are not
+used."""
 
 
 # --- the drives
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
-    """The drives of a split, or their pieces where these are files of their own."""
+    """The drives of a split, or their pieces if these are separate files."""
     found, drives = [], find_drives(root)
     for drive, paths in drives.items():
         if share_of(drive) == split and paths[0].is_dir():
@@ -96,14 +97,14 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
 
 def share_of(drive: str) -> str:
-    """Split of a drive, from its name alone."""
+    """The split of a drive, which depends only on its name."""
     place = drawn(SEED, drive)
     return "train" if place < 0.7 else "val" if place < 0.8 else "test"
 
 
 def find_drives(root: Path) -> dict[str, list[Path]]:
-    """Drive -> its folder of packets, or else its npz files. Raises `InputError` where there is
-    only the 10 Hz export."""
+    """Drive -> its folder of packets, or else its npz files. Raises `InputError` if there is only
+    the 10 Hz export."""
     drives, slow = defaultdict[str, list[Path]](list), set()
     for depth in ("", "*/", "*/*/", "*/*/*/"):
         for path in sorted(root.glob(f"{depth}oxts")):
@@ -130,10 +131,11 @@ def find_drives(root: Path) -> dict[str, list[Path]]:
 
 
 def read_packets(oxts: Path) -> list[Sequence]:
-    """The pieces of a drive of its folder `oxts`.
+    """The pieces of a drive from its folder `oxts`.
 
-    Packets without a stamp are left out, rows are sorted, of equal stamps the first is kept. World:
-    east, north, up from the first packet (`project`). Raises `InputError` naming file and field.
+    Packets without a stamp are left out, rows are sorted, and the first of equal stamps is kept.
+    World: east, north, up from the first packet (`project`). Raises `InputError` naming file and
+    field.
     """
     times, drive = oxts / "timestamps.txt", _drive_of(oxts.parent.name)
     rows, packets = _packets(oxts / "data")
@@ -217,7 +219,7 @@ def project(
     longitude: Float[np.ndarray, " n"],
     altitude: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 3"]:
-    """East, north, up (m) from the first point, of degrees and metres: Mercator's projection with
+    """East, north, up (m) from the first point, for degrees and metres: Mercator's projection with
     the scale of the first latitude."""
     scale = np.cos(np.radians(latitude[0])) * EARTH_RADIUS
     east = scale * np.radians(longitude)
@@ -228,12 +230,12 @@ def project(
 
 def _packets(folder: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 30"]]:
     """Numbers of the packets, and their values."""
-    # Plain names, not paths: at 100 Hz these are tens of thousands of files.
+    # Names are plain text, not paths, because at 100 Hz there are tens of thousands of files.
     names = sorted(filter(_PACKET.fullmatch, os.listdir(folder))) if folder.is_dir() else []
     if len(names) < 2:
         raise InputError(folder, "holds no packets <row>.txt", f"expected layout: {DATASET.layout}")
     table = np.array([_packet(os.path.join(folder, name)) for name in names])
-    absurd = ~(np.abs(table[:, : len(_MOST)]) <= _MOST)  # NaN, too
+    absurd = ~(np.abs(table[:, : len(_MOST)]) <= _MOST)  # includes NaN
     if absurd.any():
         row, index = np.argwhere(absurd)[0]
         problem = f"field '{_VALUES[index]}' is {table[row, index]:g}"
@@ -262,7 +264,7 @@ def _stamps(path: Path) -> np.ndarray:
     stamps = np.full(len(lines), np.datetime64("NaT"), dtype="datetime64[ns]")
     for row, line in enumerate(lines):
         try:
-            if line and not _STAMP.fullmatch(line):  # NumPy takes "now" for a stamp, too
+            if line and not _STAMP.fullmatch(line):  # NumPy would also accept "now" as a stamp
                 raise ValueError
             stamps[row] = np.datetime64(line or "NaT", "ns")
         except ValueError:

@@ -2,17 +2,18 @@
 of an office with Tango (Chen et al., *OxIOD: The Dataset for Deep Inertial Odometry*, 2018).
 
 Layout: `<scene>/<dataN | userN | device>/{raw,syn}/imuK.csv` beside `viK.csv`, `handK.csv` or
-`tangoK.csv`, and lists in the single-user scenes. No file has a header. A walk that is there as
-`raw` and as `syn` is one walk: `raw` is used, whose stamps place every row to 3 ms (in `syn` both
-streams were put on one 100 Hz grid by repeating rows), `syn` where `raw` is absent or refused.
+`tangoK.csv`, and lists in the single-user scenes. No file has a header. A walk that exists as `raw`
+and as `syn` is one walk. `raw` is used, whose stamps are accurate to 3 ms (in `syn` both streams
+were put on one 100 Hz grid by repeating rows). `syn` is used if `raw` is absent or refused.
 
 The phone is not the body with Vicon's markers. `alignment.align` finds the mounting, the level and
-the clocks from each walk. A fit that does not explain the motion, or finds what no phone on a
-marker body can be, is refused. In `large scale` the truth is a Tango tablet whose attitude is
-unusable, and `alignment.align_positions` finds the phone's.
+the clocks from each walk. A fit that does not explain the motion, or whose values are impossible
+for a phone on a marker body, is refused. In `large scale` the truth is that of a Tango tablet whose
+attitude is unusable, and `alignment.align_positions` finds the phone's attitude.
 
-`gyro` and `accel` stay the phone's, biases included. The accelerometer's delay against the gyro (6
-to 22 ms on an iPhone 7 Plus, 44 to 52 ms on an iPhone 5, 2 to 3 ms on a Nexus 5) is taken out.
+`gyro` and `accel` are those of the phone, including their biases. The accelerometer's delay
+relative to the gyro (6 to 22 ms on an iPhone 7 Plus, 44 to 52 ms on an iPhone 5, 2 to 3 ms on a
+Nexus 5) is removed.
 """
 
 from __future__ import annotations
@@ -54,48 +55,49 @@ LAYOUT = (
     "<scene>/{Train,Test}.txt"
 )
 
-# What is held out is named, so that a partial copy and the whole set agree.
+# Held-out sessions are named, so that they are the same in a partial copy and in the whole set.
 VALIDATION = frozenset({"trolley/data1", "handheld/data4"})
-"""Sessions of the authors' training lists that validate (`val`)."""
+"""Sessions of the authors' training lists for validation (`val`)."""
 SESSIONS_VAL = frozenset({"multi users/user4", "handheld/data4"})
 SESSIONS_TEST = frozenset(
     {"multi users/user2", "multi devices/nexus 5", "trolley/data1", "handheld/data5"}
     | {"handbag/data2"}
 )
-"""Sessions that validate and test in `sessions_*`; every other one of the Vicon room trains."""
+"""Sessions for validation and testing in `sessions_*`; all others of the Vicon room are for
+training."""
 SPLITS = ("train", "val", "test", "seen", "unseen", "large_scale")
 SPLITS += ("sessions_train", "sessions_val", "sessions_test")
 
 SHORTEST = 10.0
-"""s; nothing shorter is of use."""
+"""Shortest recording that can be used, s."""
 LAG_KNOTS = {"raw": 30.0, "syn": 5.0}
-"""s between the knots of the lag. Clocks of raw files run straight; in syn files rows were lost and
-filled in, and the lag steps by 10 to 20 ms."""
+"""Time between the knots of the lag, s. Clocks of raw files have almost constant rates; in syn
+files rows were lost and filled in, and the lag has steps of 10 to 20 ms."""
 WIDEST = 200.0
-"""m that the walks in a room span at most."""
+"""Largest extent of the walks in a room, m."""
 FASTEST_TURN, FASTEST, FASTEST_TANGO = np.radians(600.0), 10.0, 5.0
-"""rad/s and m/s: a tracker that shows more has jumped."""
+"""Largest rate and speed of a tracker, rad/s and m/s; beyond these it has jumped."""
 
-# What a fit of phone and tracker may find. In brackets: the largest figure of the real pairs, raw
-# and syn, that were at hand.
+# Limits of a fit of phone and tracker. In brackets: the largest value of the real pairs, raw and
+# syn, that we had.
 CLOSEST_RUNNER_UP = 0.5
-"""What the best fit leaves unexplained over what the best fit with another lag does (0.14); 1 where
-both are as good."""
+"""Largest ratio of the unexplained share of the best fit to that of the best fit with another lag
+(0.14); it is 1 if both are equally good."""
 LONGEST_LAG = {"raw": 5.0, "syn": 1.0}
-"""s. The clocks of raw files were set apart (0.29 here, 1.7 in others of the set, and as far as the
-search goes); the rows of syn files were matched by the authors (0.29)."""
+"""Largest lag, s. The clocks of raw files differ (0.29 here, up to 1.7 in others of the set), and
+the limit is that of the search; the authors matched the rows of syn files (0.29)."""
 LIMITS = {
     "mounting's uncertainty": (2.0, "°"),  # on a trolley (0.5)
     "lag's drift": (1.0, "s"),  # clocks drift by 1 ms in some seconds (0.26)
     "accel's delay": (0.15, "s"),  # phones filter the accelerometer over some samples (0.052)
     "lever arm": (0.3, "m"),  # the marker body is the phone with markers on it (0.12)
     "world's tilt": (5.0, "°"),  # the world of a calibrated tracker (0.8)
-    "gyro's bias": (0.1, "rad/s"),  # a phone's gyro that nothing has calibrated (0.02)
+    "gyro's bias": (0.1, "rad/s"),  # an uncalibrated gyro of a phone (0.02)
     "accel's bias": (0.6, "m/s²"),  # 60 mG, a bad accelerometer (0.17)
 }
 MIN_CORRELATION = 0.5
-"""Of the vertical accelerations of phone and Tango: 0.90 and more in step, at most 0.20 out of
-it."""
+"""Smallest correlation of the vertical accelerations of phone and Tango: it is 0.90 and more at the
+right lag, and at most 0.20 at others."""
 
 _VECTORS = [f"{name}_{axis}" for name in ("rotation_rate", "gravity", "user_acc") for axis in "xyz"]
 _IPHONE = ["time", "roll", "pitch", "yaw", *_VECTORS, "magnet_x", "magnet_y", "magnet_z"]
@@ -119,7 +121,7 @@ class Walk(NamedTuple):
 
     @property
     def session(self) -> str:
-        """What splits never divide."""
+        """The session, which splits never divide."""
         return f"{self.scene}/{self.folder}"
 
     @property
@@ -128,7 +130,7 @@ class Walk(NamedTuple):
         return f"{self.scene}_{self.folder}_{self.number}".replace(" ", "-")
 
     def attributes(self, kind: str) -> dict[str, str]:
-        """What is known of the walk without reading it."""
+        """Attributes of the walk that are known without reading it."""
         own = "user1" if self.scene in SINGLE_USER else "unknown"
         return {
             "scene": self.scene,
@@ -145,7 +147,7 @@ class Walk(NamedTuple):
 
 
 def find_walks(root: Path) -> list[Walk]:
-    """Every walk below `root`, whose scenes may lie some folders deeper."""
+    """Every walk below `root`, whose scenes may be some folders deeper."""
     return [
         walk
         for scene in (*SINGLE_USER, *UNSEEN, LARGE_SCALE)
@@ -178,8 +180,8 @@ def _walks_of(scene: str, folder: Path) -> list[Walk]:
 
 
 def _placements(scene: str, folder: Path) -> Callable[[int], str]:
-    """Where the phone was in the walk of a number: by the scene or, of other users, by a note of
-    lines like "3-5: pocket", where there is one."""
+    """A function from the number of a walk to the placement of the phone: by the scene, or for
+    other users by a note with lines like "3-5: pocket", if there is one."""
     if scene not in UNSEEN:
         by_hand = ("running", "slow walking", LARGE_SCALE)
         return lambda number: "handheld" if scene in by_hand else scene
@@ -201,13 +203,13 @@ def recordings(root: Path, split: str) -> list[Recording]:
         the authors' lists of the single-user scenes; the sessions `VALIDATION` are taken from
         `train` for `val`.
     `unseen`
-        other users and other devices: in no list and in no training.
+        other users and other devices, which are in no list and are not used for training.
     `large_scale`
         the floors with Tango, in no list either.
     `sessions_train`, `sessions_val`, `sessions_test`
-        every walk of the Vicon room, other users and devices among them, by whole sessions: the
-        lists alone leave little to train on in a partial copy. A network trained on these has seen
-        users and devices of `unseen`: evaluate it on `sessions_test` alone.
+        every walk of the Vicon room, including other users and devices, by whole sessions, because
+        the lists of a partial copy alone have little training data. A network trained on these has
+        seen users and devices of `unseen`: evaluate it only on `sessions_test`.
     """
     walks = find_walks(root)
     chosen = select(walks, split, root) if walks else []
@@ -218,7 +220,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
 
 def recording_of(walk: Walk) -> Recording:
-    """`raw` before `syn`, which is read where `raw` is refused."""
+    """The recording of a walk: `raw` first, and `syn` if `raw` is refused."""
     found = None
     for kind in ("syn", "raw"):
         if kind in walk.files:
@@ -229,7 +231,7 @@ def recording_of(walk: Walk) -> Recording:
 
 
 def select(walks: list[Walk], split: str, root: Path) -> list[Walk]:
-    """The walks of `split`. Raises `InputError` on a list that is missing or empty."""
+    """The walks of `split`. Raises `InputError` if a list is missing or empty."""
     if split == "unseen":
         return [walk for walk in walks if walk.scene in UNSEEN]
     if split == "large_scale":
@@ -247,7 +249,7 @@ def select(walks: list[Walk], split: str, root: Path) -> list[Walk]:
 
 def _on_lists(walks: list[Walk], name: str, root: Path) -> list[Walk]:
     """The walks that the lists `name` of the single-user scenes name, by lines `dataN` (all its
-    walks) and `dataN/imuK.csv`. The last line may lack its end."""
+    walks) and `dataN/imuK.csv`. The last line may be without a newline."""
     folders = {scene: place for scene in SINGLE_USER for place in _scene_folders(root, scene)}
     lists = {s: place / name for s, place in folders.items() if (place / name).is_file()}
     if not lists:
@@ -279,11 +281,11 @@ def _on_lists(walks: list[Walk], name: str, root: Path) -> list[Walk]:
 
 
 def build(walk: Walk, kind: str) -> list[Sequence]:
-    """One walk at 100 Hz. Raises `Refusal` where its files are damaged, or where they or the fit of
-    phone and tracker are of no use: another form of the walk may serve."""
+    """One walk at 100 Hz. Raises `Refusal` if its files are damaged, or if they or the fit of phone
+    and tracker cannot be used: another form of the walk may be usable."""
     imu_path, truth_path = walk.files[kind]
     try:
-        # The phone's stamps survive in the syn files of the large scale.
+        # The syn files of the large scale still have the phone's stamps.
         phone = read_phone(imu_path, "raw" if walk.scene == LARGE_SCALE else kind)
         on_tango = truth_path.name.startswith("tango")
         about = walk.attributes(kind) | {"truth": "tango" if on_tango else "vicon"}
@@ -332,12 +334,12 @@ def _on_tango(phone: Streams, path: Path, kind: str) -> Streams:
 
 
 def read_phone(path: Path, kind: str) -> Streams:
-    """A phone's file, without name. iPhone: 16 columns, accelerations in G with iOS's sign, so that
-    specific force = −(gravity + user_acc)·9.80665; CoreMotion has taken its estimate of their bias
-    off the rotation rates. Nexus: rows of one sensor each (`raw`), or 10 columns (`syn`), m/s²
-    already.
+    """The streams of a phone's file. iPhone: 16 columns, accelerations in G with iOS's sign, so
+    that specific force = −(gravity + user_acc)·9.80665; CoreMotion has subtracted its estimate of
+    the bias from the rotation rates. Nexus: rows of one sensor each (`raw`), or 10 columns (`syn`),
+    in m/s².
 
-    Of kind "raw" the stamps are unix time; of kind "syn" they are destroyed, and rows are 1/100 s
+    The stamps of kind "raw" are unix time; those of kind "syn" are destroyed, and rows are 1/100 s
     apart. Raises `InputError`.
     """
     table = _read_table(path, _IPHONE, _NEXUS, _NEXUS_EVENTS)
@@ -351,7 +353,7 @@ def read_phone(path: Path, kind: str) -> Streams:
         return streams._replace(attributes={"imu_compensated": "no"})
     values = table.take(*_IPHONE[:13])
     stamps, start = np.arange(len(values)) / RATE, 0.0
-    if kind == "raw":  # the stamps are right, the order of some rows is not
+    if kind == "raw":  # the stamps are right, but some rows are in the wrong order
         values = values[np.argsort(values[:, 0], kind="stable")]
         start = float(values[0, 0])
         stamps = values[:, 0] - start
@@ -371,7 +373,8 @@ def read_phone(path: Path, kind: str) -> Streams:
 
 
 def _nexus_events(table: Table) -> Streams:
-    """Rows `t_ms, type, x, y, z` of one sensor each: 1 accelerometer, 2 magnetometer, 4 gyro."""
+    """The streams from rows `t_ms, type, x, y, z` of one sensor each: 1 accelerometer, 2
+    magnetometer, 4 gyro."""
     stamps, kind, *_ = table.take("time", "type").T
     values, start = table.take("x", "y", "z"), float(stamps.min()) / 1e3
     sensors = []
@@ -388,7 +391,7 @@ def _nexus_events(table: Table) -> Streams:
 
 
 def _read_table(path: Path, *layouts: list[str]) -> Table:
-    """A file without header as a table with the names of its number of columns."""
+    """A file without header as a table; the names of the columns depend on their number."""
     named = {len(names): names for names in layouts}
     table = read_text(path, header=False, widths=tuple(named))
     if (rows := len(table.columns[0])) < SHORTEST * RATE:
@@ -397,8 +400,8 @@ def _read_table(path: Path, *layouts: list[str]) -> Table:
 
 
 def _sampled(stamps: np.ndarray, values: np.ndarray, path: Path) -> Samples:
-    """The rows that do not repeat the row before (they are filler, whatever their stamps) on the
-    phone's own clock. A repeated stamp with other values is a rounded clock."""
+    """The rows that do not repeat the row before, on the phone's own clock. Rows that repeat it are
+    filler, with any stamp. A repeated stamp with other values comes from a rounded clock."""
     fresh = _is_fresh(values)
     return Samples(restored_clock(stamps[fresh], path), values[fresh], str(path))
 
@@ -410,8 +413,8 @@ def _is_fresh(values: Float[np.ndarray, "n w"]) -> Bool[np.ndarray, " n"]:
 def restored_clock(stamps: Float[np.ndarray, " n"], path: Path) -> Float[np.ndarray, " n"]:
     """Times (s) of uniformly taken samples from stamps rounded to 10 ms.
 
-    The times are piecewise linear in the number of the sample, lost ones counted, with a knot per
-    30 s. Raises `InputError` when the stamps cannot come from a uniform clock.
+    The times are piecewise linear in the number of the sample, counting lost ones, with a knot per
+    30 s. Raises `InputError` if the stamps cannot come from a uniform clock.
     """
     remedy, problem = "use the syn files", ""
     if len(stamps) < 2:
@@ -425,7 +428,7 @@ def restored_clock(stamps: Float[np.ndarray, " n"], path: Path) -> Float[np.ndar
     if problem:
         raise InputError(path, f"field 'time' {problem}", remedy)
     period = float(np.mean(steps[steps < 2.5 * typical]))
-    # Lost rows leave a step behind, which is counted by its length.
+    # Lost rows leave a longer step, whose length gives their number.
     lost = np.where(steps > 2.6 * period, np.round(steps / period) - 1.0, 0.0)
     number = np.arange(len(stamps)) + np.concatenate([[0.0], np.cumsum(lost)])
     hats = hat_functions(number, uniform_knots(number, 30.0 / period))
@@ -475,8 +478,8 @@ def read_vicon(path: Path, kind: str, start: float) -> Poses:
 
 
 def read_tango(path: Path) -> Samples:
-    """Tango's positions (m) without held rows and jumps. Rows are 1/100 s apart; the stamps are
-    rounded to a second in some files. Raises `InputError`."""
+    """Tango's positions (m) without held rows and jumps. Rows are 1/100 s apart, because the stamps
+    are rounded to a second in some files. Raises `InputError`."""
     values = _read_table(path, _TRACKER).take(*_TRACKER[2:5], gaps=True)
     usable = _is_fresh(values) & np.isfinite(values).all(axis=1)
     rows = _enough(usable, 0.5, "rows hold a position", path)
@@ -488,7 +491,7 @@ def read_tango(path: Path) -> Samples:
 
 
 def _enough(usable: Bool[np.ndarray, " n"], share: float, what: str, path: Path) -> np.ndarray:
-    """The usable rows; raises `InputError` where they are less than this share."""
+    """The usable rows; raises `InputError` if they are fewer than this share."""
     rows = np.flatnonzero(usable)
     if len(rows) < share * len(usable):
         raise damaged(path, f"only {len(rows)} of {len(usable)} {what}")

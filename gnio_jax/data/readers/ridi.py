@@ -4,16 +4,16 @@ truth (Yan, Shan, Furukawa, ECCV 2018).
 Layout: folders <name>/ with processed/data.csv (one table on the pose's clock, about 202.3 Hz, ns,
 quaternions wxyz, an index column without a name), or with the recorder's text files alone:
 acce.txt, gyro.txt (`t x y z`), pose.txt (`t px py pz qx qy qz qw`) and orientation.txt (`t qx qy qz
-qw`, the game rotation vector), each on its own clock, ns, quaternions xyzw. The table is taken
-where there is one. IMU and pose are of one rigid body; nothing is calibrated, and the accelerometer
-reads 1–3 % high.
+qw`, the game rotation vector), each on its own clock, ns, quaternions xyzw. The table is used if it
+exists. IMU and pose belong to one rigid body; nothing is calibrated, and the accelerometer reads
+1–3 % too much.
 
-Recorders that followed use ARCore, whose world is y-up, and whose pose.txt is the camera's: their
-android_sensor_pose.txt is the IMU's, and it is taken, turned to z-up, where it is there. Their
-rates differ by the phone.
+Later recorders use ARCore, whose world is y-up, and whose pose.txt is that of the camera. Their
+android_sensor_pose.txt has the poses of the IMU; it is used if it exists, turned to z-up. Their
+rates depend on the phone.
 
-Everything comes back at 200 Hz. The lists name train and test; for validation whole people are held
-out of train (`held_out_of_train`).
+Sequences have 200 Hz. The lists name train and test; for validation whole people are held out of
+train (`held_out_of_train`).
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ _PLACEMENTS = {"handheld": "handheld", "leg": "pocket", "bag": "bag", "body": "b
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
-    """The recordings of a split that are present, wherever below the root; `seen` is `test`.
+    """The recordings of a split that are present, anywhere below the root; `seen` is `test`.
 
-    `unseen` is the authors' cross-subject list. Recordings that are in no list are in no split but
-    `all`, every recording below the root, which needs no list.
+    `unseen` is the authors' cross-subject list. Recordings in no list are only in `all`, which is
+    every recording below the root and needs no list.
     """
     folders = find_folders(root, _is_recording)
     if split == "all":
@@ -77,7 +77,7 @@ def _recording(folder: Path, attributes: dict[str, str]) -> Recording:
 
 
 def held_out_of_train(path: Path) -> set[str]:
-    """Names in the training list that validate: whole people, about a tenth of the list, the same
+    """Names in the training list for validation: whole people, about a tenth of the list, the same
     in every copy of the data."""
     folders = listed(path, lambda entry: Path(_name(entry)), path.parent, DATASET.layout)
     return held_out({folder.name: _subject(folder.name) for folder in folders})
@@ -90,7 +90,7 @@ def _is_recording(folder: Path) -> bool:
 
 
 def _name(entry: str) -> str:
-    """Lines of the lists are `name,placement` or `name`."""
+    """The name in a line of the lists, `name,placement` or `name`."""
     return entry.partition(",")[0].strip()
 
 
@@ -102,11 +102,11 @@ def _subject(name: str) -> str:
 
 
 def read(folder: Path) -> list[Sequence]:
-    """One recording of its folder, at 200 Hz, from its table or else from the recorder's text
-    files, divided where its IMU or odometry has a gap longer than a window.
+    """One recording from its folder, at 200 Hz, from its table or else from the recorder's text
+    files, divided at gaps of IMU or odometry that are longer than a window.
 
     `device_orientation` is the game rotation vector, turned to begin at the reference's attitude,
-    since its yaw is arbitrary. Raises `InputError` naming file and field.
+    because its yaw is arbitrary. Raises `InputError` naming file and field.
     """
     table, arcore = (folder / _TABLE).is_file(), (folder / _ARCORE).is_file()
     streams = _from_table(folder) if table else _from_text_files(folder, arcore)

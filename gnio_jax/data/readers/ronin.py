@@ -1,17 +1,17 @@
-"""RoNIN: phones carried as people please, positions from a Tango device strapped to the chest
-(Herath, Yan, Furukawa, ICRA 2020).
+"""RoNIN: phones carried in any way, with positions from a Tango device on the chest (Herath, Yan,
+Furukawa, ICRA 2020).
 
 Layout: folders <name>/{data.hdf5,info.json}, anywhere below the root (the published archives do not
 follow the lists), and the lists list_{train,val,test_seen,test_unseen}.txt of the authors'
 repository. All quaternions are wxyz, body→world, 200 Hz.
 
-The chest device moves apart from the phone: its attitude (`pose/tango_ori`) is not the phone's. As
-the authors do, the reference orientation is that of the phone's own filter, laid onto the Tango
-world at the first row, when the phone's place on the chest is known: tango_ori[0] ⊗
-start_calibration ⊗ conj(src[0]) ⊗ src(t). In training and validation src is the phone's game
-rotation vector if it ends less than 20° from the truth, else the best of integrated gyro, game
-rotation vector and the authors' EKF; that choice looks at the truth, so in the tests src is always
-the game rotation vector. The position is the chest's.
+The chest device moves independently of the phone: its attitude (`pose/tango_ori`) is not the
+phone's. As in the authors' code, the reference orientation is that of the phone's own filter,
+aligned with the Tango world at the first row, when the phone's pose on the chest is known:
+tango_ori[0] ⊗ start_calibration ⊗ conj(src[0]) ⊗ src(t). In training and validation src is the
+phone's game rotation vector if it ends less than 20° from the truth, else the best of integrated
+gyro, game rotation vector and the authors' EKF. This choice uses the truth, so in the tests src is
+always the game rotation vector. The position is that of the chest.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from gnio_jax.types import Sequence
 
 RATE = 200.0
 MAX_GAME_ERROR = 20.0
-"""Degrees by which the game rotation vector may end off the truth and still be preferred in
-training, as the authors have it."""
+"""Largest final error with which the game rotation vector is preferred in training, degrees, as in
+the authors' code."""
 
 _TABLE, _INFO = "data.hdf5", "info.json"
 _LISTS = {
@@ -56,7 +56,7 @@ _ERRORS = {
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
-    """The recordings of a split's list that are present, wherever below the root; `test` is
+    """The recordings of a split's list that are present, anywhere below the root; `test` is
     `seen`."""
     folders = find_folders(root, lambda folder: (folder / _TABLE).is_file())
     chosen = listed(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
@@ -67,9 +67,9 @@ def recordings(root: Path, split: str) -> list[Recording]:
 def read(folder: Path, choose: bool = False) -> list[Sequence]:
     """One recording of its folder, from its `start_frame` on.
 
-    `choose` lets the errors against the truth decide which source the orientation follows, as in
-    training; without it that is the game rotation vector. `device_orientation` is the game rotation
-    vector as the phone gave it. Raises `InputError` naming file and field.
+    With `choose` the source of the orientation is chosen by its errors against the truth, as in
+    training; without it the source is the game rotation vector. `device_orientation` is the game
+    rotation vector of the phone. Raises `InputError` naming file and field.
     """
     path, about = folder / _TABLE, folder / _INFO
     info = json_object(about, f"it belongs beside {_TABLE}")
@@ -121,7 +121,7 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
 
 
 def _choice(info: dict[str, Any], has_ekf: bool, path: Path) -> tuple[str, float]:
-    """The source to train on, and by how much it ends off the truth, degrees."""
+    """The source for training, and its final error against the truth, degrees."""
     errors = {
         name: float(_vector(info, field, 1, path)[0])
         for name, field in _ERRORS.items()
@@ -141,14 +141,14 @@ def _start_frame(info: dict[str, Any], rows: int, path: Path) -> int:
 
 
 def _vector(info: dict[str, Any], name: str, length: int, path: Path) -> Float[np.ndarray, "d"]:
-    """A field that holds so many finite numbers, or one alone."""
+    """A field of `length` finite numbers, or of a single one."""
     if info.get(name) is None:
         raise damaged(path, f"field '{name}' is missing")
     given = [info[name]] if length == 1 else info[name]
     values = np.empty(0)
     numbers = isinstance(given, list) and all(type(each) in (int, float) for each in given)
     if numbers and len(given) == length:
-        # JSON's integers have no end.
+        # JSON's integers may be of any size.
         values = np.array([float(each) if abs(each) < 1e300 else np.inf for each in given])
     if values.shape != (length,) or not np.isfinite(values).all():
         what = "is no number" if length == 1 else f"does not hold {length} numbers"

@@ -2,9 +2,9 @@
 
 Layout: <root>/{train,val,test}_list.txt with one folder name per line;
 <root>/<name>/imu0_resampled.npy, float64 (N, 17) at 200 Hz, whose columns
-imu0_resampled_description.json names. Its gyro and accel are given in the world; the body frame is
-Rᵀ of them. They were compensated with the biases of the reference system, which is kinder than any
-filter will find it in the field: `imu_compensated` among the attributes says so.
+imu0_resampled_description.json names. Its gyro and accel are expressed in the world, and Rᵀ rotates
+them into the body frame. They were compensated with the biases of the reference system, so the task
+is easier than in the field; the attribute `imu_compensated` says so.
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ DATASET = Dataset(
     recordings=recordings,
     splits=tuple(_LISTS),
     rate=RATE,
-    # Rewritten recordings lie in a folder of another name, so that nobody takes one for the other.
+    # Rewritten recordings are in a folder of another name, so that they are not confused with
+    # TLIO's.
     folders=("tlio", "tlio_layout"),
     source="https://github.com/CathIAS/TLIO (its README links the data)",
     layout="<root>/{train,val,test}_list.txt and "

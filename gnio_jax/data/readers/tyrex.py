@@ -3,26 +3,27 @@
 with smartphones*, Pervasive and Mobile Computing 2018).
 
 Layout: `datasets/{android,ios}/<Person>_<Device>_<Dist|NoDist>_<Way>/` with `accelerometer.txt`,
-`gyroscope.txt`, `timeAlignment.txt` and, of an iPhone, `description.txt`; the tracker's poses are
-`datasets/qualisys/<same name>.mat` (MATLAB 5). `Dist` walks pass magnets, which no IMU minds.
+`gyroscope.txt`, `timeAlignment.txt` and, for an iPhone, `description.txt`; the tracker's poses are
+`datasets/qualisys/<same name>.mat` (MATLAB 5). `Dist` walks pass magnets, which do not affect an
+IMU.
 
 - Nexus 5: stamps in s of the record, both sensors at 200 Hz, the accelerometer in m/s² with
   Android's sign; the gyro's file has the system's estimate of the bias beside the raw rate. It is
-  taken off, as for any program that asks Android for a gyro.
+  subtracted, as Android does for programs that read the gyro.
 - iPhone 4S and 5: stamps in s since the phone was booted, the record begins at `BootTime`; each
   sensor at a rate of its own (90 to 107 Hz); the accelerometer in G with Apple's sign.
 - Qualisys: 60 Hz, mm, rotations body → world column by column, NaN where the body was lost. Its
   time is the record's plus the number in `timeAlignment.txt`, to 0.03 s.
 
-**The iPhones' gyros are raw**: no bias is taken off, and 0.1 rad/s remain on an iPhone 5. Runners
-reach the 2 G at which two of the accelerometers clip (`accel_clipped`).
+**The iPhones' gyros are raw**: no bias is subtracted, and it is 0.1 rad/s on an iPhone 5. In runs
+two of the accelerometers reach 2 G and clip (`accel_clipped`).
 
 The tracked body is a handle on the phone, whose axes are the phone's to a few degrees and whose
 origin is some cm away. `alignment.align` finds the mounting, the level and the clocks from each
-walk, as of OxIOD; poses at 60 Hz are too slow to be differenced in a hand that swings, and so the
+walk, as for OxIOD. Poses at 60 Hz are too infrequent to be differenced in a swinging hand, so the
 gyro carries the attitude between them. A fit that does not explain the motion is refused.
 
-Everything comes back at 100 Hz.
+Sequences have 100 Hz.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from gnio_jax.types import STANDARD_G, Sequence
 RATE = 100.0
 """Hz."""
 DEVICES = {"Nexus5": "Nexus 5", "iPhone4S": "iPhone 4S", "iPhone5": "iPhone 5"}
-"""Names of the folders, and of the phones."""
+"""Names in folders → names of phones."""
 TRAINS = "Thibaud"
 """The person whose walks are `train`."""
 WAYS = {
@@ -61,26 +62,29 @@ WAYS = {
     "RunningHand": "running, in the hand",
     "RunningPocket": "running, in the pocket",
 }
-"""Names of the folders, and the ways to carry as the attribute `placement` has them."""
+"""Names in folders → ways of carrying in the attribute `placement`."""
 
 LONGEST_RECORD, LATEST_START = 600.0, 60.0
-"""s; a record lasts two minutes, and the sensors start within a second of it."""
+"""Longest record and latest start of a sensor, s: a record lasts two minutes, and the sensors start
+within a second of it."""
 CLIPS = (1.95, 2.15)
-"""G between which the accelerometers of Nexus 5 and iPhone 4S clip; the iPhone 5's reaches 6 G."""
+"""Range in G in which the accelerometers of Nexus 5 and iPhone 4S clip; that of the iPhone 5
+reaches 6 G."""
 WIDEST = (0.2, 100.0)
-"""m that the walks in a room span at least and at most; what spans less is not in mm."""
+"""Smallest and largest extent of the walks in a room, m; smaller ones are not in mm."""
 FASTEST_TURN, FASTEST = np.radians(2000.0), 10.0
-"""rad/s (the gyros' own range) and m/s: a tracker that shows more has jumped."""
+"""Largest rate (the range of the gyros) and speed of a tracker, rad/s and m/s; beyond these it has
+jumped."""
 LAG_SEARCH = 0.3
-"""s by which `timeAlignment.txt` may be wrong (0.04)."""
+"""Largest error of `timeAlignment.txt`, s (0.04)."""
 LAG_KNOTS = 60.0
-"""s between the knots of the lag: the clocks run straight."""
+"""Time between the knots of the lag, s: the clocks have almost constant rates."""
 
-# What a fit of phone and tracker may find. In brackets: the largest figure of the 84 walks.
+# Limits of a fit of phone and tracker. In brackets: the largest value of the 84 walks.
 LIMITS = {
     "lever arm": (0.3, "m"),  # the handle is on the phone (0.07)
     "world's tilt": (5.0, "°"),  # the world of a calibrated tracker (0.3)
-    "mounting's uncertainty": (2.0, "°"),  # what hardly turns or moves tells none
+    "mounting's uncertainty": (2.0, "°"),  # a phone that hardly moves does not determine it
     "mounting's turn": (20.0, "°"),  # its axes are the phone's (2)
     "gyro's bias": (0.2, "rad/s"),  # raw gyros (0.104)
     "accel's delay": (0.15, "s"),  # phones filter the accelerometer (0.046)
@@ -91,7 +95,7 @@ _NAME = re.compile(rf"(\w+?)_({'|'.join(DEVICES)})_(Dist|NoDist)_(\w+)")
 
 
 class Walk(NamedTuple):
-    """One walk: the folder of its phone, and what its name says."""
+    """One walk: the folder of its phone, and the parts of its name."""
 
     folder: Path
     person: str
@@ -106,7 +110,7 @@ class Walk(NamedTuple):
 
 
 def walk_of(folder: Path) -> Walk | None:
-    """The walk of a folder, by its name; None of another folder."""
+    """The walk of a folder, by its name; None for another folder."""
     match = _NAME.fullmatch(folder.name)
     if match is None:
         return None
@@ -115,11 +119,11 @@ def walk_of(folder: Path) -> Walk | None:
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
-    """The recordings of a split that are present, wherever below the root.
+    """The recordings of a split that are present, anywhere below the root.
 
-    `train`: the walks of one person. The other's validate where magnets lie beside the path
-    (`val`), and test where none do (`test`, running included). `all` is every walk, and
-    `all-0of2`, `all+0of2` divide it by person.
+    `train` has the walks of one person. `val` has those of the other person with magnets beside the
+    path, and `test` those without (including running). `all` is every walk, and `all-0of2`,
+    `all+0of2` divide it by person.
     """
     found = find_folders(root, lambda folder: walk_of(folder) is not None)
     walks = [walk for folder in found.values() if (walk := walk_of(folder)) is not None]
@@ -145,14 +149,14 @@ def _recording(walk: Walk) -> Recording:
 
 
 def read(folder: Path) -> list[Sequence]:
-    """One walk of its phone's folder. Raises `InputError` naming file and field, and `Refusal`
-    where phone and tracker do not move alike."""
+    """One walk from its phone's folder. Raises `InputError` naming file and field, and `Refusal` if
+    phone and tracker do not have the same motion."""
     walk = walk_of(folder)
     if walk is None:
         problem = "is not named <Person>_<Device>_<Dist|NoDist>_<Way>"
         raise InputError(folder, problem, "give the folder its published name")
     phone, track = read_phone(walk), read_track(walk.track, _offset(folder))
-    # Whichever is damaged, they do not fit together.
+    # One of these files is damaged, so they do not fit together.
     both = f"{walk.track} and accelerometer.txt, gyroscope.txt, timeAlignment.txt of the phone"
     about = {
         "group": walk.person,
@@ -169,8 +173,8 @@ def read(folder: Path) -> list[Sequence]:
 
 
 def clipped(accel: Float[np.ndarray, "n 3"]) -> float:
-    """Share of the samples (m/s²) at the ends of an accelerometer's range; 0 where it reaches
-    beyond `CLIPS`."""
+    """Share of the samples (m/s²) at the ends of an accelerometer's range; 0 if it reaches beyond
+    `CLIPS`."""
     felt = np.abs(accel).max(axis=1) / STANDARD_G
     return float((felt > CLIPS[0]).mean()) if felt.max() < CLIPS[1] else 0.0
 
@@ -204,7 +208,7 @@ def read_phone(walk: Walk) -> Streams:
 
 
 def _boot_time(path: Path) -> float:
-    """s since boot at which an iPhone's record began."""
+    """Time of the beginning of an iPhone's record, s since boot."""
     found = re.search(r"BootTime\s*=\s*(\d{1,12}(?:\.\d{1,9})?)", text_of(path))
     if found is None:
         raise damaged(path, "field 'BootTime' is missing")
@@ -212,7 +216,7 @@ def _boot_time(path: Path) -> float:
 
 
 def _offset(folder: Path) -> float:
-    """s by which the tracker's time is ahead of the record's."""
+    """The tracker's time minus the record's, s."""
     path = folder / "timeAlignment.txt"
     text = text_of(path).strip()
     try:

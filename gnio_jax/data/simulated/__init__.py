@@ -1,1 +1,1 @@
-"""Walks that are computed, not recorded."""
+"""Simulated walks."""

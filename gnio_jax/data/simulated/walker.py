@@ -1,17 +1,17 @@
-"""How people walk and carry a phone: a walk whose every part is drawn from ranges.
+"""A simulated walker with a phone: every part of a walk is drawn from ranges.
 
 The plan of a walk is a smooth speed, heading and slope: standing, strolling, walking, running,
 turning, climbing and descending stairs. The gait is on top of it. The amplitude and the phase of
-every harmonic, the blow of the heel and the swing of the phone are drawn for each walk (domain
-randomisation). What is left for a network to rely on is what all walkers share: bounce and cadence
-grow with the speed, and the trunk is fastest where it is lowest, which distinguishes forward from
+every harmonic, the heel strike and the swing of the phone are drawn for each walk (domain
+randomisation). A network can then use only what all walkers have in common: bounce and cadence grow
+with the speed, and the trunk is fastest where it is lowest, which distinguishes forward from
 backward. In a run it is slowest there.
 
-`MANY_PEOPLE` has wide ranges. The trunk follows the inverted pendulum (Zijlstra & Hof, 2003). How
-much of its motion reaches a hand, a pocket and a bag, and how hard the heel strikes there, was set
-so that the spectra of the simulated accelerations cover those of OxIOD's training and validation
-sessions; no network learns from these. `FEW_PEOPLE` has narrow ranges about the same middle, from
-which a small network learns in a minute. All ranges are ours.
+`MANY_PEOPLE` has wide ranges. The trunk follows the inverted pendulum (Zijlstra & Hof, 2003). The
+gains of its motion and the strength of the heel strike in a hand, a pocket and a bag were set so
+that the spectra of the simulated accelerations cover those of OxIOD's training and validation
+sessions; no network learns from these sessions. `FEW_PEOPLE` has narrow ranges about the same
+middle, from which a small network learns in a minute. All ranges are ours.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ Wave = Callable[[np.ndarray], np.ndarray]
 
 
 class Carrying(NamedTuple):
-    """How a phone is carried, as ranges to draw from. Three ranges are forward, left, up, or roll,
-    pitch, yaw. Accelerations and rates are root mean squares in a slow walk (`_STEP`, `_CADENCE`).
+    """A way of carrying a phone, as ranges to draw from. Three ranges are forward, left, up, or
+    roll, pitch, yaw. Accelerations and rates are root mean squares in a slow walk (`_STEP`,
+    `_CADENCE`).
     """
 
     share: float
@@ -41,15 +42,15 @@ class Carrying(NamedTuple):
     surge: Range
     """Gain of the trunk's fore-aft motion at step frequency."""
     surge_phase: Range
-    """Mean and standard deviation of its phase against the inverted pendulum, rad."""
+    """Mean and standard deviation of its phase relative to the inverted pendulum, rad."""
     bounce: Range
     """Gain of the trunk's vertical motion at step frequency."""
     harmonics: Range
-    """Acceleration at twice the step frequency against that at step frequency."""
+    """Ratio of the acceleration at twice the step frequency to that at step frequency."""
     stride: Ranges
     """Acceleration at stride frequency, m/s²."""
     strike: Range
-    """Acceleration of the blow of the heel, m/s²."""
+    """Acceleration of the heel strike, m/s²."""
     stride_rate: Ranges
     """Angular rate at stride frequency, rad/s."""
     step_rate: Ranges
@@ -132,16 +133,16 @@ CARRYING = {
         lever=((0.05, 0.2), (-0.1, 0.1), (0.1, 0.3)),
     ),
 }
-"""How phones are carried, by name."""
+"""Ways of carrying a phone, by name."""
 
 STANDING_START = 3.0
-"""s that every walk begins with."""
+"""Time of standing at the beginning of every walk, s."""
 _STEP, _CADENCE = 0.55, 1.5
-"""Step length (m) and step frequency (Hz) of the slow walk that the amplitudes belong to."""
+"""Step length (m) and step frequency (Hz) of the slow walk for which the amplitudes are given."""
 
 
 class Activity(NamedTuple):
-    """What a walker does for a while."""
+    """An activity of a walker."""
 
     share: float
     """Probability that it comes next."""
@@ -156,14 +157,14 @@ class Activity(NamedTuple):
 
 
 class Population(NamedTuple):
-    """The ranges that a walk is drawn from."""
+    """The ranges from which a walk is drawn."""
 
     activities: dict[str, Activity]
     carrying: dict[str, Carrying]
     cadence: Range
     """Gain of the step frequency at a given speed."""
     idle: Range
-    """Slow wandering of the phone's place, which standing does not stop, m."""
+    """Slow wandering of the phone's position, which continues while the walker stands, m."""
 
 
 def _narrow(ranges: Any, share: float) -> Any:
@@ -177,7 +178,8 @@ def _narrow(ranges: Any, share: float) -> Any:
 def _narrow_carrying(carried: Carrying, share: float) -> Carrying:
     values = carried._asdict()
     ranges = {name: _narrow(value, share) for name, value in values.items() if type(value) is tuple}
-    # The surge of the trunk reaches the phone wherever it is: it says which way the walker goes.
+    # The fore-aft motion of the trunk reaches the phone in every placement, and shows the direction
+    # of walking.
     mean, std = carried.surge_phase
     ranges |= {"surge": (0.9, 1.1), "surge_phase": (mean, share * std)}
     return carried._replace(**ranges, turned=0.0, roll=share * carried.roll)
@@ -196,7 +198,7 @@ MANY_PEOPLE = Population(
     cadence=(0.86, 1.16),
     idle=(0.001, 0.006),
 )
-"""Everything is drawn from wide ranges."""
+"""People with wide ranges."""
 
 FEW_PEOPLE = Population(
     activities={
@@ -211,11 +213,11 @@ FEW_PEOPLE = Population(
     cadence=_narrow((0.86, 1.16), 0.2),
     idle=(0.001, 0.003),
 )
-"""The same middles, a fifth of the widths."""
+"""People with the same middles and a fifth of the widths."""
 
 
 class Plan(NamedTuple):
-    """Where a person goes, smoothly."""
+    """The smooth plan of a walk."""
 
     speed: Float[np.ndarray, " n"]
     """m/s."""
@@ -234,25 +236,25 @@ class Steps(NamedTuple):
     """s."""
     plan: Plan
     length: Float[np.ndarray, " n"]
-    """Of a step, m."""
+    """Length of a step, m."""
     cadence: Float[np.ndarray, " n"]
-    """Steps in a second, Hz."""
+    """Steps per second, Hz."""
     phase: Float[np.ndarray, " n"]
     """2π for each step."""
 
     def growth(self) -> Float[np.ndarray, "n 1"]:
-        """Amplitude of a swing against that of the slow walk."""
+        """Ratio of the amplitude of a swing to that of the slow walk."""
         return (self.length / (self.length + 0.5) * (_STEP + 0.5) / _STEP)[:, None]
 
 
 class Motion(NamedTuple):
-    """True motion of the phone; one more pose than samples, since the last one drives an interval,
-    too."""
+    """True motion of the phone. There is one more pose than samples, because the last sample also
+    drives an interval."""
 
     time: Float[np.ndarray, " n"]
     """s."""
     position: Float[np.ndarray, "n 3"]
-    """m, from the first pose."""
+    """Position relative to the first pose, m."""
     velocity: Float[np.ndarray, "n 3"]
     """m/s."""
     attitude: Rotation
@@ -270,8 +272,8 @@ def draw_motion(
     """The motion of a phone on a walk that is drawn from `people`; `time` (s) is uniform with the
     step `dt`. `placement` is a way of `people.carrying`.
 
-    The gait of the walker number `who` is the same in every walk; without a number it is drawn from
-    `rng` too. Position and velocity are value and derivative of one spline.
+    The gait of walker number `who` is the same in every walk; without a number it is also drawn
+    from `rng`. Position and velocity are value and derivative of one spline.
     """
     own = rng if who is None else np.random.default_rng([7, who])
     carried = people.carrying[placement]
@@ -290,8 +292,8 @@ def draw_motion(
     offset = offset + lever + wander(rng, time, 3, rng.uniform(*people.idle), 0.1, 0.8)
     swing = _swing(rng, own, carried, steps)
 
-    # The yaw of the mounting is anything: where the phone points is no hint of where its owner
-    # goes.
+    # The yaw of the mounting is arbitrary, so that the phone's heading does not show the direction
+    # of walking.
     tilt = rng.uniform(*carried.tilt)
     if rng.random() < carried.turned:
         tilt = -tilt
@@ -318,7 +320,7 @@ def _plan(
     time: Float[np.ndarray, " n"],
     dt: float,
 ) -> Plan:
-    """A walk through random activities, round bends and corners."""
+    """A walk through random activities, with bends and corners."""
     speed, rise, running = (np.zeros_like(time) for _ in range(3))
     names, chances = list(activities), [each.share for each in activities.values()]
     clock = STANDING_START
@@ -358,7 +360,8 @@ def _turn_rate(rng: np.random.Generator, time: Float[np.ndarray, " n"]) -> np.nd
 def _trunk(
     rng: np.random.Generator, own: np.random.Generator, carried: Carrying, steps: Steps
 ) -> Float[np.ndarray, "n 3"]:
-    """What reaches the phone of the trunk's fore-aft and vertical motion at step frequency, m."""
+    """The part of the trunk's fore-aft and vertical motion at step frequency that reaches the
+    phone, m."""
     time, planned, length, _, phase = steps
     bounce = own.uniform(*carried.bounce) * 0.28 * length**2 / (8.0 * own.uniform(0.8, 1.0))
     surge = own.uniform(*carried.surge) * 0.016 * length / 0.7
@@ -400,7 +403,7 @@ def _strides(
 def _strikes(
     own: np.random.Generator, carried: Carrying, steps: Steps, dt: float
 ) -> Float[np.ndarray, "n 3"]:
-    """The blow of each heel: an oscillation that rises and dies within a fraction of a step, m."""
+    """The heel strikes: an oscillation that rises and decays within a fraction of a step, m."""
     since = np.mod(steps.phase, 2.0 * np.pi) / (2.0 * np.pi * steps.cadence)
     decay, frequency = own.uniform(0.02, 0.06), own.uniform(4.0, 14.0, size=3)
     angle = 2.0 * np.pi * frequency * since[:, None] + own.uniform(0.0, 0.8, size=3)
@@ -417,7 +420,7 @@ def _strikes(
 def _swing(
     rng: np.random.Generator, own: np.random.Generator, carried: Carrying, steps: Steps
 ) -> Float[np.ndarray, "n 3"]:
-    """Roll, pitch and yaw of the phone against the walker, rad."""
+    """Roll, pitch and yaw of the phone relative to the walker, rad."""
     total = wander(rng, steps.time, 3, rng.uniform(*carried.grip), 0.01, 0.15)
     for ranges, rate in ((carried.stride_rate, 0.5), (carried.step_rate, 1.0)):
         speed = np.sqrt(2.0) * np.array([own.uniform(*each) for each in ranges])
@@ -430,8 +433,8 @@ def _swing(
 def wander(
     rng: np.random.Generator, time: np.ndarray, width: int, rms: float, low: float, high: float
 ) -> np.ndarray:
-    """Smooth aimless motion (n, width): eight sinusoids between two frequencies (Hz) with a root
-    mean square of `rms` together."""
+    """Smooth random motion (n, width): eight sinusoids between two frequencies (Hz) with a total
+    root mean square of `rms`."""
     frequency = rng.uniform(low, high, size=(8, width))
     start = rng.uniform(0.0, 2.0 * np.pi, size=(8, width))
     result = np.zeros((len(time), width))
@@ -441,7 +444,7 @@ def wander(
 
 
 def smooth_steps(values: np.ndarray, seconds: float, dt: float) -> np.ndarray:
-    """Steps turned into ramps of `seconds` with three continuous derivatives."""
+    """Steps smoothed to ramps of `seconds` with three continuous derivatives."""
     half = round(seconds / dt / 2)
     kernel = np.hanning(2 * half + 3)[1:-1] ** 2
     return convolved(np.pad(values, half, mode="edge"), kernel / kernel.sum())

@@ -1,9 +1,9 @@
-"""Computed walks with a known truth: a few walks for the demo and the tests, and ten hours of
+"""Simulated walks with a known truth: a few walks for the demo and the tests, and ten hours of
 walks of many people.
 
-The motion of the phone is `walker.draw_motion`'s. Sample k of the IMU is the mean over the interval
-that it drives, gyro_k = log(R_kᵀ R_{k+1}) / dt and accel_k = R_kᵀ ((v_{k+1} − v_k) / dt − g), so
-that integrating the noise-free IMU sample by sample returns the trajectory.
+The motion of the phone is that of `walker.draw_motion`. Sample k of the IMU is the mean over its
+interval, gyro_k = log(R_kᵀ R_{k+1}) / dt and accel_k = R_kᵀ ((v_{k+1} − v_k) / dt − g), so that
+integrating the noise-free IMU sample by sample returns the trajectory.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from gnio_jax.types import GRAVITY, Sequence
 
 
 class SensorErrors(NamedTuple):
-    """White noise and random walk of an IMU as densities, constant biases by their length."""
+    """White noise and random walk of an IMU as densities, and constant biases by their
+    magnitude."""
 
     gyro_density: float
     """rad/s/√Hz."""
@@ -41,9 +42,9 @@ class SensorErrors(NamedTuple):
     accel_bias_walk: float
     """m/s²/√s."""
     gyro_bias: tuple[float, float]
-    """Range of the length of the gyro bias, rad/s."""
+    """Range of the magnitude of the gyro bias, rad/s."""
     accel_bias: tuple[float, float]
-    """Range of the length of the accelerometer bias, m/s²."""
+    """Range of the magnitude of the accelerometer bias, m/s²."""
 
 
 PHONE = SensorErrors(
@@ -65,11 +66,11 @@ def pedestrian(
     rate: float = 200.0,
     imu_errors: bool = True,
 ) -> Sequence:
-    """A walk of the person number `who`, for `seconds` at `rate` Hz, of which all but the gait is
-    drawn from `seed`. It starts with 3 s of standing.
+    """A walk of person number `who`, for `seconds` at `rate` Hz. Everything except the gait is
+    drawn from `seed`.
 
-    Without `imu_errors` the IMU has neither bias nor noise. The true biases, at the start, are
-    among the attributes.
+    It starts with 3 s of standing. Without `imu_errors` the IMU has neither bias nor noise. The
+    attributes include the true biases at the start.
     """
     rng = np.random.default_rng([seed])
     time, dt = np.arange(round(seconds * rate) + 1) / rate, 1.0 / rate
@@ -80,9 +81,9 @@ def pedestrian(
 
 
 def random_walk(seed: int, seconds: float = 60.0, rate: float = 100.0) -> Sequence:
-    """A walk of `seconds` at `rate` Hz of which everything is drawn from `seed`: walker, gait, way
-    to carry the phone and IMU, from a good one to a poor one. It starts with 3 s of standing. The
-    true biases, at the start, are among the attributes."""
+    """A walk of `seconds` at `rate` Hz. Everything is drawn from `seed`: walker, gait, way of
+    carrying the phone, and IMU, from a good one to a poor one. It starts with 3 s of standing. The
+    attributes include the true biases at the start."""
     rng = np.random.default_rng([11, seed])
     names = list(CARRYING)
     placement = str(rng.choice(names, p=[CARRYING[name].share for name in names]))
@@ -114,8 +115,8 @@ def walk_sequence(
     attributes: dict[str, object],
     imu_errors: bool = True,
 ) -> Sequence:
-    """The sequence of a simulated walk. The errors of its IMU, which are drawn in any case, and the
-    true biases at the start join its attributes."""
+    """The sequence of a simulated walk. Errors of its IMU are always drawn. The true biases at the
+    start are added to the attributes."""
     gyro = turns_between(walk.attitude) / dt
     force = np.diff(walk.velocity, axis=0) / dt + np.array([0.0, 0.0, GRAVITY])
     accel = walk.attitude[:-1].inv().apply(force)
@@ -155,7 +156,7 @@ def _sensor_error(
     density: float,
     walk: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(constant bias (3,), its sum with random walk and white noise (count, 3))."""
+    """The constant bias (3,), and its sum with random walk and white noise (count, 3)."""
     direction = rng.standard_normal(3)
     bias = direction / np.linalg.norm(direction) * rng.uniform(*length)
     walked = np.cumsum(rng.standard_normal((count, 3)), axis=0) * walk * np.sqrt(dt)
@@ -163,8 +164,8 @@ def _sensor_error(
 
 
 def device_attitude(rng: np.random.Generator, walk: Motion, dt: float) -> Rotation:
-    """The phone's own estimate: a yaw from anywhere that drifts by some degrees, a degree of tilt
-    error."""
+    """The phone's own attitude: an arbitrary yaw that drifts by some degrees, and a tilt error of a
+    degree."""
     count = len(walk.time) - 1
     drift = np.cumsum(rng.standard_normal(count)) * np.radians(0.4) * np.sqrt(dt)
     drift = drift + rng.uniform(-np.pi, np.pi)
@@ -192,7 +193,8 @@ def _few_recordings(_: Path | None, split: str) -> list[Recording]:
     placements, walks = list(CARRYING), []
     for index in range(count):
         who = first_person + index % people
-        # Shifted by one per round of people, so that nobody carries the phone in one place only.
+        # The placement is shifted by one per round of people, so that nobody carries the phone in
+        # one place only.
         where = placements[(index + index // people) % len(placements)]
         computed = partial(_alone, pedestrian, seed + index, who, where, seconds)
         walks.append(Recording(f"synthetic_{seed + index}_{where}", computed))
