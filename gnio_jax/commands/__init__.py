@@ -1,4 +1,4 @@
-"""The command lines: typed options in, one call into the package."""
+"""The command lines: each reads typed options and makes one call into the package."""
 
 import os
 

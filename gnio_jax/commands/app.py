@@ -51,7 +51,7 @@ GNIO = options.Group(
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run a command, by default that of the process, and leave with its exit status."""
+    """Run a command, by default that of the process, and exit with its status."""
     words = list(sys.argv[1:] if argv is None else argv)
     if words == ["--completion"]:
         print(options.completion(GNIO, "gnio"))

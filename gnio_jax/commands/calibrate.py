@@ -1,4 +1,4 @@
-"""`gnio calibrate`: what a run does not know of its own errors."""
+"""`gnio calibrate`: fit the filter of a run to the errors of its network."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gnio_jax.cores import usable_cores
 def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
     """Fit the filter of a run to its validation split, and write a run with it.
 
-    On the walks that it was trained on, a network's errors are smaller than on other walks, so the
-    filter is fitted to others. First, each axis gets a factor for the network's standard
-    deviations, from the errors on the validation split. Then the filter's noises are chosen that
-    make its innovations most likely. Last, the errors that the filter reports but does not estimate
-    (its consider covariance) are fitted to the errors of its positions. The result is a run that
-    gnio evaluate takes as any other; test splits are refused. A run that has learnt from several
+    A network's errors are smaller on its training walks than on other walks, so the filter is
+    fitted to other walks. First, each axis gets a factor for the network's standard deviations,
+    from the errors on the validation split. Then the filter's noises are chosen that make its
+    innovations most likely. Last, the errors that the filter reports but does not estimate (its
+    consider covariance) are fitted to the errors of its positions. The result is a run, which gnio
+    evaluate takes like any other; test splits are refused. A run that has learnt from several
     datasets is fitted to the walks of all of them.
 
     examples:
@@ -29,7 +29,7 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
       {prog} --workdir runs/oxiod --average-headings
       {prog} --workdir runs/oxiod --out-of-fold runs/fold0 runs/fold1
     """
-    from gnio_jax import calibration  # late: mistakes do not wait for JAX
+    from gnio_jax import calibration  # late, so that mistakes do not wait for JAX
 
     console.prepare_filter()
     with console.terminal() as terminal:
@@ -54,7 +54,7 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
 
 
 def _spelled(value: Any) -> str:
-    """A setting in a cell: a number, several, or none where it was switched off."""
+    """The text of a setting in a cell: one number, several, or none if it is switched off."""
     if value is None:
         return "none"
     return ", ".join(f"{each:.4g}" for each in (value if isinstance(value, tuple) else (value,)))

@@ -1,4 +1,4 @@
-"""`gnio compare`: runs side by side."""
+"""`gnio compare`: comparison of runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ENDINGS = (".md", ".csv", ".png")
 
 
 def compare(asked: CompareConfig, _call: options.Call) -> None:
-    """Compare runs sequence by sequence: by how much they differ, with intervals.
+    """Compare runs sequence by sequence: their differences, with intervals.
 
     The others are compared with the first run. Runs that have no evaluation yet are evaluated
     first. Seeds of a run are averaged, and the name of a run without its seed stands for all of
@@ -35,7 +35,7 @@ def compare(asked: CompareConfig, _call: options.Call) -> None:
       {prog} runs/gnio_s0 runs/gnio_s0/eval/oxiod_test_ekf_loose
     """
     if asked.out is not None:
-        _check_out(asked.out)  # or what was evaluated for it would be lost
+        _check_out(asked.out)  # otherwise the evaluations for it would be lost
     from gnio_jax.apps import compare as comparison  # late: mistakes do not wait for JAX
 
     console.prepare_filter()
@@ -43,7 +43,7 @@ def compare(asked: CompareConfig, _call: options.Call) -> None:
         found = comparison.compare(asked, terminal, usable_cores())
     console.say(f"{comparison.title(found)}\n")
     table = Table(box=box.SIMPLE_HEAD, header_style="bold")
-    table.add_column(overflow="fold", min_width=16)  # names have the width that is left
+    table.add_column(overflow="fold", min_width=16)  # names get the remaining width
     for name in comparison.HEADER[2:]:
         table.add_column(name, justify="right")
     for metric, *cells in comparison.lines(found):
@@ -59,7 +59,7 @@ def compare(asked: CompareConfig, _call: options.Call) -> None:
 
 
 def _check_out(out: str) -> None:
-    """Raise now where the files could not be written later."""
+    """Raise an error now if the files could not be written later."""
     path = Path(out)
     if path.name in ("", "..") or path.suffix in ENDINGS or out.endswith(("/", "\\")):
         remedy = "give the name of a file without its ending: runs/both"

@@ -27,22 +27,22 @@ _DISK_ERRORS = {
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO),
     *(errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG),
 }
-"""Of a place that may not be written, that has no room, and of a name that does not fit."""
+"""Errors for a place that may not be written, for a full disk, and for an impossible name."""
 _READER_LEFT = 141
 _COMPILE_SECONDS = "0.1"
-"""s. What takes longer to compile is kept; JAX itself keeps what takes a second."""
+"""Compile time, s, from which a program is kept; JAX's own default is a second."""
 
 
 def run(main: Callable[[], object]) -> None:
-    """Call `main()` and leave with the shell's exit statuses.
+    """Call `main()` and exit with the shell's exit statuses.
 
     A user's mistake (`InputError`), a full disk or a folder that may not be written is one line on
-    stderr and status 2; Ctrl-C gives status 130. SIGTERM unwinds the program like an exception, so
-    that nothing half-written stays behind, and gives status 143. A warning is one line on stderr.
-    Any other exception is a fault of the program and keeps its traceback.
+    stderr and status 2; Ctrl-C gives status 130. SIGTERM ends the program like an exception, so
+    that no incomplete file remains, and gives status 143. A warning is one line on stderr. Any
+    other exception is an error of the program and keeps its traceback.
     """
     signal.signal(signal.SIGTERM, _terminate)
-    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may hold any bytes
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may have any bytes
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with warnings.catch_warnings():
@@ -56,7 +56,7 @@ def run(main: Callable[[], object]) -> None:
     except KeyboardInterrupt:
         _leave("interrupted", 128 + signal.SIGINT)
     except BrokenPipeError:
-        # The reader of our output (head, less) has left: there is nobody to tell.
+        # The reader of our output (head, less) has ended, so no message can be shown.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(_READER_LEFT) from None
     except OSError as error:
@@ -66,8 +66,8 @@ def run(main: Callable[[], object]) -> None:
 
 
 def warn_of_other_sources() -> None:
-    """Warn where the working folder holds another gnio_jax than the one that runs: what is changed
-    there would have no effect."""
+    """Warn if the working folder has another gnio_jax than the one that runs, because changes there
+    have no effect."""
     running = Path(gnio_jax.__file__)
     if os.path.isfile("gnio_jax/__init__.py") and not running.samefile("gnio_jax/__init__.py"):
         there = f"runs the gnio_jax of {running.parent} and not that of this folder"
@@ -75,10 +75,10 @@ def warn_of_other_sources() -> None:
 
 
 def keep_compiled_programs() -> None:
-    """Let JAX keep what it compiles in the user's cache, unless the user has said where.
+    """Let JAX keep compiled programs in the user's cache, unless the user has chosen a place.
 
-    JAX reads the variables as it is imported, and processes that are started inherit them. Where
-    the folder cannot be written every command compiles anew.
+    JAX reads the variables when it is imported, and child processes inherit them. If the folder
+    cannot be written, every command compiles again.
     """
     base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     folder = Path(base) / "gnio-jax" / "compiled"
@@ -90,10 +90,10 @@ def keep_compiled_programs() -> None:
 
 
 def compile_quickly() -> None:
-    """Have XLA compile in half the time, for commands that run once what they compile: on a CPU
-    the filter is as quick without its last optimisations. The user's own flags win.
+    """Let XLA compile in half the time, for commands that run each program once: on a CPU the
+    filter is as fast without the last optimisations. The user's own flags have priority.
 
-    XLA reads the variable with the first program, and refuses flags that it does not know.
+    XLA reads the variable with the first program, and refuses unknown flags.
     """
     flags = {"--xla_backend_optimization_level": "1"}
     if version("jax").startswith("0.10."):
@@ -104,18 +104,19 @@ def compile_quickly() -> None:
 
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
-"""Characters that move a terminal's cursor, colour it or turn its text about; not tab and newline.
+"""Characters that move a terminal's cursor, or change its colour or text direction; not tab and
+newline.
 """
 
 
 def without_controls(text: str) -> str:
-    """`text` without control characters, which names of files and of people's recordings may hold:
-    they are written as Python's escapes."""
+    """`text` with Python's escapes in the place of control characters, which may be in names of
+    files and recordings."""
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 class _Plain(Console):
-    """A console on which text is text, and no control of the terminal."""
+    """A console that prints text without markup and without terminal controls."""
 
     def __init__(self, **options: Any):
         super().__init__(highlight=False, markup=False, emoji=False, **options)
@@ -144,7 +145,7 @@ def columns(*names: str, **options: Any) -> Table:
 
 
 def pairs(rows: Iterable[tuple[str, str]]) -> Table:
-    """A table of names and what they stand for, without lines."""
+    """A table of names and values, without lines."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold")
@@ -154,8 +155,8 @@ def pairs(rows: Iterable[tuple[str, str]]) -> Table:
 
 
 def prepare_filter() -> None:
-    """JAX as the filter of many recordings takes it: with float64, while the network states its
-    float32, and a device for each core. It imports JAX, for which a mistake should not wait."""
+    """Set up JAX for the filter of many recordings: with float64 (the network states its float32),
+    and with a device for each core. Call it late, because it imports JAX."""
     import jax
 
     from gnio_jax import filtering
@@ -165,7 +166,8 @@ def prepare_filter() -> None:
 
 
 class Terminal:
-    """A `Reporter`: lines and one progress bar on stderr; on a file or a pipe the lines alone."""
+    """A `Reporter`: lines and one progress bar on stderr; only the lines if that is a file or a
+    pipe."""
 
     def __init__(self, bars: Any):
         self._bars = bars
@@ -187,7 +189,7 @@ class Terminal:
 @contextlib.contextmanager
 def terminal(shown: bool = True) -> Iterator[Terminal]:
     """A `Terminal` whose bar is removed at the end, or one without a bar."""
-    from rich import progress  # late: no help and no mistake needs it
+    from rich import progress  # late, because neither help nor errors need it
 
     console = _Plain(stderr=True)
     columns = (

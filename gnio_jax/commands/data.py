@@ -1,4 +1,4 @@
-"""`gnio data`: the datasets, whether they are sound, and how they come into one form."""
+"""`gnio data`: list, check and convert datasets."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gnio_jax.files import write_text
 
 @dataclass(frozen=True)
 class ListOptions:
-    """What `gnio data list` is asked for: nothing."""
+    """`gnio data list` has no options."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class _Dataset:
 class CheckOptions(_Dataset):
     plots: Folder | None = None
     """Folder for a picture of each recording: trajectory, speed, |accel|, gyro against reference,
-    and where it is not valid."""
+    and the times at which it is not valid."""
     json: NewFile | None = None
     """File for the figures."""
 
@@ -50,7 +50,7 @@ class ConvertOptions(_Dataset):
 
 
 def show_list(asked: ListOptions, _call: options.Call) -> None:
-    """Every dataset that is read: rate, splits, licence, where to get it, what is found here.
+    """List every known dataset: rate, splits, licence, source, and what is found here.
 
     A dataset is looked for in $GNIO_DATA/NAME, then in data/NAME. Its recordings are not read.
 
@@ -76,7 +76,7 @@ def show_list(asked: ListOptions, _call: options.Call) -> None:
 
 
 def _found_here(dataset: Any) -> str:
-    """Of a `Dataset`: its folder and the recordings of each split."""
+    """The folder of a `Dataset`, and the recordings of each split."""
     from gnio_jax.data.loading import find_recordings
 
     try:
@@ -93,7 +93,7 @@ def _found_here(dataset: Any) -> str:
 
 
 def check(asked: CheckOptions, _call: options.Call) -> None:
-    """Do IMU and reference of each recording describe one motion?
+    """Check whether IMU and reference of each recording describe the same motion.
 
     The mean of R·accel must be gravity, and the gyro must turn as the reference does. A walker's
     median speed must be at most 3 m/s, and the accelerations of the positions must agree with the
@@ -159,7 +159,7 @@ _FIGURES: dict[str, Callable[[Any], str]] = {
 
 
 def _json(row: Any) -> dict[str, Any]:
-    """A `loading.Checked` for a JSON file, which knows no array and no NaN."""
+    """A `loading.Checked` for a JSON file, which has no arrays and no NaN."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Iterable) and not isinstance(value, str):
@@ -172,10 +172,10 @@ def _json(row: Any) -> dict[str, Any]:
 
 
 def convert(asked: ConvertOptions, _call: options.Call) -> None:
-    """A dataset as the package's HDF5: a file for each recording, a list for each split.
+    """Convert a dataset to the package's HDF5: a file per recording, a list per split.
 
     Recordings that fail the self-check are left out. The folder is written whole or not at all: a
-    conversion that was stopped leaves nothing, and the same command begins anew.
+    conversion that was stopped leaves nothing, and the same command starts again.
 
     examples:
       {prog} oxiod ~/converted/oxiod

@@ -1,4 +1,4 @@
-"""`gnio doctor`: what is installed here, and what is found."""
+"""`gnio doctor`: installed packages, and datasets, weights and caches."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class DoctorOptions:
 
 
 def doctor(asked: DoctorOptions, _call: options.Call) -> None:
-    """What is installed here and what is found: packages, devices, datasets, weights, caches.
+    """Show what is installed and found here: packages, devices, datasets, weights, caches.
 
-    A missing part is not an error. Show the output where you ask for help. A dataset is looked for
-    in $GNIO_DATA/NAME, then in data/NAME.
+    A missing part is not an error. Include the output when you ask for help. A dataset is looked
+    for in $GNIO_DATA/NAME, then in data/NAME.
 
     examples:
       {prog}
@@ -56,11 +56,11 @@ def _devices() -> dict[str, str]:
     import jax
     import jax.numpy as jnp
 
-    jax.config.update("jax_enable_x64", True)  # as every command that filters
+    jax.config.update("jax_enable_x64", True)  # as in every command with the filter
     try:
         kinds = [f"{device.platform} {device.device_kind}" for device in jax.devices()]
         third = float(jnp.asarray(1.0, jnp.float64) / 3.0)
-    except RuntimeError as error:  # a platform that was asked for and is not there
+    except RuntimeError as error:  # a requested platform that does not exist
         return {"devices": f"none: {error}"}
     counted = ", ".join(f"{kinds.count(kind)} × {kind}" for kind in dict.fromkeys(kinds))
     found = {"devices": counted, "float64": "works" if third == 1 / 3 else "does not work"}
@@ -70,7 +70,7 @@ def _devices() -> dict[str, str]:
 
 
 def _places() -> dict[str, str]:
-    """Datasets whose folder is there, weights, runs, caches."""
+    """Datasets whose folder exists, weights, runs, caches."""
     import jax
 
     from gnio_jax import config as configuration

@@ -1,4 +1,5 @@
-"""`gnio evaluate`, `gnio score`: trajectories and errors, of a trained network or of anybody."""
+"""`gnio evaluate`, `gnio score`: trajectories and errors, of a trained network or of any
+program."""
 
 from __future__ import annotations
 
@@ -17,9 +18,9 @@ class ScoreOptions:
     reference: Annotated[Path, UNNAMED]
     """File in TUM format: t x y z qx qy qz qw."""
     estimate: Annotated[Path, UNNAMED]
-    """The same of the estimate, with stamps of the same clock."""
+    """The same for the estimate, with stamps of the same clock."""
     alignment: Literal["origin", "none", "yaw_position", "se3"] = "origin"
-    """What is matched before the errors are taken (docs/tables.md)."""
+    """Alignment before the errors are computed (docs/tables.md)."""
 
 
 def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
@@ -27,12 +28,12 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
 
     Results go to WORKDIR/eval/<dataset>_<split>_<estimator>/: metrics.json, metrics.csv,
     trajectories/ and references/ in TUM format (for evo), plots/, and report.html, a page with map,
-    curves and a time slider. Figures that stand there of another --data-root are kept: then the
-    folder's name ends with that of the data. Every table has two rows to compare with: never_moves,
-    the start pose throughout, and perfect_displacements, the same estimator fed with the
-    reference's displacements. A walk that has waypoints and no poses is compared with its
-    waypoints. A run that has learnt from several datasets is evaluated on one of them, which
-    --dataset names.
+    curves and a time slider. If that folder has figures of another --data-root, they are kept, and
+    the name of the new folder ends with that of the data folder. Every table has two rows to
+    compare with: never_moves, which stays at the start pose, and perfect_displacements, the same
+    estimator with the reference's displacements. A walk that has waypoints and no poses is compared
+    with its waypoints. A run that has learnt from several datasets is evaluated on one of them,
+    which --dataset names.
 
     examples:
       {prog}                       the newest run below runs/
@@ -61,7 +62,7 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
 
 
 def score(asked: ScoreOptions, _call: options.Call) -> None:
-    """Errors of any trajectory against a reference, as gnio evaluate prints them.
+    """Print errors of any trajectory against a reference, as gnio evaluate does.
 
     Each pose of the reference is compared with the nearest one of the estimate, if their stamps
     differ by at most 0.01 s.

@@ -1,4 +1,4 @@
-"""`gnio interop`: other people's checkpoints as runs."""
+"""`gnio interop`: runs from checkpoints of other programs."""
 
 from __future__ import annotations
 
@@ -16,21 +16,20 @@ class InteropOptions:
     checkpoint: Annotated[Path, UNNAMED]
     """File of the weights."""
     workdir: Annotated[Path, UNNAMED]
-    """Folder of the run, which is made."""
+    """Folder of the new run."""
     rate: Positive = 200.0
-    """Samples per second that the network was trained with, Hz (imu_freq in TLIO's
-    parameters.json)."""
+    """Rate at which the network was trained, Hz (imu_freq in TLIO's parameters.json)."""
     window_seconds: Positive = 1.0
     """Length of its window, s (past_time + window_time there)."""
     stride_seconds: Positive = 0.05
     """Distance between window starts, and between the filter's clones, s (TLIO's filter: 0.05; the
     paper: 0.1)."""
     dataset: str = "tlio"
-    """Dataset that gnio evaluate takes where none is named."""
+    """Dataset that gnio evaluate uses if none is named."""
 
 
 def interop(asked: InteropOptions, _call: options.Call) -> None:
-    """Make a run of weights that were trained with TLIO's code, for gnio evaluate.
+    """Make a run from weights that were trained with TLIO's code, for gnio evaluate.
 
     CHECKPOINT is a checkpoint of TLIO's training, its model_torchscript.pt, or an .npz of its state
     dict; files of PyTorch need pip install 'gnio-jax[torch]'. The run's filter cuts the network's

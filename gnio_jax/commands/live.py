@@ -1,4 +1,4 @@
-"""`gnio live`: the trajectory while the samples come."""
+"""`gnio live`: the trajectory while samples arrive."""
 
 from __future__ import annotations
 
@@ -25,20 +25,22 @@ Waiting = Annotated[
     float, Bound(lambda value: 0 <= value <= threading.TIMEOUT_MAX, "must be a time to wait, s")
 ]
 DRAWN_EVERY = 0.125
-"""s. A drawing looks at the whole path: one for each pose would fall behind a long stream."""
+"""Time between drawings, s. Each drawing processes the whole path, so one for each pose would be
+too slow for a long stream."""
 
 
 @dataclass(frozen=True)
 class LiveOptions:
     source: Annotated[str, UNNAMED] = "-"
-    """- for standard input; udp:PORT from this machine, udp:0.0.0.0:PORT from any; a recording."""
+    """- for standard input; udp:PORT from this machine, udp:0.0.0.0:PORT from any machine; or a
+    recording."""
     weights: str | None = None
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
     run below runs/."""
     out: NewFile | None = None
-    """File for the trajectory, in TUM format, when the stream has ended."""
+    """File for the trajectory in TUM format, which is written when the stream has ended."""
     rerun: str | None = None
-    """File for the viewer Rerun, NAME.rrd, or the word viewer to look at it now."""
+    """File for the viewer Rerun, NAME.rrd, or the word viewer to open it now."""
     gyro_unit: Literal["rad/s", "deg/s"] | None = None
     """Unit of the gyro. By default it is rad/s for a stream, and the recording's own for a
     recording."""
@@ -46,9 +48,9 @@ class LiveOptions:
     """Unit of the accelerometer. By default it is m/s2 for a stream, and the recording's own for a
     recording."""
     imu_rate: Positive | None = None
-    """Samples per second that will come, Hz; by default it is measured."""
+    """Rate of the samples, Hz; by default it is measured."""
     rest_seconds: float = 1.0
-    """How long the device lies still at the start, s."""
+    """Time for which the device lies still at the start, s."""
     speed: NonNegative = 1.0
     """For a recording: replay it this many times as fast as it was recorded; 0 means as fast as
     possible."""
@@ -57,23 +59,23 @@ class LiveOptions:
 
 
 def live(asked: LiveOptions, _call: options.Call) -> None:
-    """Follow an IMU live: where its carrier is now.
+    """Follow an IMU live, and show where its carrier is now.
 
     A stream has a line for each sample, time,gyro x,y,z,accel x,y,z, or a JSON object with time,
-    gyro and accel, in s, rad/s and m/s², +9.81 upwards at rest. Its rate is measured. When it says
-    ready, keep the device still for a second: tilt, velocity and the gyro's bias are taken from it.
-    In a terminal the path is drawn, elsewhere a line is printed each second. Ctrl-C or SIGTERM ends
-    it (status 130, 143); the trajectory is written all the same. If the units or columns of a
-    recording must be named, import it first (gnio data import).
+    gyro and accel, in s, rad/s and m/s², +9.81 upwards at rest. Its rate is measured. When the
+    command prints ready, keep the device still for a second: tilt, velocity and the gyro's bias are
+    taken from it. In a terminal the path is drawn; elsewhere a line is printed each second. Ctrl-C
+    or SIGTERM ends it (status 130, 143), and the trajectory is still written. If the units or
+    columns of a recording must be named, import it first (gnio data import).
 
     examples:
       phone_stream | {prog} --weights runs/mine      lines on standard input
       {prog} udp:0.0.0.0:5555                        the same lines as datagrams, from a phone
       {prog} walk.zip --speed 4                      a recording or bag, four times as fast
     """
-    inbox = _listen(asked) if asked.source.startswith(UDP) else None  # before all that takes time
+    inbox = _listen(asked) if asked.source.startswith(UDP) else None  # before slow imports
     console.compile_quickly()
-    import jax  # late: mistakes do not wait for it
+    import jax  # late, so that mistakes do not wait for it
     import numpy as np
 
     from gnio_jax.apps import live as following
@@ -84,7 +86,7 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     datagrams = following.Datagrams(inbox, asked.source) if inbox else None
     if asked.out:
-        check_writable(asked.out)  # or the trajectory would be lost at the end
+        check_writable(asked.out)  # otherwise the trajectory would be lost at the end
     if asked.rerun:
         rerun.check(asked.rerun)
     weights = packages.choose(asked.weights)
@@ -110,7 +112,7 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
     def begin(imu_rate: float) -> None:
         following.expect(tracker, found, run, imu_rate)
         own = run.config.data.rate
-        lower = f"; the network was trained at {own:g} Hz, and what lies between is guessed"
+        lower = f"; the network was trained at {own:g} Hz, so higher frequencies are missing"
         say(f"  samples come at {imu_rate:.4g} Hz{lower if imu_rate < 0.99 * own else ''}")
 
     if stream is None:
@@ -154,7 +156,7 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
 
 
 def _listen(asked: LiveOptions) -> socket.socket:
-    """The socket of udp:PORT, which this machine alone reaches, or of udp:ADDRESS:PORT."""
+    """The socket of udp:PORT, which only this machine reaches, or of udp:ADDRESS:PORT."""
     host, _, port = asked.source.removeprefix(UDP).rpartition(":")
     if not (port.isascii() and port.isdecimal() and 0 < int(port[:6]) < 2**16):
         raise InputError(asked.source, "names no port", "write udp:5555 or udp:0.0.0.0:5555")
@@ -169,7 +171,7 @@ def _listen(asked: LiveOptions) -> socket.socket:
 
 
 def _no_start(found: Any, name: str, rest_seconds: float) -> InputError:
-    """Why there is no pose."""
+    """The error if there is no pose."""
     if found.samples == 0:
         return InputError(
             name, "ended without a single sample", "check that samples are sent to it"
@@ -185,8 +187,8 @@ def _no_start(found: Any, name: str, rest_seconds: float) -> InputError:
 
 @contextlib.contextmanager
 def _shown() -> Iterator[Callable[[Any], None]]:
-    """What is called after each clone step: in a terminal it draws the path, elsewhere it prints a
-    line each second."""
+    """A function that is called after each clone step: in a terminal it draws the path, elsewhere
+    it prints a line each second."""
     from gnio_jax.apps import live as following
 
     output, shown = console.stdout(), -math.inf

@@ -1,5 +1,5 @@
-"""Options of the commands: the fields of a frozen dataclass, with the types, bounds and comments
-that settings have in a file.
+"""Options of the commands: the fields of a frozen dataclass, with types, bounds and comments like
+those of settings in a file.
 
 argparse splits the words of a command line and lays out the help; `config` reads the values.
 """
@@ -29,54 +29,55 @@ from gnio_jax.errors import InputError, did_you_mean
 
 HELP, HELP_VERBOSE = ("-h", "--help"), ("-H", "--help-verbose")
 MANY = 24
-"""Options of which the help lists names and defaults alone; --help-verbose explains them."""
+"""Number of options above which the help lists only names and defaults; --help-verbose explains
+them."""
 WIDTH = 100
-"""Columns of a help text, where the terminal is not narrower."""
+"""Largest number of columns of a help text."""
 
 
 class Group(NamedTuple):
     """A program whose first word is the name of a command."""
 
     help: str
-    """What it is, and behind the line "examples:" some."""
+    """A description, and examples after the line "examples:"."""
     commands: dict[str, str | Group]
     """Name -> "module:function" of this room. Only the module of a command that is called is
     imported, so a mistake does not wait for the others."""
 
 
 class Call(NamedTuple):
-    """How a command was called."""
+    """The call of a command."""
 
     prog: str
     """`gnio train`, or `python train.py`."""
     argv: Sequence[str]
-    """The words behind it."""
+    """The words after it."""
 
     def __str__(self) -> str:
         return shlex.join([*self.prog.split(), *self.argv])
 
 
 Command = Callable[[Any, Call], None]
-"""A function of `asked`, a dataclass of options, and of its call; its docstring is its help."""
+"""A function of `asked`, a dataclass of options, and of the call; its docstring is the help."""
 
 
 class Option(NamedTuple):
     """An option, or a word that is given without a name."""
 
     name: str
-    """`--optim.epochs`; of a word what stands for it, `FILE`."""
+    """`--optim.epochs`; for a word its placeholder, `FILE`."""
     path: tuple[str, ...]
-    """Its field behind that of the section around it: `("optim", "epochs")`."""
+    """Names of its section and its field: `("optim", "epochs")`."""
     section: type
     """The dataclass of its field."""
     hint: Any
     words: Words
     default: Any
-    """`dataclasses.MISSING` where it must be given."""
+    """`dataclasses.MISSING` if it must be given."""
 
     @property
     def negation(self) -> str:
-        """Of a flag that is on by default, the option that takes it away; else empty."""
+        """The option that switches off a flag that is on by default; empty for other options."""
         section, dot, field = self.name.removeprefix("--").rpartition(".")
         return f"--{section}{dot}no-{field}" if self.default is True else ""
 
@@ -110,7 +111,8 @@ def options_type(command: Command) -> type:
 
 
 def options_of(kind: type, path: tuple[str, ...] = (), prefix: str = "--") -> Iterator[Option]:
-    """Every option of a dataclass of options, those of its sections behind their names."""
+    """Every option of a dataclass of options, including those of its sections with their names as
+    prefix."""
     hints = typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint, word = hints[field.name], field.name.replace("_", "-")
@@ -132,14 +134,14 @@ def options_of(kind: type, path: tuple[str, ...] = (), prefix: str = "--") -> It
 
 
 def read(command: Command, call: Call, default: Any = None) -> Any:
-    """The options of a command from the words of its call; what they leave out is as in `default`,
-    or as the class has it.
+    """The options of a command from the words of its call.
 
-    `-` and `_` in names are the same. Raises `InputError` for an option that does not exist (naming
-    the closest that does), lacks its value, has one of the wrong type or beyond its bounds, or is
-    missing. `--help` prints the help and leaves with status 0: the command's docstring as far as
-    its line "examples:", the options with the comments of their fields, last the examples. Of many
-    options it lists names and defaults, and `--help-verbose` explains them.
+    Options that are not given are those of `default`, or the defaults of the class. `-` and `_` in
+    names are the same. Raises `InputError` for an option that does not exist (naming the closest
+    one), that has no value or one of the wrong type or beyond its bounds, or that is missing.
+    `--help` prints the help and exits with status 0: the command's docstring up to its line
+    "examples:", the options with the comments of their fields, and last the examples. If there are
+    many options, it lists names and defaults, and `--help-verbose` explains them.
     """
     kind = options_type(command)
     options = {".".join(option.path): option for option in options_of(kind)}
@@ -196,7 +198,7 @@ def _known(word: str, known: set[str]) -> str:
 def _parser(
     command: Command, prog: str, options: dict[str, Option], brief: bool
 ) -> argparse.ArgumentParser:
-    """What splits the words of these options and writes their help."""
+    """The parser that splits the words of these options and writes their help."""
     configs = ", ".join(configuration.names())
     text = (inspect.getdoc(command) or "").format(prog=prog, configs=configs)
     about, _, examples = text.partition("\nexamples:\n")
@@ -281,7 +283,7 @@ def comment(option: Option) -> str:
 
 @cache
 def _comments(module: str) -> dict[str, dict[str, str]]:
-    """Of each class of a module, the string below each field."""
+    """The string below each field, for each class of a module."""
     if module == "builtins":
         return {}
     tree = ast.parse(inspect.getsource(sys.modules[module]))
@@ -297,7 +299,7 @@ def _comments(module: str) -> dict[str, dict[str, str]]:
 
 
 def _overview(group: Group, prog: str) -> str:
-    """The help of a group: what each command does, in the first line of its own help."""
+    """The help of a group, with the first line of the help of each command."""
     about, _, examples = group.help.format(prog=prog).partition("\nexamples:\n")
     lines = []
     for name, command in group.commands.items():
@@ -315,7 +317,7 @@ def _overview(group: Group, prog: str) -> str:
 
 
 def completion(group: Group, prog: str) -> str:
-    """A script by which bash completes the commands and options of a program by name, and values as
+    """A script with which bash completes the commands and options of a program, and values as
     files."""
 
     def cases(group: Group, words: str) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""`gnio data import`, `gnio data export`: what other programs have written, and what they read."""
+"""`gnio data import`, `gnio data export`: files from and for other programs."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class ExportFile:
 
 
 def import_file(asked: ImportFile, _call: options.Call) -> None:
-    """A recording of a phone or robot as the package's HDF5.
+    """Import a recording of a phone or robot as the package's HDF5.
 
     The format is recognised by the content: a zip or folder of Sensor Logger or phyphox, a ROS bag
     or MCAP, a folder of EuRoC's layout, a CSV. Units are those of the format or of a header, or
-    they are detected; what was assumed is printed. A recording without a reference is evaluated
-    with --init static.
+    they are detected; assumptions are printed. A recording without a reference is evaluated with
+    --init static.
 
     examples:
       {prog} walk.zip --out recordings/walk.h5
@@ -87,7 +87,7 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
 
 
 def export_file(asked: ExportFile, _call: options.Call) -> None:
-    """A trajectory that gnio evaluate or gnio track left, in the format of another program.
+    """Write a trajectory of gnio evaluate or gnio track in the format of another program.
 
     examples:
       {prog} trajectories/walk.txt walk.mcap        Foxglove, ROS 2

@@ -1,4 +1,4 @@
-"""`gnio tables`: the paper's tables, made anew."""
+"""`gnio tables`: reproduces the paper's tables."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def tables(asked: TablesConfig, _call: options.Call) -> None:
 
     Every row is trained with the same recordings, batches, epochs, learning rate and augmentation,
     each network with its own published loss, clipping and weight decay. Runs are kept below
-    OUT/runs and shared by the tables. An interrupted command continues where it stopped when it is
-    called again. A finished one only writes its summary again. Results:
+    OUT/runs and shared by the tables. If an interrupted command is called again, it continues where
+    it stopped. A finished one only writes its summary again. Results:
     OUT/<table>_<split>_<estimator>.md, .csv and .png.
 
     examples:
@@ -34,6 +34,6 @@ def tables(asked: TablesConfig, _call: options.Call) -> None:
         with console.terminal() as terminal:
             text = make.make(asked, terminal, usable_cores())
     except runs.Interrupted as stopped:
-        print("stopped and saved; the same command goes on from here", file=sys.stderr)
+        print("stopped and saved; the same command continues from here", file=sys.stderr)
         sys.exit(128 + stopped.args[0])
     console.say(text)

@@ -1,4 +1,4 @@
-"""`gnio track`: the trajectory of one's own recording."""
+"""`gnio track`: the trajectory of your own recording."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from gnio_jax.files import file_stem
 
 ERRORS = ("ate", "ate_2d", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio")
 ERRORS += ("leg_ratio", "leg_error", "waypoint_rms")
-"""What is shown of the errors against a reference, as far as there are any; summary.json has them
-all."""
+"""Metrics against a reference that are shown if they exist; summary.json has all."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class TrackOptions:
 
 
 def track(asked: TrackOptions, call: options.Call) -> None:
-    """The trajectory of a recording: where its carrier walked, and how far it can be trusted.
+    """Compute the trajectory of a recording and its expected accuracy.
 
     FILE is anything that gnio data import reads, or an HDF5 file that it has written. Stand still
     for a second at the beginning. The folder OUT gets trajectory.txt (TUM format), track.png,
@@ -51,7 +50,7 @@ def track(asked: TrackOptions, call: options.Call) -> None:
           accel_z=az
     """
     console.compile_quickly()
-    import jax  # late: mistakes do not wait for it
+    import jax  # late, so that mistakes do not wait for it
 
     from gnio_jax.apps import packages
     from gnio_jax.apps import track as tracking
@@ -76,7 +75,8 @@ def track(asked: TrackOptions, call: options.Call) -> None:
 
 
 def _folder_name(name: str) -> str:
-    """The recording's name, or what can be one of a folder: a file may say anything of itself."""
+    """The recording's name, made fit for a folder, because the name inside a file may be
+    arbitrary."""
     plain = name == Path(name).name and name.isprintable() and name not in ("", "..")
     return name if plain else file_stem(name)
 

@@ -1,4 +1,4 @@
-"""`gnio train`: a network on a dataset."""
+"""`gnio train`: trains a network on a dataset."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ class TrainOptions(TrainConfig):
     resume: bool = False
     """Continue the run in the work folder from its latest checkpoint."""
     seeds: tuple[Seed, ...] = ()
-    """Seeds to train one after the other, in the place of --seed: WORKDIR_s0, WORKDIR_s1, ..."""
+    """Seeds to train one after the other, instead of --seed: WORKDIR_s0, WORKDIR_s1, ..."""
     devices: Count | None = None
-    """Devices of each process that share a batch; by default all of its GPUs, or the one that a CPU
-    is."""
+    """Number of devices of each process that share a batch; by default all of its GPUs, or the CPU
+    as one device."""
     distributed: Annotated[str | None, Words("HOST:PORT,PROCESSES,ID")] = None
-    """Where process 0 listens, how many processes there are, and the number of this one; Slurm,
-    Open MPI and Kubernetes need nothing."""
+    """Address of process 0, number of processes, and number of this process; not needed with Slurm,
+    Open MPI and Kubernetes."""
 
 
 def train(asked: TrainOptions, call: options.Call) -> None:
-    """Train a network and leave a run: config.yaml, checkpoints, logs in its work folder.
+    """Train a network and write a run: config.yaml, checkpoints and logs in its work folder.
 
-    Settings come from four places, and the later one wins: the paper's defaults; --config, or the
-    config.yaml of the run that is resumed; the options below; --set, which reaches every setting of
-    a YAML file. --resume continues from the latest checkpoint. The result is that of a run that
-    never stopped. --init-from starts from the weights of a run or package (gnio weights) of the
-    same network. With --through-filter.learn, network and filter are trained together, and the
-    filter begins with the settings of that run (gnio calibrate).
+    Settings come from four places, and later ones override earlier ones: the paper's defaults;
+    --config, or the config.yaml of the run that is resumed; the options below; --set, which reaches
+    every setting of a YAML file. --resume continues from the latest checkpoint. The result is that
+    of a run that was never stopped. --init-from starts from the weights of a run or package (gnio
+    weights) of the same network. With --through-filter.learn, network and filter are trained
+    together, and the filter begins with the settings of that run (gnio calibrate).
 
     These come with the package, for --config: {configs}.
 
@@ -89,14 +89,14 @@ def train(asked: TrainOptions, call: options.Call) -> None:
 
 
 def experiment(asked: TrainOptions, call: options.Call) -> TrainConfig:
-    """The experiment that the options come to.
+    """The experiment that the options describe.
 
-    Training through the filter begins with the filter of the run that it starts from, as far as
-    neither file nor --set says otherwise. What that filter considers belongs to its own covariance,
-    not to the one that will be trained.
+    Training through the filter begins with the filter of the run that it starts from, except for
+    settings of the file or of --set. The consider covariance of that filter is not used, because it
+    belongs to another covariance than the one that will be trained.
     """
     file = None if asked.config is None else configuration.find(asked.config)
-    content = None if file is None else configuration.read(file)  # once: it may be a pipe
+    content = None if file is None else configuration.read(file)  # once, as it may be a pipe
 
     def combined(base: TrainConfig) -> TrainConfig:
         found = base if content is None else configuration.parse(content, str(file), base)
@@ -118,7 +118,7 @@ def experiment(asked: TrainOptions, call: options.Call) -> TrainConfig:
     from gnio_jax import filtering
     from gnio_jax.apps import packages
 
-    filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
+    filtering.cores_as_devices()  # before the checkpoint's arrays fix the devices
     trained = packages.load_pretrained(config.init_from).config.filter
     begins = dataclasses.replace(trained, considered=ConsideredStd())
     return combined(TrainConfig(filter=begins))

@@ -1,4 +1,4 @@
-"""`gnio weights`, `gnio publish`, `gnio export`: trained networks that are passed on."""
+"""`gnio weights`, `gnio publish`, `gnio export`: trained networks for other people."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ class WeightsOptions:
     name: Annotated[str | None, UNNAMED] = None
     """Name, folder or zip of a package; by default all are listed."""
     out: Path | None = None
-    """Folder for a run of the package; by default its model card is shown."""
+    """Folder for a run made from the package; by default its model card is shown."""
 
 
 @dataclass(frozen=True)
 class PublishOptions:
     run: Annotated[Path, UNNAMED]
-    """Folder of the run; its best checkpoint is taken."""
+    """Folder of the run; its best checkpoint is used."""
     out: Path
     """Folder to write, or NAME.zip."""
     data: str
-    """What it was trained on: recordings, devices, people, carrying positions."""
+    """Training data: recordings, devices, people, carrying positions."""
     license: str
     """Terms under which the data may be used and the weights passed on."""
     fails: tuple[str, ...] = ()
@@ -46,10 +46,10 @@ class ExportOptions:
 
 
 def weights(asked: WeightsOptions, _call: options.Call) -> None:
-    """The trained networks that are found here: name, size, trained on, key metric.
+    """List the trained networks that are found here: name, size, training data, key metric.
 
     Packages are looked for in the installed gnio-jax and in the folders of $GNIO_WEIGHTS. gnio
-    track --weights NAME uses one; gnio publish makes one of a run. With --out a package becomes a
+    track --weights NAME uses one; gnio publish makes one from a run. With --out a package becomes a
     run, which gnio evaluate, gnio calibrate and gnio train --init-from take.
 
     examples:
@@ -90,10 +90,10 @@ def weights(asked: WeightsOptions, _call: options.Call) -> None:
 
 
 def publish(asked: PublishOptions, _call: options.Call) -> None:
-    """A package of a run: weights, settings, model card, checksums.
+    """Make a package from a run: weights, settings, model card, checksums.
 
-    It holds no data, and no code that is run when it is loaded. The figures of the run's
-    evaluations go with it, so evaluate before you publish.
+    It contains no data, and no code that runs when it is loaded. It includes the figures of the
+    run's evaluations, so evaluate before you publish.
 
     examples:
       {prog} runs/mine --out packages/mine --data "12 h of walks by 9 people, phone in hand" \\
@@ -115,12 +115,12 @@ def publish(asked: PublishOptions, _call: options.Call) -> None:
 
 
 def export(asked: ExportOptions, _call: options.Call) -> None:
-    """A run as ONNX models, for programs without Python: network, start, window, filter step.
+    """Export a run as ONNX models for programs without Python.
 
-    The filter is that of gnio track. The models are then driven over a minute of a simulated walk,
-    and their deviation from the package is printed. export.json says what each file takes and
-    gives; docs/deployment.md and examples/onnx show the loop around them. It needs pip install
-    'gnio-jax[onnx]'.
+    The models are network, start, window and filter step, and the filter is that of gnio track.
+    They are then run over a minute of a simulated walk, and their deviation from the package is
+    printed. export.json describes the inputs and outputs of each file; docs/deployment.md and
+    examples/onnx show the loop around them. It needs pip install 'gnio-jax[onnx]'.
 
     examples:
       {prog} runs/mine

@@ -42,8 +42,8 @@ walker stands. From twice that share on the speed is the square root of the boun
 SHORTEST_LEG, FASTEST_LEG = 1.0, 2.5
 """Limits of a leg, m and m/s; a leg beyond these is not a walk from tap to tap."""
 MOST_TURN, LEAST_STRAIGHT = np.radians(45.0), 0.5
-"""Largest angle between a leg and the phone's direction, rad, and smallest share of its reckoned
-length; beyond these the phone did not point ahead."""
+"""Largest angle between a leg and the phone's direction, rad, and smallest ratio of the straight to
+the reckoned length of a leg; beyond these the phone did not point ahead."""
 FEWEST_LEGS = 2
 """Smallest number of legs for which a walk's yaw is used."""
 MOST_RESIDUAL = 20.0

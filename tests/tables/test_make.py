@@ -133,7 +133,7 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
     monkeypatch.setattr(loop, "train_all", lambda *_, **__: [loop.Outcome(root, None, 15)])
     with pytest.raises(SystemExit) as left:
         gnio("tables", "gates", *arguments, "--out", str(root / "elsewhere"))
-    assert left.value.code == 128 + 15 and "goes on from here" in capsys.readouterr().err
+    assert left.value.code == 128 + 15 and "continues from here" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
