@@ -1,4 +1,4 @@
-"""Errors that a user can mend. Nothing here imports JAX, so that options are checked quickly."""
+"""Errors that a user can correct. Nothing here imports JAX, so that options are checked quickly."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable
 
 
 class InputError(ValueError):
-    """A mistake that a user can mend. Its text is one line: the place, the problem, the remedy.
+    """A mistake that a user can correct. Its text is one line: the place, the problem, the remedy.
 
-    The command lines print it on stderr and leave with exit status 2.
+    The command lines print it on stderr and exit with status 2.
     """
 
     def __init__(self, where: object, problem: str, remedy: str = ""):
@@ -26,13 +26,13 @@ def did_you_mean(
     word: str, known: Iterable[str], shown: Callable[[str], object] = str, cutoff: float = 0.6
 ) -> str:
     """The beginning of a remedy that names the closest of the known words, as `shown` writes it;
-    empty where none is close."""
+    empty if none is close."""
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=cutoff)
     return f"did you mean '{shown(close[0])}'? " if close else ""
 
 
 def require_packages(where: object, extra: str, *names: str) -> None:
-    """Raise `InputError` where a package of an extra of gnio-jax is not installed."""
+    """Raise `InputError` if a package of an extra of gnio-jax is not installed."""
     for name in names:
         try:
             importlib.import_module(name)

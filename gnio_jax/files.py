@@ -21,7 +21,7 @@ HDF5 = (".h5", ".hdf5")
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path`, which it replaces on success. On failure it is removed.
 
-    The folder is created when it is missing. A reader sees the old file or the whole new one.
+    The folder is created if it is missing. A reader sees the old file or the whole new one.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -36,7 +36,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
     except OSError as error:
-        error.filename = error.filename or str(path)  # a full disk comes without a name
+        error.filename = error.filename or str(path)  # the error of a full disk has no name
         raise
     finally:
         temporary.unlink(missing_ok=True)
@@ -47,7 +47,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    # As `replacing` names its file: a name can be too long.
+    # The name is that of `replacing`, because a name can be too long.
     _check_writable_folder(path.parent, f".{path.stem}.", path.suffix)
 
 
@@ -57,13 +57,13 @@ def check_writable_folder(folder: Path) -> None:
 
 
 def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
-    """Write a file for a moment. A missing folder is not created: its nearest parent is tried."""
+    """Write and remove a file. A missing folder is not created: its nearest parent is tried."""
     parents = (folder.absolute(), *folder.absolute().parents)
     there = next(parent for parent in parents if parent.exists())
     try:
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=there)
     except OSError as error:
-        error.filename = str(there)  # the user knows no temporary file
+        error.filename = str(there)  # the user does not know the temporary file
         raise
     os.close(handle)
     Path(name).unlink()
@@ -95,16 +95,17 @@ def fingerprint(content: bytes) -> dict[str, int | str]:
 
 
 def file_stem(name: str) -> str:
-    """The name of a sequence, made fit for the name of a file."""
+    """The name of a sequence, changed to a valid name of a file."""
     return re.sub(r"[^\w.+-]+", "_", name).lstrip(".") or "_"
 
 
 def shown_name(name: str, length: int = 60) -> str:
     """The name of a file or a recording as text of a picture.
 
-    A long name is cut to its end. A $ is escaped, since Matplotlib would read mathematics.
+    Of a long name only the end is kept. A $ is escaped, because Matplotlib would read it as
+    mathematics.
     """
-    text = name.encode("utf-8", "backslashreplace").decode()  # a name may hold any bytes
+    text = name.encode("utf-8", "backslashreplace").decode()  # a name may have any bytes
     text = text if len(text) <= length else f"…{text[1 - length :]}"
     return text.replace("$", r"\$")
 

@@ -4,8 +4,8 @@ Every function acts on one element (use `jax.vmap` for more) unless its shape sa
 the dtype of its input and has finite derivatives at its singular points.
 
 The functions that the filter calls most have a derivative of their own (`jax.custom_jvp`), in both
-modes. It keeps whole matrices for the backward pass, where JAX would keep every term of a sum that
-is spelt out, and it costs a few operations, where the transpose of such a sum costs dozens.
+modes. It keeps whole matrices for the backward pass, while JAX would keep every term of a sum that
+is written out. It costs a few operations, while the transpose of such a sum costs dozens.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _GENERATORS = np.array(
         [[0, -1, 0], [1, 0, 0], [0, 0, 0]],
     ]
 )
-"""hat of the unit vectors. Sums over three are spelt out in this file: XLA fuses them, while a
-reduction can end as a library call."""
+"""hat of the unit vectors. Sums over three are written out in this file, because XLA fuses them,
+while a reduction can become a library call."""
 
 
 @jax.custom_jvp
@@ -74,15 +74,15 @@ def _series(squared: Scalar) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def _small_or_safe(squared: Scalar) -> tuple[jax.Array, Scalar, Scalar]:
-    """Whether θ² is small; θ² where it is, else 0; θ² where it is not, else 1."""
+    """Whether θ² is small; θ² if it is small, else 0; θ² if it is not small, else 1."""
     small = squared < 1e-2
     return small, jnp.where(small, squared, 0.0), jnp.where(small, 1.0, squared)
 
 
 @_series.defjvp
 def _series_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    """With c_n = Σ_k (−θ²)^k / (2k + n)!, the three are c_1, c_2, c_3, and by θ² the derivative of
-    c_n is (n c_{n+2} − c_{n+1}) / 2."""
+    """With c_n = Σ_k (−θ²)^k / (2k + n)!, the three are c_1, c_2, c_3, and the derivative of c_n by
+    θ² is (n c_{n+2} − c_{n+1}) / 2."""
     (squared,), (d_squared,) = primals, tangents
     sine, versine, excess = _series(squared)
     small, x, safe = _small_or_safe(squared)
@@ -113,8 +113,8 @@ def exp(phi: Vector) -> Matrix:
 def matmul(
     a: Float[jax.Array, "p k *n"], b: Float[jax.Array, "k q *n"]
 ) -> Float[jax.Array, "p q *n"]:
-    """a b for small matrices stacked along trailing axes, as a sum that XLA fuses with its
-    neighbours, where a dot is a library call."""
+    """a b for small matrices stacked along trailing axes, as a sum that XLA fuses with neighbouring
+    operations; a dot would be a library call."""
     return functools.reduce(jnp.add, [a[:, None, k] * b[None, k] for k in range(b.shape[0])])
 
 
@@ -130,7 +130,7 @@ def _matmul_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
 
 
 _LONG = 16
-"""A sum over more terms than this is a dot."""
+"""Largest number of terms of a sum that is not computed as a dot."""
 
 
 def contract_left(
@@ -154,8 +154,8 @@ def _contract(a: jax.Array, b: jax.Array, longest: int) -> jax.Array:
 
 
 def orthonormalize(rotation: Matrix) -> Matrix:
-    """The rotation nearest to a matrix that is one but for rounding: one Newton step R (3 I −
-    RᵀR)/2 of the polar decomposition."""
+    """The rotation nearest to a matrix that is a rotation except for rounding: one Newton step R (3
+    I − RᵀR)/2 of the polar decomposition."""
     return matmul(
         rotation, 1.5 * np.eye(3, dtype=rotation.dtype) - 0.5 * matmul(rotation.T, rotation)
     )
@@ -165,8 +165,8 @@ def level(up: Vector) -> Matrix:
     """The rotation body → world of yaw 0 (see `yaw_direction`) that turns `up`, a direction in the
     body, to the world's z.
 
-    Where the body's x axis is vertical, and its yaw with it undefined, the body's y axis takes the
-    world's y.
+    If the body's x axis is vertical, its yaw is undefined, and the body's y axis gets the direction
+    of the world's y.
     """
     z = up / jnp.sqrt(jnp.sum(up * up))
     along = jnp.array([1.0, 0.0, 0.0], up.dtype) - z[0] * z  # the body's x axis, made horizontal
@@ -239,7 +239,7 @@ def direction(
 ) -> tuple[Float[jax.Array, "*k"], Float[jax.Array, "*k"]]:
     """(cos, sin) of the azimuth of horizontal vectors.
 
-    A vector of length 0 has none: (1, 0) is returned, with zero derivative.
+    For a vector of length 0, (1, 0) is returned, with zero derivative.
     """
     squared = x * x + y * y
     undefined = squared < 1e-14
@@ -254,9 +254,9 @@ def planar_alignment(
 ) -> tuple[Float[jax.Array, "2 2"], Float[jax.Array, "2"]]:
     """Rotation Q and shift t of the plane with the least Σ w ‖target − (Q source + t)‖².
 
-    With both points a, b taken from their weighted means, the angle of Q is that of the vector
-    (Σ w a · b, Σ w a × b). Where its length is 0, as for a single point or points in one place, Q
-    is the identity with zero derivative; the sum of `weight` must be positive.
+    With the points a, b relative to their weighted means, the angle of Q is that of the vector (Σ w
+    a · b, Σ w a × b). If its length is 0, as for a single point or points in one place, Q is the
+    identity with zero derivative. The sum of `weight` must be positive.
     """
     share = weight[:, None] / jnp.sum(weight)
     means = jnp.sum(share * source, axis=0), jnp.sum(share * target, axis=0)

@@ -1,8 +1,8 @@
 """Numerics of the host, in NumPy and float64: rotations, interpolation and masks.
 
-Loaders and metrics use these functions. Those that run on a device are in `geometry`, under the
-same names where they do the same. Quaternions are wxyz, body→world, as everywhere in the package.
-A stack of rotations is SciPy's `Rotation`.
+Loaders and metrics use these functions. Those that run on a device are in `geometry`; functions
+with the same name do the same. Quaternions are wxyz, body→world, as everywhere in the package. A
+stack of rotations is SciPy's `Rotation`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def filled_up(values: np.ndarray, rows: int, filling: float | None = None) -> np
 def convolved(
     values: Float[np.ndarray, "n *w"], kernel: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "m *w"]:
-    """Convolve columns of n rows with a kernel of k ≤ n, where they overlap wholly: m = n − k + 1.
+    """Convolve columns of n rows with a kernel of k ≤ n at complete overlap: m = n − k + 1.
 
     `scipy.signal.fftconvolve` gives the same, but its import takes longer than most calls here.
     """
@@ -81,7 +81,7 @@ def quaternion_product(left: np.ndarray, right: np.ndarray, axis: int = -1) -> n
 
 
 def matrix_from_quaternion(wxyz: Float[np.ndarray, "*k 4"]) -> Float[np.ndarray, "*k 3 3"]:
-    """Rotation matrices of quaternions, which are scaled to unit length; NaN where one is not
+    """Rotation matrices of quaternions, which are scaled to unit length; NaN if one is not
     finite."""
     flat = wxyz.reshape(-1, 4)
     finite = finite_rows(flat)
@@ -92,7 +92,7 @@ def matrix_from_quaternion(wxyz: Float[np.ndarray, "*k 4"]) -> Float[np.ndarray,
 
 
 def quaternion_from_matrix(rotation: Float[np.ndarray, "*k 3 3"]) -> Float[np.ndarray, "*k 4"]:
-    """Unit quaternions of rotation matrices; NaN where one is not finite."""
+    """Unit quaternions of rotation matrices; NaN if one is not finite."""
     flat = rotation.reshape(-1, 3, 3)
     finite = finite_rows(flat.reshape(-1, 9))
     wxyz = np.full((len(flat), 4), np.nan)
@@ -111,7 +111,7 @@ def hat(v: Float[np.ndarray, "*k 3"]) -> Float[np.ndarray, "*k 3 3"]:
 
 def yaw(rotation: Float[np.ndarray, "*k 3 3"]) -> Float[np.ndarray, "*k"]:
     """Yaw atan2(R[1, 0], R[0, 0]) of body→world matrices, rad in (−π, π]: the azimuth of the body's
-    x axis. 0 where that axis is vertical."""
+    x axis; 0 if that axis is vertical."""
     return np.asarray(np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]))
 
 
@@ -137,11 +137,11 @@ def about_z(angle: Float[np.ndarray, " n"]) -> Rotation:
 
 
 def levelling(up: Float[np.ndarray, "3"]) -> Rotation:
-    """The smallest rotation that turns `up` (any length) onto z; the half turn about x where `up`
+    """The smallest rotation that turns `up` (any length) onto z; the half turn about x if `up`
     points down (ours).
 
     It levels a tilted world in which the mean specific force is `up`, with the least change of yaw.
-    `geometry.level` is another rotation, which also sets the yaw to 0.
+    `geometry.level` is a different rotation, which also sets the yaw to 0.
     """
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
@@ -168,8 +168,9 @@ def cumulative_rotation(turns: Rotation) -> Rotation:
 def integrate_gyro(
     gyro: Float[np.ndarray, "n 3"], step: float | Float[np.ndarray, " m"]
 ) -> Rotation:
-    """Attitude relative to the first sample, n rotations: `gyro` (rad/s) at the stamps, each
-    interval turned by the mean of its ends. `step` is the interval, or the n − 1 of them, s."""
+    """Attitude relative to the first sample, n rotations, from `gyro` (rad/s) at the stamps. The
+    rate of each interval is the mean of its ends. `step` is the interval, or the n − 1 intervals,
+    s."""
     return cumulative_rotation(Rotation.from_rotvec(midpoints(gyro) * np.reshape(step, (-1, 1))))
 
 
@@ -190,7 +191,7 @@ def midpoints(values: Float[np.ndarray, "n *w"]) -> Float[np.ndarray, "m *w"]:
 def neighbours(
     stamps: Real[np.ndarray, " n"], time: Real[np.ndarray, " m"]
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Rows (left, right = left + 1) of the increasing stamps between which each time lies.
+    """Rows (left, right = left + 1) of the increasing stamps that enclose each time.
 
     Beyond the ends it is the outermost pair. A time that equals a stamp has that stamp on its
     right, except for the first stamp.
@@ -214,12 +215,12 @@ def slerp(
 
 
 def finite_rows(values: Float[np.ndarray, "n w"]) -> Bool[np.ndarray, " n"]:
-    """Which rows hold neither NaN nor infinity."""
+    """Which rows have neither NaN nor infinity."""
     return np.asarray(np.isfinite(values).all(axis=1))
 
 
 def robust_std(error: Float[np.ndarray, "*k"]) -> float:
-    """Standard deviation of the normal distribution whose median absolute value `error` has."""
+    """Standard deviation of the normal distribution with the median absolute value of `error`."""
     return 1.4826 * float(np.median(np.abs(error)))
 
 
@@ -229,7 +230,7 @@ def robust_std(error: Float[np.ndarray, "*k"]) -> float:
 def spans(mask: Bool[np.ndarray, " n"]) -> Int[np.ndarray, "k 2"]:
     """(start, stop) of each run of True, in order.
 
-    `for start, stop in spans(mask)` takes them one by one, `start, stop = spans(mask).T` together.
+    `for start, stop in spans(mask)` gives them one by one, `start, stop = spans(mask).T` together.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     return edges.reshape(-1, 2)
@@ -250,6 +251,7 @@ def within(mask: Bool[np.ndarray, " n"], reach: int) -> Bool[np.ndarray, " n"]:
 
 
 def last_true(mask: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Row of the latest True at or before each row. Before the first True it is the first's row."""
+    """Row of the latest True at or before each row. Before the first True it is the row of the
+    first True."""
     rows = np.arange(len(mask))
     return np.maximum.accumulate(np.where(mask, rows, int(np.argmax(mask))))

@@ -30,11 +30,12 @@ BATCH = "batch"
 def initialise(distributed: str | None = None, devices: int | None = None) -> None:
     """Connect this process with the others of its run, before JAX's first computation.
 
-    distributed: "HOST:PORT,PROCESSES,ID": where process 0 listens, how many processes there are,
-    and the number of this one. Slurm, Open MPI and Kubernetes provide this themselves; without
-    either, the process runs alone. devices: as how many devices a CPU appears. Raises `InputError`
-    for a text of another form, for less than one device, and where an address cannot be used. Where
-    the others do not come within five minutes, JAX ends the process with a report of its own.
+    distributed: "HOST:PORT,PROCESSES,ID": the address of process 0, the number of processes, and
+    the number of this one. Slurm, Open MPI and Kubernetes provide this themselves; without either,
+    the process runs alone. devices: the number of devices as which a CPU appears. Raises
+    `InputError` for a text of another form, for less than one device, and for an address that
+    cannot be used. If the others do not come within five minutes, JAX ends the process with a
+    report of its own.
     """
     if devices is not None:
         _check_devices(devices)
@@ -58,7 +59,7 @@ def initialise(distributed: str | None = None, devices: int | None = None) -> No
         return
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
-        # A process that has failed does not wait five minutes for the others.
+        # A process that has failed must not wait five minutes for the others.
         jax.distributed.initialize(*given or (), shutdown_timeout_seconds=15)
     except (RuntimeError, ValueError) as error:
         problem = f"the processes did not meet ({' '.join(str(error).split())[:150]})"
@@ -83,14 +84,14 @@ def cpu_devices(count: int) -> None:
 
 
 def is_first() -> bool:
-    """Whether this process writes the files and prints the lines."""
+    """Whether this process is the one that writes files and prints lines."""
     return jax.process_index() == 0
 
 
 def largest(*numbers: int) -> tuple[int, ...]:
     """The largest value over all processes, number by number. Numbers have 31 bits.
 
-    So all processes know what only one of them knew, such as its clock or a signal.
+    So all processes get a value that only one of them had, such as its clock or a signal.
     """
     if jax.process_count() == 1:
         return numbers
@@ -99,7 +100,7 @@ def largest(*numbers: int) -> tuple[int, ...]:
 
 
 def on_host(tree: Tree) -> Tree:
-    """The results of a compiled program over all devices, whole, in the memory of every process."""
+    """The whole results of a compiled program over all devices, in the memory of every process."""
     if jax.process_count() == 1:
         return jax.device_get(tree)
     return multihost_utils.process_allgather(tree, tiled=True)
@@ -174,7 +175,8 @@ def fresh_copy(leaf: Any) -> jax.Array:
     """A copy of an array that is bound to no device, so that any compiled step takes it.
 
     `jnp.array` compiles a program for each shape, so the many shapes of a network's state go
-    through the host. Parts of recordings do not, because JAX frees late what it shares with NumPy.
+    through the host. Parts of recordings do not, because JAX is late to free memory that it shares
+    with NumPy.
     """
     return jax.device_put(np.array(leaf)) if isinstance(leaf, jax.Array) else jax.numpy.array(leaf)
 

@@ -1,4 +1,4 @@
-"""How a long computation reports its progress: to a terminal, as plain lines, or not at all."""
+"""Reporting of the progress of a long computation: to a terminal, as plain lines, or not at all."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 Progress = Callable[[float], None]
-"""Called with the share of a stage that is done, from 0 to 1."""
+"""A function that is called with the finished share of a stage, from 0 to 1."""
 
 
 def silent(share: float) -> None:
-    """A `Progress` that tells nobody."""
+    """A `Progress` that shows nothing."""
 
 
 @runtime_checkable
 class Reporter(Protocol):
-    """It receives lines of text and the progress of the current stage."""
+    """A receiver of lines of text and of the progress of the current stage."""
 
     def line(self, text: str) -> None:
         """Show one line of text."""
@@ -28,7 +28,7 @@ class Reporter(Protocol):
 
 
 class Silence:
-    """It shows nothing: a library call, or a process of several that is not the first."""
+    """A reporter that shows nothing, for library calls, and for all processes but the first."""
 
     def line(self, text: str) -> None:
         pass
@@ -38,7 +38,7 @@ class Silence:
 
 
 class Lines:
-    """It prints plain lines on stderr and shows no progress bar."""
+    """A reporter that prints plain lines on stderr, without a progress bar."""
 
     def line(self, text: str) -> None:
         print(text, file=sys.stderr)

@@ -20,7 +20,7 @@ GRAVITY = 9.81
 """Magnitude of gravity in the world frame, m/s²."""
 
 FASTEST_TURN, STRONGEST_FORCE = 100.0, 1000.0
-"""rad/s and m/s²: beyond the range of any gyro or accelerometer one navigates with."""
+"""Limits beyond the range of any gyro (rad/s) and accelerometer (m/s²) for navigation."""
 
 STANDARD_G = 9.80665
 """The unit "G" in which phones report acceleration, m/s²."""
@@ -38,7 +38,7 @@ class Waypoints(NamedTuple):
 class Sequence(NamedTuple):
     """One recording: IMU and reference on one uniform clock. Host arrays in float64.
 
-    Where the reference is missing, its arrays hold NaN and `valid` is False.
+    Where the reference is missing, its arrays are NaN and `valid` is False.
     """
 
     name: str
@@ -62,14 +62,14 @@ class Sequence(NamedTuple):
     """False where `gyro` and `accel` were interpolated across a gap; None if nothing is missing.
     The filter takes no measurement there (`filtering.gaps`)."""
     waypoints: Waypoints | None = None
-    """Where somebody was at a few moments. A recording that has nothing else is valid nowhere, and
-    what needs poses refuses it."""
+    """Known positions at a few moments. A recording with no other reference is valid nowhere, and
+    functions that need poses refuse it."""
     attributes: dict[str, Any] = {}
     """The origin: dataset, session, group, subject, device, placement, truth, licence, ...
     (str, float or bool)."""
 
     def known_where(self, valid: Bool[np.ndarray, "n"]) -> Sequence:
-        """The sequence with its reference where `valid` says so, and none elsewhere."""
+        """The sequence with its reference where `valid` is True, and none elsewhere."""
         poses = (self.orientation, self.position, self.velocity)
         orientation, position, velocity = (np.where(valid[:, None], x, np.nan) for x in poses)
         return self._replace(
@@ -85,20 +85,20 @@ class Windows(NamedTuple):
     displacement: Float[Array, "b 3"]
     """Displacement over the window in the same frame, m."""
     steps: Float[Array, "b n 3"]
-    """Its parts, from each sample's stamp to the next, m. A network that predicts a velocity for
-    every sample is trained with them."""
+    """Parts of the displacement, from each sample's stamp to the next, m. They train a network that
+    predicts a velocity for every sample."""
 
 
 class Prediction(NamedTuple):
-    """What every network predicts for a window."""
+    """The prediction of a network for a window."""
 
     displacement: Float[Array, "*b 3"]
     """m, in the gravity-aligned zero-yaw frame of the window's start."""
     log_std: Float[Array, "*b 3"]
     """Logarithm of the standard deviation of `displacement`, per axis."""
     diagnostics: dict[str, Array] = {}
-    """Internal values to look at: `gate`, `scale` (b, 3), `attention` (b, heads, m), if the model
-    has them."""
+    """Internal values for inspection: `gate`, `scale` (b, 3), `attention` (b, heads, m), if the
+    model has them."""
 
     def covariance(self, least: float, dtype: Any) -> Float[jax.Array, "*b 3 3"]:
         """Covariance of `displacement`, m²: diag(exp 2u), u raised to `least`."""
@@ -108,8 +108,8 @@ class Prediction(NamedTuple):
     def normalised(
         self, error: Float[jax.Array, "*b d"], least: float | None
     ) -> tuple[Float[jax.Array, "*b d"], Float[jax.Array, "*b d"]]:
-        """(e/σ)² of errors of the first d axes, m, and log σ, with the same covariance: without its
-        constant −log N(e) is Σ ½ (e/σ)² + log σ."""
+        """(e/σ)² of errors of the first d axes, m, and log σ, with the same covariance. Without its
+        constant, −log N(e) is Σ ½ (e/σ)² + log σ."""
         log_std = jnp.asarray(self.log_std)[..., : error.shape[-1]]
         log_std = log_std if least is None else jnp.maximum(log_std, least)
         return error**2 * jnp.exp(-2 * log_std), log_std

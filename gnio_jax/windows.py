@@ -4,18 +4,18 @@ Sample j of the window that starts at sample i is (paper eq. 1)
 
     x_j = R_γ(R_i)ᵀ R_j [accel_j − b_a, gyro_j − b_g],
 
-where R_j is the attitude at sample j (body → world) and R_γ(R_i) the rotation about z by the yaw
-of R_i. So gravity stays on z, the start has zero yaw, and the channels are [accel, gyro]. The
-network answers with the displacement over the window in this same frame. It may see a context too:
+where R_j is the attitude at sample j (body → world) and R_γ(R_i) the rotation about z by the yaw of
+R_i. So gravity is on z, the start has zero yaw, and the channels are [accel, gyro]. The network
+predicts the displacement over the window, expressed in the same frame. It may also see a context:
 samples before i, in the same frame (ours).
 
 The attitudes R_j have two sources:
 
 - A recording has one for every sample. `align_recording` rotates it once, on the host, and
   `cut_windows` then cuts any number of windows on the device: training and batch inference.
-- The filter has one for the start alone and integrates the gyro from there: `cut_window`.
+- The filter has one only for the start and integrates the gyro from there: `cut_window`.
 
-`true_displacement` is the answer that the reference gives.
+`true_displacement` is the displacement of the reference.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Starts = Int[np.ndarray, "m"]
 
 
 class AlignedRecording(NamedTuple):
-    """A recording of which windows need one rotation each. float32, host or device arrays."""
+    """A recording from which each window needs one rotation. float32, host or device arrays."""
 
     imu: Float[Array, "t 6"]
     """[accel m/s², gyro rad/s]: in the world for `per_sample`, in the body for `single`."""
@@ -51,8 +51,8 @@ class AlignedRecording(NamedTuple):
 def window_starts(samples: int, length: int, stride: int) -> Starts:
     """First samples of all windows of `length` samples in a recording, `stride` samples apart.
 
-    The last window still has the sample after it, at whose stamp its displacement ends. With a
-    context, `length` counts it too, and a window is said to start with its context.
+    There is one sample after the last window, at whose stamp its displacement ends. With a context,
+    `length` includes it, and a window starts with its context.
     """
     return np.arange(0, samples - length, stride)
 
@@ -70,7 +70,7 @@ def align_recording(
     start: Starts,
     window_rotation: str,
 ) -> AlignedRecording:
-    """Do once for a recording what all its windows have in common, in float64.
+    """The computation that all windows of a recording have in common, in float64.
 
     accel m/s² and gyro rad/s, biases subtracted, in the body frame; attitude body → world; start
     the samples whose yaw the windows remove: their first ones after the context. With
@@ -89,7 +89,7 @@ def align_recording(
 
 
 def window_rows(start: Int[Array, "b"], length: int) -> Int[Array, "b n"]:
-    """Rows of a recording that each window of `length` samples takes. Jittable."""
+    """Rows of a recording in each window of `length` samples. Jittable."""
     return start[:, None] + jnp.arange(length, dtype=jnp.int32)[None, :]
 
 
@@ -120,25 +120,25 @@ def rotate_vectors(
 ) -> Float[jax.Array, "b n k 3"]:
     """Rotate the vectors of each window, in full float32 on every kind of device.
 
-    A sum over the columns of the rotation: ten times as fast on CPUs as a product of so small
-    matrices.
+    This is a sum over the columns of the rotation, which on CPUs is ten times as fast as a product
+    of such small matrices.
     """
     x, y, z = (rotation[:, None, None, :, j] * vectors[..., j, None] for j in range(3))
     return x + y + z
 
 
-# The filter: an attitude for the start alone
+# The filter: an attitude only for the start
 # ------------------------------------------------------------------------------------------------
 
 
 class WindowCut(NamedTuple):
-    """How the filter cuts its window between clone i and clone j from the stream.
+    """The filter's cut of its window between clone i and clone j from the stream.
 
     The window's first sample gets the attitude of clone i.
     """
 
     lead: int
-    """Samples by which the window begins before the first that drove the filter on from clone i."""
+    """Number of samples by which the window begins before the first one after clone i."""
     subtract_biases: bool
     """Whether the network sees the samples without the filter's biases."""
     propagating: slice
@@ -147,10 +147,10 @@ class WindowCut(NamedTuple):
 
 WINDOW_CUTS = {
     "per_sample": WindowCut(0, True, slice(-1)),
-    # No rate propagates: all samples keep the attitude of the first.
+    # No rate is integrated: all samples have the attitude of the first.
     "single": WindowCut(0, True, slice(0)),
-    # In TLIO's tracker a sample stamped t drives the filter from t − dt to t, and its own rate
-    # leads to its own attitude. The network sees the IMU with the filter's biases in it.
+    # In TLIO's tracker a sample with stamp t drives the filter from t − dt to t, and its own rate
+    # leads to its own attitude. The network sees the IMU without bias correction.
     "tlio": WindowCut(1, False, slice(1, None)),
 }
 """The values of `FilterConfig.window_rotation`."""
@@ -170,8 +170,8 @@ def cut_window(
     attitude `rotation`.
 
     gyro rad/s and accel m/s² in the body frame. Attitudes are propagated by R_{j+1} = R_j exp(φ_j),
-    φ the bias-corrected rate times dt, as `cut` says: forwards from there, and backwards through
-    the context. Jittable and differentiable.
+    where φ is the bias-corrected rate times dt, as `cut` specifies: forwards from there, and
+    backwards through the context. Jittable and differentiable.
     """
     rates = gyro - gyro_bias[None]
     if cut.subtract_biases:
@@ -182,13 +182,14 @@ def cut_window(
         before = geometry.cumulative_rotation(jnp.eye(3, dtype=first.dtype), turns[:, :, :context])
         first = first @ before[:, :, -1].T
     attitudes = geometry.cumulative_rotation(first, turns)
-    # Samples lie along the last axis: sums over three that XLA fuses, as everywhere in the filter.
+    # Samples are along the last axis, so that XLA fuses sums over three, as everywhere in the
+    # filter.
     attitudes = jnp.broadcast_to(attitudes, (3, 3, len(gyro)))
     signals = geometry.matmul(attitudes, jnp.stack([accel.T, gyro.T], axis=1))
     return signals.transpose(2, 1, 0).reshape(-1, 6)
 
 
-# The reference's answer
+# The reference's displacement
 # ------------------------------------------------------------------------------------------------
 
 

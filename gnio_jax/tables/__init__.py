@@ -1,2 +1,2 @@
-"""The paper's tables, made anew: networks side by side, what each part contributes, and what
-happens at rest."""
+"""Reproduction of the paper's tables: comparison of networks, contribution of each part, and errors
+at rest."""

@@ -1,5 +1,5 @@
-"""What networks predict for single windows, sorted by what the walker did: errors, gate and
-attention at rest and in motion."""
+"""Predictions of networks for single windows by the walker's activity: errors, gate and attention
+at rest and in motion."""
 
 from __future__ import annotations
 
@@ -28,25 +28,26 @@ class PredictedWindows(NamedTuple):
     truth: Float[np.ndarray, "m 3"]
     """Displacement, m."""
     displacement: Float[np.ndarray, "m 3"]
-    """The network's, m."""
+    """The network's displacement, m."""
     std: Float[np.ndarray, "m 3"]
     """Standard deviation of one window, with the factors that `gnio calibrate` fitted to windows,
-    m. The filter's `measurement_scale` is not in it: it is of many windows that overlap."""
+    m. The filter's `measurement_scale` is not included, because it is for many overlapping
+    windows."""
     diagnostics: dict[str, np.ndarray]
-    """`gate`, `scale` (m, 3) and `attention` (m, heads, prototypes), where the network has them."""
+    """`gate`, `scale` (m, 3) and `attention` (m, heads, prototypes), if the network has them."""
     activity: Int[np.ndarray, "m"]
     """Number in ACTIVITIES."""
 
 
 def predict_split(workdir: Path, split: str) -> PredictedWindows:
-    """What the best checkpoint of a run predicts for the windows of a split of its dataset."""
+    """The predictions of the best checkpoint of a run for the windows of a split of its dataset."""
     run = checkpoint.load_run(workdir)
     config = run.config.data
     sequences = data.load(run.config.datasets[0], run.config.data_root, split)
     recordings, _ = evaluation.prepare(sequences, config, orientation="reference")
     network = Network.of(run.model, run.variables)
     predicted = evaluation.infer(network, recordings, config, diagnostics=DIAGNOSTICS)
-    # A row for each stride: those before the end of the first window have neither.
+    # There is a row for each stride; rows before the end of the first window have neither.
     given = [evaluation.given_displacements(each, 0.0) for each in recordings]
     truth, displacement = (
         np.concatenate([each.value for each in rows]) for rows in (given, predicted)
@@ -66,7 +67,7 @@ def predict_split(workdir: Path, split: str) -> PredictedWindows:
 
 
 def activity(displacement: Float[np.ndarray, "m 3"], seconds: float) -> Int[np.ndarray, "m"]:
-    """What the walker does, by the reference's displacement of a window, m. Ours: the limits."""
+    """The walker's activity, from the reference's displacement of a window, m. Ours: the limits."""
     speed = np.linalg.norm(displacement[:, HORIZONTAL], axis=1) / seconds
     climb = np.abs(displacement[:, 2]) / seconds
     conditions = {
@@ -80,9 +81,9 @@ def activity(displacement: Float[np.ndarray, "m 3"], seconds: float) -> Int[np.n
 
 
 def by_activity(windows: PredictedWindows) -> dict[str, dict[str, float]]:
-    """For each activity that occurs: windows, rms error of the displacement, m, rms of the error
-    over its standard deviation, median length of the displacement, m, and the median |gate| and
-    scale of the horizontal axes, where there is a gate."""
+    """For each activity that occurs: number of windows, rms error of the displacement, m, rms of
+    the error over its standard deviation, median length of the displacement, m, and the median
+    |gate| and scale of the horizontal axes, if there is a gate."""
     figures = {}
     for number, name in enumerate(ACTIVITIES):
         rows = windows.activity == number
@@ -130,11 +131,11 @@ def render(by_method: dict[str, dict[str, dict[str, float]]]) -> str:
 
 
 def entropy(attention: Float[np.ndarray, "m h p"]) -> tuple[float, float]:
-    """How widely the attention spreads over the prototypes: the entropy of a window, as a mean over
+    """The spread of the attention over the prototypes: the entropy of a window, as a mean over
     windows and heads, and that of the mean over the windows, as shares of log p.
 
-    Both near 1: every window sees all prototypes alike. The first small, the second large: windows
-    choose, and choose differently.
+    If both are near 1, every window attends equally to all prototypes. If the first is small and
+    the second large, windows attend to different prototypes.
     """
     largest = np.log(attention.shape[-1])
     of_window, of_mean = (
@@ -147,8 +148,8 @@ def entropy(attention: Float[np.ndarray, "m h p"]) -> tuple[float, float]:
 def attention_by_activity(
     windows: PredictedWindows,
 ) -> tuple[list[str], Float[np.ndarray, "a p"]]:
-    """Activities that occur in at least five windows, and for each how much more attention each
-    prototype gets than on average (1: as on average)."""
+    """Activities that occur in at least five windows, and for each the ratio of the attention of
+    each prototype to its average (1: as on average)."""
     attention = windows.diagnostics["attention"].mean(1)
     counts = np.bincount(windows.activity, minlength=len(ACTIVITIES))
     common = np.flatnonzero(counts >= 5)
@@ -157,9 +158,9 @@ def attention_by_activity(
 
 
 def information(windows: PredictedWindows, draws: int = 20) -> tuple[float, float]:
-    """Mutual information, bits, of the activity and the prototype most attended to (over the mean
-    of the heads), and the same with the activities shuffled, which is what chance alone makes of so
-    few windows."""
+    """Mutual information, bits, of the activity and the prototype with the most attention (over the
+    mean of the heads), and the same with shuffled activities, which is the value by chance for this
+    number of windows."""
     strongest = windows.diagnostics["attention"].mean(1).argmax(1)
     rng = np.random.default_rng(0)
     shuffled = [

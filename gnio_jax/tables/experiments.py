@@ -1,4 +1,4 @@
-"""What the paper's tables vary, as configurations, and the figures it prints for them."""
+"""The rows of the paper's tables as configurations, and the published figures."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ REGULARISATION: dict[str, dict[str, float]] = {
     "tlio": {"clip_norm": 0.1},
     "ctin": {"weight_decay": 1e-6},
 }
-"""Of the published recipes, what is neither loss nor budget. TLIO needs its clip: where its
-uncertainty begins to learn, the gradients of the likelihood are so large that they undo what its
+"""Settings of the published recipes besides loss and budget. TLIO needs its clip: when its
+uncertainty begins to learn, the gradients of the likelihood are so large that they destroy what its
 displacements have learnt."""
 
 PUBLISHED = {
@@ -46,17 +46,17 @@ PUBLISHED_GATES = {
     ("tanh", "pos_elu"): 1.85,
     ("tanh", "softplus"): 1.84,
 }
-"""The same of gate and scale, RMSE on TLIO's set, m."""
+"""The same for gate and scale, RMSE on TLIO's set, m."""
 
 PUBLISHED_BANKS = {0: None, 16: 2.07, 32: None, 64: 1.98, 128: 2.07}
-"""The same of prototypes in the bank."""
+"""The same for prototypes in the bank."""
 
 
 class Row(NamedTuple):
     """One row of a table before it is run."""
 
     name: str
-    """Also of its folder, shared by the tables it is in."""
+    """Name of the row and of its folder, which the tables with this row share."""
     label: str
     config: TrainConfig
     published: float | None = None
@@ -64,11 +64,11 @@ class Row(NamedTuple):
 
 
 class Experiment(NamedTuple):
-    """A table of the paper: rows, the first of which is what the others are compared with."""
+    """A table of the paper: its rows, of which the others are compared with the first."""
 
     title: str
     source: str
-    """Where the published figures are and what they were measured on."""
+    """Place of the published figures, and their data."""
     rows: list[Row]
 
 
@@ -105,9 +105,9 @@ def loss(network: str, base: TrainConfig) -> LossConfig:
 
 
 def held_epochs(optim: OptimConfig) -> float:
-    """Epochs in which TLIO's uncertainty does not learn: the published ones. Ours: a shorter run
-    holds it for the number of steps that those take with the published batches, and at most for
-    half of itself."""
+    """Epochs in which TLIO's uncertainty does not learn: the published number. Ours: a shorter run
+    holds it fixed for the same number of steps as the published epochs and batches, but at most for
+    half of the run."""
     if optim.epochs >= PAPER_EPOCHS:
         return TLIO_HELD
     return min(TLIO_HELD * optim.batch_size / TLIO_BATCH, optim.epochs / 2)
@@ -123,7 +123,7 @@ def variant(base: TrainConfig, **options: Any) -> TrainConfig:
 
 
 def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHODS) -> Experiment:
-    """The networks side by side; compared with the first."""
+    """All networks; the others are compared with the first."""
     published = PUBLISHED.get((base.datasets[0], split), {})
     source = "no published figure for this split"
     if published:
@@ -134,7 +134,7 @@ def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHOD
 
 def components(base: TrainConfig) -> Experiment:
     """Bank and gated head, each alone and both. The paper's baseline is TLIO's own network; the
-    plain linear head on GNIO's pooled features is printed beside it."""
+    plain linear head on GNIO's pooled features is a further row."""
     plain = variant(base, bank_size=0, head="linear")
     bank, gated = variant(base, head="linear"), variant(base, bank_size=0)
     return Experiment(

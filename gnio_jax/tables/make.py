@@ -32,7 +32,7 @@ METRICS = (
     *("ate", "ate_2d", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
     *("stationary_drift", "leg_ratio", "waypoint_rms", "nis", "nees"),
 )
-"""Of every table, as far as rows have them. The first is what rows are compared by."""
+"""Metrics of every table, if rows have them. Rows are compared by the first."""
 
 ABLATIONS = {
     "components": experiments.components,
@@ -42,7 +42,7 @@ ABLATIONS = {
 
 
 def make(options: TablesConfig, reporter: Reporter | None = None, workers: int = 1) -> str:
-    """Make a table: train and evaluate what is missing, write the files, return what to show.
+    """Make a table: train and evaluate missing runs, write the files, and return the text to show.
 
     `workers` processes read recordings that are slow to read. Raises `InputError` for options that
     make no sense, and `runs.Interrupted` after a signal.
@@ -71,7 +71,8 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
 
 
 def base_config(options: TablesConfig) -> TrainConfig:
-    """The experiment that the rows vary. Raises `InputError` for one that cannot be varied."""
+    """The experiment from which the rows are derived. Raises `InputError` if that is not
+    possible."""
     base = configuration.load(options.base)
     base = dataclasses.replace(
         base,
@@ -102,7 +103,7 @@ def _words(text: str) -> tuple[str, ...]:
 
 
 def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> str:
-    """What a reader must know of the figures."""
+    """Notes that explain the figures."""
     calibrated = f", gnio calibrate on {base.data.val_split}" if options.calibrate else ""
     return (
         f"{base.datasets[0]} {options.split}, {options.estimator}; every row: "
@@ -115,7 +116,7 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> s
 
 
 def hardware() -> str:
-    """What it runs on."""
+    """The hardware, as text."""
     device, cores = jax.devices()[0], usable_cores()
     if device.platform != "cpu":
         return device.device_kind
@@ -158,7 +159,7 @@ def scale_gradients(run: Path) -> list[float]:
 
 
 def _entropies(result: Result, split: str) -> Float[np.ndarray, "seeds 2"]:
-    """Entropies of the attention of each run; none of a network without a bank."""
+    """Entropies of the attention of each run; none for a network without a bank."""
     runs = result.runs if result.row.config.model.bank_size != 0 else []
     windows = [activities.predict_split(run, split) for run in runs]
     found = [activities.entropy(each.diagnostics["attention"]) for each in windows]
@@ -166,7 +167,7 @@ def _entropies(result: Result, split: str) -> Float[np.ndarray, "seeds 2"]:
 
 
 def _over_seeds(name: str, rows: list[Float[np.ndarray, "_"]]) -> dict[str, list[Cell]]:
-    """A figure that belongs to this table alone, of each row with its seeds."""
+    """A figure of this table alone, for each row with its seeds."""
     means = [float(np.mean(own)) if len(own) else None for own in rows]
     found = [
         Summary(mean, own.tolist(), None, None, 0, 0, 0, len(own))
@@ -176,7 +177,7 @@ def _over_seeds(name: str, rows: list[Float[np.ndarray, "_"]]) -> dict[str, list
 
 
 def figures_of(results: list[Result]) -> dict[str, list[Cell]]:
-    """Metric → the figures of every row, compared with the first, where a row has some."""
+    """Metric → the figures of every row, compared with the first, if a row has any."""
     found = tabulate.cells([result.reports for result in results], METRICS)
     return {
         metric: own
@@ -186,7 +187,7 @@ def figures_of(results: list[Result]) -> dict[str, list[Cell]]:
 
 
 def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
-    """The table as Markdown, then what its marks mean."""
+    """The table as Markdown, followed by the meaning of its marks."""
     columns = {name: tabulate.column(name) for name in figures}
     header = ["", *(column.title for column in columns.values()), "median ATE (m)", "gain"]
     header += ["difference of ATE, m (95 %)", "published (m)", "its gain"]
@@ -204,8 +205,8 @@ def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
 
 
 def arrow(gain: float | None) -> str:
-    """As the paper prints gains: ↓ and the share by which the error is smaller, ↑ by which it is
-    larger."""
+    """A gain as the paper prints it: ↓ and the reduction of the error in %, or ↑ and its
+    increase."""
     if gain is None:
         return "–"
     if round(gain, 1) == 0:
@@ -213,7 +214,7 @@ def arrow(gain: float | None) -> str:
     return f"{'↓' if gain > 0 else '↑'} {abs(gain):.1f} %"
 
 
-# --- all methods over the reference, and windows by what the walker did
+# --- all methods over the reference, and windows by the walker's activity
 
 
 def make_trajectories(path: Path, options: TablesConfig, results: list[Result]) -> str:
@@ -240,7 +241,8 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[Result]) 
 def make_standing(
     path: Path, options: TablesConfig, experiment: Experiment, results: list[Result], remarks: str
 ) -> str:
-    """Errors at rest and in slow walking, gate and attention: where the gate's claim stands."""
+    """Errors at rest and in slow walking, gate and attention, which test the claim about the
+    gate."""
     from gnio_jax.tables import plots  # Matplotlib takes a second to import
 
     lines, by_method = [], {}
@@ -277,15 +279,15 @@ PAPERS_COST = {
 }
 """Parameters in millions and the column "GFLOPs", as the paper prints them."""
 SAMPLES, BATCHES, SECONDS = 200, (1, 128), 3.0
-"""Of a window; windows of a call; for which a call is timed."""
+"""Samples of a window, windows per call, and time for which a call is measured, s."""
 
 
 class Complexity(NamedTuple):
-    """What one network costs."""
+    """The computational cost of one network."""
 
     parameters: int
     gflops: float
-    """Floating-point operations of one window in the compiled program, 10⁹; NaN where the compiler
+    """Floating-point operations of one window in the compiled program, 10⁹; NaN if the compiler
     does not count them."""
     latency: list[float]
     """Time per window of each size of a batch, ms, median."""

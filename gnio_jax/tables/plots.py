@@ -1,4 +1,4 @@
-"""Pictures of the tables. Import it only where one is drawn (Matplotlib)."""
+"""Pictures of the tables. Import this module only where one is drawn (Matplotlib)."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ METHODS = {
 
 
 def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Figure:
-    """`ate` of each row: every seed a dot, their mean a bar, sequences behind it; beside it what
-    the paper printed. What diverged has no dot: the row's label has its number."""
+    """`ate` of each row: a dot for every seed, a bar for their mean, and sequences behind it;
+    beside it the paper's figure. An estimate that diverged has no dot; the row's label has their
+    number."""
     published = [row.published for row in experiment.rows]
     beside = any(value is not None for value in published)
     size = (9.0 if beside else 6.4, 1.4 + 0.45 * len(results))
@@ -71,7 +72,7 @@ def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Fi
 
 def gradients(results: list[Result], norms: Sequence[Float[np.ndarray, "seeds epochs"]]) -> Figure:
     """Norm of the gradient of the scale's layer over training, one line per row: the mean over
-    seeds, their range shaded."""
+    seeds, with their range shaded."""
     figure = Figure(figsize=(6.8, 4.2), layout="constrained")
     axes = figure.add_subplot()
     for result, own, colour in zip(results, norms, colours.COLOURS, strict=False):
@@ -149,8 +150,8 @@ def gate(windows: PredictedWindows) -> Figure:
 
 
 def attention(names: list[str], lifts: Float[np.ndarray, "a p"], words: str) -> Figure:
-    """How much more attention each prototype gets in each activity than on average; prototypes in
-    the order of the activity they favour."""
+    """Ratio of the attention of each prototype in each activity to its average; prototypes are
+    sorted by the activity that they favour."""
     order = np.lexsort((-lifts.max(0), lifts.argmax(0)))
     figure = Figure(figsize=(9.0, 1.6 + 0.4 * len(names)), layout="constrained")
     axes = figure.add_subplot()
@@ -165,7 +166,7 @@ def attention(names: list[str], lifts: Float[np.ndarray, "a p"], words: str) -> 
 
 
 def standing(by_method: dict[str, dict[str, dict[str, float]]]) -> Figure:
-    """Error of a window's displacement by what the walker did, one line of dots per method."""
+    """Error of a window's displacement by the walker's activity, one line of dots per method."""
     names = [name for name in ACTIVITIES if any(name in figures for figures in by_method.values())]
     figure = Figure(figsize=(7.2, 4.0), layout="constrained")
     axes = figure.add_subplot()
@@ -174,7 +175,7 @@ def standing(by_method: dict[str, dict[str, dict[str, float]]]) -> Figure:
         values = [figures.get(name, {}).get("error", np.nan) for name in names]
         axes.semilogy(places, values, "o", color=METHODS.get(method, colours.GREY), label=method)
     axes.set_xticks(range(len(names)), names)
-    axes.set(ylabel="rms error of a window's displacement (m)", title="By what the walker did")
+    axes.set(ylabel="rms error of a window's displacement (m)", title="By activity")
     axes.legend(fontsize=8, frameon=False)
     finish(axes)
     return figure

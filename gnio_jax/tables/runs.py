@@ -1,5 +1,5 @@
 """The runs of a table's row: its seeds are trained, then calibrated and evaluated one after the
-other. Nothing is done twice, and what was interrupted goes on."""
+other. Nothing is done twice, and interrupted work continues."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class Result(NamedTuple):
     row: Row
     reports: list[Report]
     runs: list[Path]
-    """Their work folders."""
+    """Work folders of the seeds."""
     folders: list[Path]
-    """Of their evaluations."""
+    """Reports of their evaluations."""
 
     @property
     def seeds(self) -> list[Scores]:
@@ -42,13 +42,13 @@ class Result(NamedTuple):
 
 
 def run_row(row: Row, options: TablesConfig, reporter: Reporter, workers: int = 1) -> Result:
-    """Train, calibrate if that is asked for, and evaluate a row with seeds 0 … seeds−1 below
+    """Train, calibrate if the options ask for it, and evaluate a row with seeds 0 … seeds−1 below
     OUT/runs.
 
-    A run that is finished is not trained again, one that was interrupted goes on, a calibration and
-    an evaluation that are there are read. Raises `InputError` if a folder holds a run with other
-    settings or of other recordings, and `Interrupted` after a signal. `workers` processes read
-    recordings that are slow to read.
+    A finished run is not trained again, an interrupted one continues, and an existing calibration
+    or evaluation is read. Raises `InputError` if a folder holds a run with other settings or of
+    other recordings, and `Interrupted` after a signal. `workers` processes read recordings that are
+    slow to read.
     """
     workdir = Path(options.out) / "runs" / row.name
     config, seeds = dataclasses.replace(row.config, workdir=str(workdir)), range(options.seeds)
@@ -64,8 +64,8 @@ def run_row(row: Row, options: TablesConfig, reporter: Reporter, workers: int = 
 
 
 def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers: int = 1) -> None:
-    """Train the runs of `config` with these seeds to their end, as far as they are not there
-    yet."""
+    """Train the runs of `config` with these seeds to their end, unless they are finished
+    already."""
     states: dict[str, list[int]] = {"begun": [], "new": [], "finished": []}
     for each in configuration.with_seeds(config, seeds):
         states[_state(each)].append(each.seed)
@@ -81,8 +81,8 @@ def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers
 
 
 def _state(config: TrainConfig) -> str:
-    """How far the run of `config` is: new, begun or finished. Raises `InputError` if its folder
-    holds one with other settings or of other recordings."""
+    """State of the run of `config`: new, begun or finished. Raises `InputError` if its folder has a
+    run with other settings or of other recordings."""
     workdir = Path(config.workdir or "")
     file = workdir / "config.yaml"
     if not file.exists():
@@ -92,7 +92,7 @@ def _state(config: TrainConfig) -> str:
     if data.get(dataset).needs_root:
         theirs = Path(configuration.load(file).data_root or data.find_root(dataset))
         ours = data.find_root(dataset, config.data_root)
-        if theirs.is_dir() and theirs.resolve() != ours.resolve():  # else the folder has moved
+        if theirs.is_dir() and theirs.resolve() != ours.resolve():  # otherwise the folder has moved
             problem = f"was trained on the recordings of {theirs}, not of {ours}"
             raise InputError(file, problem, "give another --out")
     log = workdir / "metrics.jsonl"
@@ -101,8 +101,8 @@ def _state(config: TrainConfig) -> str:
 
 
 def calibrated(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
-    """The run's best checkpoint with its filter fitted to its validation split: the calibrated run
-    that is there if it is of that checkpoint, else a new one."""
+    """The run's best checkpoint with its filter fitted to its validation split: the existing
+    calibrated run if it is of that checkpoint, else a new one."""
 
     def best(run: Path) -> list[str]:
         return sorted(step.name for step in (run / "checkpoints" / "best").glob("[0-9]*"))
