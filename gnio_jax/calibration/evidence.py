@@ -56,7 +56,7 @@ def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
     if not config.out_of_fold:
         if config.split not in (None, own, split):
             problem = "is neither the validation nor the training split of the run"
-            remedy = f"give {own} or {split}: what is tested must not have been fitted"
+            remedy = f"give {own} or {split}: the filter must not be fitted to test walks"
             raise InputError(f"--split {config.split}", problem, remedy)
         return config.split or own, [Source(run, None)]
     if config.split:

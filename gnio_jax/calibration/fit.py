@@ -238,7 +238,7 @@ def innovation_objective(
 ) -> tuple[Array, Array]:
     """The objective to be minimised, as a function of the free parameters `names` of the settings,
     and its part that is the −log-likelihood of all innovations divided by their number. The rest is
-    the prior about `start`, which holds parameters that the walks do not determine."""
+    the prior about `start`, which keeps parameters in place that the walks do not determine."""
     chex.assert_equal_shape([free, start])
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> Array:

@@ -57,7 +57,7 @@ class Poses(NamedTuple):
     velocity: Float[np.ndarray, "n 3"] | None = None
     """Velocity of the tracked point, m/s; None: the tracker gives none."""
     lever: Float[np.ndarray, "3"] = np.zeros(3)
-    """From the tracked point to the IMU, in the IMU's body, m."""
+    """Vector from the tracked point to the IMU, in the IMU's body, m."""
     noisy: bool = False
     """True for a raw tracker with flips, single jumps, and noise that differences would amplify."""
     ends_pieces: bool = False

@@ -159,7 +159,7 @@ def score_files(reference: Path, estimate: Path, alignment: Alignment = "origin"
 
 
 def _check(config: EvaluateConfig) -> None:
-    """Raise `InputError` for options that are impossible for every run."""
+    """Raise `InputError` for options that are impossible for any run."""
     if config.batch_size < 1:
         raise InputError("--batch-size", f"must be at least 1, found {config.batch_size}")
     if not _infers(config) and config.orientation not in (None, "filter"):

@@ -57,7 +57,7 @@ slider.dispatchEvent(new Event("input"));
 Figures = Mapping[str, float | None]
 """Metric → value: None where it is not defined, infinite where the estimate diverged."""
 Columns = dict[str, Float[np.ndarray, "_"]]
-"""What the figures draw of a sequence, by name."""
+"""The columns of a sequence that the figures draw, by name."""
 
 
 class Run(NamedTuple):
@@ -80,7 +80,7 @@ class Run(NamedTuple):
     """The whole configuration, as text of several lines."""
 
 
-# --- what the page shows of an evaluation
+# --- the runs that the page shows
 
 
 def of_report(

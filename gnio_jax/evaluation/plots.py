@@ -44,7 +44,7 @@ TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
 """Errors that the title of a sequence names."""
 
 
-# --- what is drawn of an estimate
+# --- the data that a picture draws
 
 
 class View(NamedTuple):

@@ -76,7 +76,7 @@ class Recording(NamedTuple):
     accel: Float[np.ndarray, "t 3"]
     """K·n samples, m/s²."""
     imu_valid: Bool[np.ndarray, "t"] | None
-    """Which samples were measured; None: all."""
+    """Whether each sample was measured; None: all were."""
     start: Start
     attitude: Matrices | None
     """Body→world at every sample and at the end of the last one, K·n + 1 rows, for windows that are
@@ -87,7 +87,7 @@ class Recording(NamedTuple):
     """Displacement of the reference over each window, with a stride between windows, m, expressed
     in the yaw frame of the window's start; NaN where the reference cannot be trusted."""
     notes: tuple[str, ...]
-    """What a reader of the result should know."""
+    """Notes for a reader of the result."""
     waypoints: Waypoints | None = None
     """The reference of a sequence without poses."""
 

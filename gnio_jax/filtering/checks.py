@@ -86,7 +86,7 @@ def check_rows(
 
 
 def check_rotation(name: str, value: jax.Array) -> None:
-    """Refuse what is no rotation matrix up to the rounding of text files."""
+    """Refuse a matrix that is no rotation, up to the rounding of text files."""
     if not isinstance(value, Tracer):
         matrix = np.asarray(value, np.float64)
         if not (np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-3 and np.linalg.det(matrix) > 0):
@@ -94,7 +94,7 @@ def check_rotation(name: str, value: jax.Array) -> None:
 
 
 def check_number(name: str, value: Any, least: float, unit: str) -> None:
-    """Refuse what is not a finite Python number of at least `least`."""
+    """Refuse a value that is not a finite Python number of at least `least`."""
     if not (isinstance(value, int | float) and least <= value < math.inf):
         raise ValueError(f"{name}: must be a number of at least {least:g} {unit}, found {value!r}")
 

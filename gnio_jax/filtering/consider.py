@@ -42,7 +42,7 @@ T = TypeVar("T")
 
 ENTRIES = 6
 OF_BIAS, OF_SCALE, OF_HEADING, OF_SLOPE = slice(0, 3), 3, 4, 5
-"""Where the gyro's bias, s, ψ and γ lie in c."""
+"""Entries of the gyro's bias, s, ψ and γ in c."""
 STILL = 1e-6
 """Added in quadrature to the length of a displacement, m, so that standing still is no singular
 point."""

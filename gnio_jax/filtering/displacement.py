@@ -12,7 +12,7 @@ three entries to the state. The covariance of each single measurement remains Σ
 of their average is bounded. If the error of a window were the sum of independent errors of its W
 strides, its correlation would fall linearly to zero at the window's length; the exponential with τ
 equal to half that length has the same integral, and so the same error of a long sum, with three
-entries in the place of 3 W.
+entries instead of 3 W.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ class FilterHistory(NamedTuple):
 
 
 class StepRecord(NamedTuple):
-    """What one clone step adds to the history, or K steps stacked."""
+    """The addition of one clone step to the history, or of K steps, stacked."""
 
     mean: Mean
     covariance: Array

@@ -67,7 +67,7 @@ def network_measurement(
 
 
 def _check(found: Any) -> None:
-    """Refuse what is no prediction of one window."""
+    """Refuse a result that is no prediction of one window."""
     if not isinstance(found, Prediction):
         kind = type(found).__name__
         raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")

@@ -16,7 +16,7 @@ N_l = Φ_{l+1} B_l the effect of the noise of sample l at the end of the interva
     Q = Σ_l N_l diag(σ_g², σ_a²) N_lᵀ + dt Σ_{m≥1} Φ_m[:, b] diag(η_g², η_a²) Φ_m[:, b]ᵀ.
 
 Every sum over samples is one product with a constant triangular matrix. Only the rotations need a
-loop, of log₂ n rounds. The samples lie along the last axis of every array of an interval.
+loop, of log₂ n rounds. The samples are along the last axis of every array of an interval.
 """
 
 from __future__ import annotations

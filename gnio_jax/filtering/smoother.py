@@ -105,7 +105,7 @@ class _ForwardStep(NamedTuple):
     slot: Int[Array, "*k"]
     """Slot of the ring for the clone at the end of the interval."""
     mean: Mean
-    """After the step."""
+    """The mean after the step."""
     covariance: Array
     """Covariance of θ, v, p, b_g, b_a, or its diagonal."""
     cross: Float[Array, "*k 15 m"]

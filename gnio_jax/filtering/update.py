@@ -77,7 +77,7 @@ class Outcome(NamedTuple):
     """Whether there was a measurement. Without one all following fields are zero or False, except
     √det S, which is 1."""
     tested: Bool[Array, ""]
-    """Whether a χ² test judged it."""
+    """Whether a χ² test was applied."""
     residual: Float[Array, "m"]
     """r."""
     nis: Float[Array, ""]

@@ -99,7 +99,7 @@ def _velocity_and_covariance(
     found = prediction.diagnostics
     if not {"velocity", "velocity_log_std", "task_log_std"} <= found.keys():
         raise ValueError(
-            "loss 'velocity_and_covariance' wants a velocity for every sample, "
+            "loss 'velocity_and_covariance' needs a velocity for every sample, "
             "which only the network 'ctin' gives"
         )
     # For a context before the window CTIN would predict velocities for which there is no target.

@@ -44,7 +44,7 @@ FILTER_PARTS = {
 }
 """Paths of the numbers of `FilterSettings` that belong to each part of the filter."""
 DIGITS = 5
-"""Digits of a value that remain if float32 holds its logarithm."""
+"""Digits of a value that remain if its logarithm is stored in float32."""
 
 Trainable = dict[str, dict[str, Any]]
 """Variables that are trained, by collection: "params" and "filter"; none of them empty."""

@@ -229,7 +229,7 @@ def test_a_conversion_is_whole_or_not_there(root, reads, monkeypatch, capsys):
     assert sorted(path.name for path in root.parent.iterdir()) == ["heads"]
     with pytest.raises(SystemExit):
         app.main(["data", "convert", "--help"])
-    told = "a conversion that was stopped leaves nothing, and the same command begins anew"
+    told = "a conversion that was stopped leaves nothing, and the same command starts again"
     assert told in " ".join(capsys.readouterr().out.split())
     monkeypatch.setattr(loading, "write_hdf5", real)
     run(*command)

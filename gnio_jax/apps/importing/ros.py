@@ -181,7 +181,7 @@ def _mcap(path: Path, stack: ExitStack) -> _Bag:
     file = stack.enter_context(path.open("rb"))
     file.seek(-min(len(MCAP_MAGIC), path.stat().st_size), os.SEEK_END)
     if file.read() != MCAP_MAGIC:
-        raise InputError(path, "is cut short, its end is missing", "mend it with mcap recover")
+        raise InputError(path, "is cut short, its end is missing", "repair it with mcap recover")
     file.seek(0)
     reader = make_reader(file, validate_crcs=True)
     summary = reader.get_summary()

@@ -181,4 +181,4 @@ def check(found: Deviation, where: Any) -> None:
     largest = found.displacement_largest, found.position_largest
     if not (largest[0] <= DISPLACEMENT_LIMIT and largest[1] <= POSITION_LIMIT):
         problem = f"the conversion is off by {largest[0]:.2g} m a window, {largest[1]:.2g} m a walk"
-        raise InputError(where, problem, "another version of jax2onnx may do better")
+        raise InputError(where, problem, "another version of jax2onnx may be more accurate")

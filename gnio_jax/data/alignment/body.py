@@ -8,10 +8,10 @@ position p of the marker body at its time t, the two equations are, in the marke
     ω(t)                        = Rx (gyro(t + lag(t)) − b_g)
     Rᵀ (p̈ + R̈ l + g u)          = Rx (accel(t + lag(t) + δ) − b_a)
 
-ω comes from differences of the tracked attitude, p̈ and R̈ from second differences. The unknowns are
-the extrinsic rotation Rx (IMU → marker body), the lever arm l (in the marker body), the biases b_g
-and b_a, the upward direction u in the tracker's world, a lag that is piecewise linear in time, and
-a delay δ of the accelerometer against the gyro (phones filter it: 10 to 50 ms).
+ω comes from differences of the tracked attitude, p̈ and R̈ from second differences. The unknowns
+are the extrinsic rotation Rx (IMU → marker body), the lever arm l (in the marker body), the biases
+b_g and b_a, the upward direction u in the tracker's world, a lag that is piecewise linear in time,
+and a delay δ of the accelerometer relative to the gyro (phones filter it: 10 to 50 ms).
 
 Both sides pass the same Gaussian filter once, before the fit; the lag changes so slowly that it
 commutes with the filter. First guesses of the lag are the peaks of the correlation of the
@@ -117,7 +117,7 @@ class BodyFit(NamedTuple):
     extrinsic: Rotation
     """IMU → marker body."""
     lever: Float[np.ndarray, "3"]
-    """From the marker body's origin to the IMU, in the marker body, m."""
+    """Vector from the marker body's origin to the IMU, in the marker body, m."""
     up: Float[np.ndarray, "3"]
     """Unit vector against gravity in the tracker's world."""
     gyro_bias: Float[np.ndarray, "3"]
@@ -406,7 +406,7 @@ def _first_guesses(seen: _Seen, felt: _Felt, search_seconds: float) -> list[tupl
     score = correlate(own - own.mean(), tracked - tracked.mean(), method="fft")
     lags = correlation_lags(len(grid), len(grid)) / RATE
     near = np.abs(lags) <= search_seconds
-    # A peak may lie at the end of the search.
+    # A peak may be at the end of the search.
     padded = np.pad(score[near], 1, constant_values=-np.inf)
     peaks, _ = find_peaks(padded, distance=max(round(SAME_LAG * RATE), 1))
     guesses = []

@@ -1,5 +1,6 @@
 """Indoor Location Competition 2.0 (Microsoft Research and XYZ10, 2021): walks through the floors of
-malls with a phone held flat before the body. There is no pose, but waypoints that were tapped.
+malls with a phone held flat before the body. There are no poses, but waypoints that were tapped on
+a map.
 
 Layout: `<site>/<floor>/path_data_files/<id>.txt`. Lines that begin with '#' name device, sensors,
 start and end; every other is `unix ms, type, values` between tabs: TYPE_ACCELEROMETER (m/s²,
@@ -164,7 +165,7 @@ def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
     for kind, (stamps, rows) in found.items():
         values = np.array(rows).reshape(-1, _VALUES[kind])
         if not (np.abs(values) < FARTHEST).all():
-            raise damaged(path, f"field '{kind}' holds NaN, Inf or what nothing measures")
+            raise damaged(path, f"field '{kind}' holds NaN, Inf or impossible values")
         fields = {kind: np.array(stamps, dtype=np.int64), "values": values}
         tables[kind] = Table(path, fields, "field")
     return header, tables

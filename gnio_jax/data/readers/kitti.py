@@ -250,7 +250,7 @@ def _packet(path: str) -> list[float]:
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
     except ValueError as error:
-        raise damaged(path, f"holds what is no number ({shortened(error, 200)})") from None
+        raise damaged(path, f"holds a value that is no number ({shortened(error, 200)})") from None
     if len(values) != len(_VALUES):
         raise damaged(
             path, f"holds {len(values)} values, expected {len(_VALUES)}; it may be cut short"
