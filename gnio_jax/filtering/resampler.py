@@ -41,8 +41,8 @@ LONGEST_TRUSTED = 1.0
 
 # In intervals of the IMU (ours). A sample that comes sooner after another is left out before the
 # low-pass, because noise would make the spline oscillate. Samples further apart than the second
-# limit are joined by a line, because the spline would be unconstrained there. Samples no further
-# apart than one lost sample makes them belong to one run.
+# limit are joined by a line, because the spline would be unconstrained there. Samples between which
+# at most one is lost belong to one run.
 _CLOSEST, _LINE, _LOST = 0.25, 1.75, 2.5
 
 # In intervals of the grid (ours). A longer interval is a stop of the IMU and does not count for its
