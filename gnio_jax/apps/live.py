@@ -313,12 +313,12 @@ def _lines(messages: Iterable[bytes]) -> Iterator[str]:
 FIRST_SECONDS = 1.0
 """Time of a stream over which its rate is measured, s …"""
 FIRST_SAMPLES = 21
-"""… and smallest number of samples for it, from which the units of gravity and stamps are
+"""… and smallest number of samples for it, from which the units of accelerometer and stamps are
 recognised (ours)."""
 LONGEST_INTERVAL = 0.5
 """Largest time between samples by their stamps, s: a slower stream has stamps in ms (ours)."""
 RATE_SHARE = 0.75
-"""Largest relative difference of a stated rate from the measured one (ours)."""
+"""Smallest ratio of a stated rate to the measured one, and of the measured one to it (ours)."""
 TURNING_SECONDS = 10.0
 """Time after which the rotation of gravity is compared with the gyro, s (ours)."""
 

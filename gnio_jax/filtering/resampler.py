@@ -49,7 +49,7 @@ _CLOSEST, _LINE, _LOST = 0.25, 1.75, 2.5
 # rate; a shorter one may be jitter. The rate is known after this number of grid samples.
 _STOP, _RATE_KNOWN = 5.0, 100
 _TOO_FAST = 1.05
-"""Factor of the fastest rate for which the low-pass is made."""
+"""Largest rate, as a multiple of the fastest rate for which the low-pass is made."""
 _BEFORE = 4
 """Samples kept before the FIR's reach, so that the spline's new end has no effect within it."""
 
