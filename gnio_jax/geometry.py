@@ -38,11 +38,9 @@ while a reduction can become a library call."""
 @jax.custom_jvp
 def hat(v: Vector) -> Matrix:
     """The cross-product matrix: hat(v) w = v × w."""
-    return (
-        v[0] * _GENERATORS[0].astype(v.dtype)
-        + v[1] * _GENERATORS[1].astype(v.dtype)
-        + v[2] * _GENERATORS[2].astype(v.dtype)
-    )
+    x, y, z = jnp.split(v[:, None], 3)
+    of_x, of_y, of_z = _GENERATORS.astype(v.dtype)
+    return x * of_x + y * of_y + z * of_z
 
 
 @hat.defjvp
@@ -102,6 +100,7 @@ def _polynomial(phi: Vector, squared: Scalar, first: Scalar, second: Scalar) -> 
     return (1 - second * squared) * eye + first * hat(phi) + second * (phi[:, None] * phi[None, :])
 
 
+@jax.jit
 def exp(phi: Vector) -> Matrix:
     """Rotation by the rotation vector `phi` (rad): I + sin θ/θ hat(φ) + (1 − cos θ)/θ² hat(φ)²."""
     squared = jnp.sum(phi * phi)
@@ -115,7 +114,8 @@ def matmul(
 ) -> Float[jax.Array, "p q *n"]:
     """a b for small matrices stacked along trailing axes, as a sum that XLA fuses with neighbouring
     operations; a dot would be a library call."""
-    return functools.reduce(jnp.add, [a[:, None, k] * b[None, k] for k in range(b.shape[0])])
+    columns, rows = jnp.split(a, a.shape[1], axis=1), jnp.split(b, b.shape[0], axis=0)
+    return functools.reduce(jnp.add, map(jnp.multiply, columns, rows))
 
 
 @functools.partial(matmul.defjvp, symbolic_zeros=True)
@@ -226,6 +226,7 @@ def matrix_from_quaternion(wxyz: Quaternion) -> Matrix:
     return (w * w - jnp.sum(u * u)) * eye + 2 * (u[:, None] * u[None, :]) + 2 * w * hat(u)
 
 
+@jax.jit
 def right_jacobian(phi: Vector) -> Matrix:
     """J_r(φ): exp(φ + δ) ≈ exp(φ) exp(J_r(φ) δ).  J_r = I − (1 − cos θ)/θ² hat(φ) + (θ − sin θ)/θ³
     hat(φ)²."""

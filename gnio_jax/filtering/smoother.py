@@ -163,12 +163,11 @@ class Adjoint(NamedTuple):
 def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
     """The adjoint before an update; `oldest` is the slot of the oldest clone."""
 
-    def measured(core: Array, clones: Array) -> dict[str, Array]:
-        parts = measurable_errors(core, clones, oldest)
-        return {name: parts[name] for name in correction.jacobian}
+    def measured(core: Array, clones: Array) -> Array:
+        return measurable_errors(correction.jacobian, core, clones, oldest)
 
     rows = jnp.concatenate([correction.core, correction.clones], axis=1)
-    blocks = {name: block.T for name, block in correction.jacobian.items()}
+    blocks = jnp.concatenate(list(correction.jacobian.values()), axis=1).T
     transposed = jax.linear_transpose(measured, correction.core.T, correction.clones.T)
     jacobian = jnp.concatenate(transposed(blocks)).T
     over = rows @ adjoint.matrix

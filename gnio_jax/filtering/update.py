@@ -19,7 +19,9 @@ and "A measurement of your own" in docs/differentiable_filter.md.
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import chex
@@ -151,22 +153,30 @@ def linearise(state: FilterState, residual: Any, covariance: Any, **jacobian: An
 
 
 def measurable_errors(
-    core: Float[Array, "n k"], clones: Float[Array, "c k"], oldest: Array | int
-) -> dict[str, Float[Array, "3 k"]]:
-    """`PARTS` of k errors of core and clones. p = a + o. p_j − p_i is o + s − o_i if the oldest
-    clone refers to the anchor before, else o − o_i."""
+    names: Iterable[str],
+    core: Float[Array, "n k"],
+    clones: Float[Array, "c k"],
+    oldest: Array | int,
+) -> Float[Array, "_ k"]:
+    """The named `PARTS`, one below the other, of k errors of core and clones.
+
+    p = a + o. p_j − p_i is o + s − o_i if the oldest clone refers to the anchor before, else
+    o − o_i.
+    """
     of_oldest = jax.lax.dynamic_slice_in_dim(clones, CLONE * oldest, CLONE)
-    present = core[OFFSET] + anchors_apart(oldest, core.dtype) * core[MOVE]
-    return {
-        "rotation": core[THETA],
-        "velocity": core[VELOCITY],
-        "position": core[OFFSET] + core[ANCHOR],
-        "gyro_bias": core[GYRO_BIAS],
-        "accel_bias": core[ACCEL_BIAS],
-        "correlated": core[CORRELATED],
-        "oldest_rotation": of_oldest[CLONE_THETA],
-        "since_oldest": present - of_oldest[CLONE_OFFSET],
+    parts = {
+        "rotation": lambda: core[THETA],
+        "velocity": lambda: core[VELOCITY],
+        "position": lambda: core[OFFSET] + core[ANCHOR],
+        "gyro_bias": lambda: core[GYRO_BIAS],
+        "accel_bias": lambda: core[ACCEL_BIAS],
+        "correlated": lambda: core[CORRELATED],
+        "oldest_rotation": lambda: of_oldest[CLONE_THETA],
+        "since_oldest": lambda: (
+            core[OFFSET] + anchors_apart(oldest, core.dtype) * core[MOVE] - of_oldest[CLONE_OFFSET]
+        ),
     }
+    return jnp.concatenate([parts[name]() for name in names])
 
 
 def anchors_apart(oldest: Array | int, dtype: np.dtype) -> Float[Array, ""]:
@@ -202,11 +212,7 @@ def project(
     the identity, so that no NaN enters the arithmetic or the derivatives."""
     present = jnp.isfinite(linear.residual).all() & jnp.isfinite(linear.covariance).all()
     jacobian = jnp.concatenate(list(linear.jacobian.values()), axis=1)
-
-    def touched(core: Array, clones: Array) -> Array:
-        parts = measurable_errors(core, clones, oldest)
-        return jnp.concatenate([parts[name] for name in linear.jacobian])
-
+    touched = functools.partial(measurable_errors, linear.jacobian, oldest=oldest)
     core = matmul(jacobian, touched(state.core_covariance, state.cross_covariance.T))
     clones = matmul(jacobian, touched(state.cross_covariance, state.clone_covariance))
     spread = matmul(jacobian, touched(core.T, clones.T)) + linear.covariance
