@@ -26,7 +26,6 @@ from gnio_jax.filtering import (
     FilterHistory,
     FilterState,
     considered_covariance,
-    initial_state,
     over_sequences,
     run_filter,
     sensitivity,
@@ -267,10 +266,10 @@ def _repeated(
     """The run over one walk without the network, as a function of a start and displacements, with
     the start and the displacements of the walk."""
     std = settings.start
+    level = std.gyro_bias
     if settings.raw_gyro_bias is not None:  # the walk was prepared with it
-        own = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, std.gyro_bias)
-        std = std._replace(gyro_bias=own)
-    state = initial_state(config, *walk.start[:4], std=std)
+        level = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, level)
+    state = walk.start._replace(std=std, level_gyro_bias=level).state(config)
     assert walk.given is not None
     value, covariance, _ = walk.given
     fixed = config, settings.noise, walk.imu_valid, config.displacement_frame

@@ -30,7 +30,6 @@ from gnio_jax.filtering import (
     FilterState,
     NoiseModel,
     considered_covariance,
-    initial_state,
     over_sequences,
     run_filter,
     run_odometry,
@@ -39,6 +38,7 @@ from gnio_jax.filtering import (
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION
 from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.filtering.state import GYRO_BIAS as CORE_GYRO_BIAS
 from gnio_jax.models import Network
 from gnio_jax.numerics import (
     filled_up,
@@ -243,7 +243,7 @@ def _run(
 
     def run(own: Inputs) -> FilterHistory:
         signals, fixed = (own.gyro, own.accel), (config, noise, own.imu_valid)
-        state = initial_state(config, *own.start[:4], std=own.start.std)
+        state = own.start.state(config)
         if apply is None:
             assert own.given is not None
             frame, covariance = "given", own.given.covariance
@@ -286,6 +286,7 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) 
     orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
     poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
     std = np.repeat(np.array(start.std), [2, 1, 3, 3, 3, 3])
+    std[GYRO_BIAS] = np.sqrt(np.diag(start.state(ekf.config).core_covariance)[CORE_GYRO_BIAS])
     if ekf.considered is not None:
         std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], ekf.considered.gyro_bias)
     return Estimate(

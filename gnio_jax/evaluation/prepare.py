@@ -15,7 +15,7 @@ from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import Trajectory
-from gnio_jax.filtering import InitialStd, level_state
+from gnio_jax.filtering import FilterConfig, FilterState, InitialStd, initial_state, level_state
 from gnio_jax.filtering.settings import filter_config
 from gnio_jax.filtering.start import rest_at_start
 from gnio_jax.numerics import (
@@ -57,8 +57,16 @@ class Start(NamedTuple):
     gyro_bias: Float[np.ndarray, "3"]
     """First estimate, rad/s."""
     std: InitialStd
+    level_gyro_bias: float
+    """Standard deviation of the level components of the gyro bias, rad/s; `std` has that of the
+    vertical one."""
     raw_gyro: bool
     """True if neither the phone nor a rest gave a first estimate of the gyro's bias."""
+
+    def state(self, config: FilterConfig) -> FilterState:
+        """The start as a state of the filter."""
+        known = self.rotation, self.velocity, self.position, self.gyro_bias
+        return initial_state(config, *known, 0, self.std, self.level_gyro_bias)
 
 
 class Recording(NamedTuple):
@@ -113,10 +121,11 @@ def prepare(
     A recording begins at the first sample with a trusted reference. With `from_first`, or without a
     reference, it begins at its first sample. `std` is the filter's initial uncertainty; a static
     start replaces that of tilt and velocity. A sequence with waypoints has no pose to start from,
-    so its start is always static. `raw_gyro_bias` replaces the standard deviation of the gyro's
-    bias if neither the phone nor a rest gives a first estimate of it: if `imu_compensated` is "no"
-    and the bias starts from zero. `orientation` is the source of `Recording.attitude`; None: there
-    is none. Raises `InputError` for a sequence that lacks what these choices need.
+    so its start is always static. `raw_gyro_bias` replaces the standard deviation of the level
+    components of the gyro's bias if neither the phone nor a rest gives a first estimate of it: if
+    `imu_compensated` is "no" and the bias starts from zero. `orientation` is the source of
+    `Recording.attitude`; None: there is none. Raises `InputError` for a sequence that lacks what
+    these choices need.
     """
     recordings, left_out = [], {}
     for sequence in sequences:
@@ -135,14 +144,13 @@ def prepare(
             continue
         bias, bias_note = _gyro_bias(whole, measured, windows.rate, gyro_bias)
         raw = sequence.attributes.get("imu_compensated") == "no" and not bias.any()
-        own_std = std
-        if raw and raw_gyro_bias is not None:
-            own_std = std._replace(gyro_bias=raw_gyro_bias)
         own_init, reference_note = init, ""
         if whole.waypoints is not None:
             own_init, reference_note = "static", OF_WAYPOINTS
-        start, start_note = _start(whole, measured, windows, bias, own_std, own_init)
-        start = start._replace(raw_gyro=bool(raw))
+        start, start_note = _start(whole, measured, windows, bias, std, own_init)
+        if raw:
+            level = std.gyro_bias if raw_gyro_bias is None else raw_gyro_bias
+            start = start._replace(raw_gyro=True, level_gyro_bias=level)
         trusted, mask = whole.valid[:, None], whole.imu_valid
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
@@ -218,7 +226,8 @@ def _start(
         velocity = sequence.velocity[0]
         velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
         rotation = matrix_from_quaternion(sequence.orientation[0])
-        return Start(rotation, velocity, sequence.position[0], gyro_bias, std, False), ""
+        start = rotation, velocity, sequence.position[0], gyro_bias
+        return Start(*start, std, std.gyro_bias, False), ""
     second = measured[measured < round(windows.rate)]
     if 2 * len(second) < round(windows.rate):  # most of the first second was not measured
         second = measured[: round(windows.rate)]
@@ -227,7 +236,8 @@ def _start(
     found = np.sqrt(np.diag(level.core_covariance))
     tilt_std, velocity_std = float(found[0]), float(found[3])
     std = std._replace(tilt=tilt_std, velocity=velocity_std)
-    start = Start(np.asarray(level.rotation), np.zeros(3), np.zeros(3), gyro_bias, std, False)
+    still = np.asarray(level.rotation), np.zeros(3), np.zeros(3), gyro_bias
+    start = Start(*still, std, std.gyro_bias, False)
     if velocity_std <= ROUGH_START:
         return start, ""
     tilt = float(f"{np.degrees(tilt_std):.1g}")  # rounded, so that few different notes are made

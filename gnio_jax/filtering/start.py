@@ -59,6 +59,7 @@ def initial_state(
     gyro_bias: Any = 0,
     accel_bias: Any = 0,
     std: InitialStd = TLIO_STD,
+    level_gyro_bias: Any = None,
 ) -> FilterState:
     """Start of the filter from a known pose, without clones.
 
@@ -66,6 +67,11 @@ def initial_state(
     gyro_bias rad/s and accel_bias m/s², each (3,) or one number for all axes; std has the standard
     deviations of their errors, which are independent. Raises `ValueError` naming an argument of
     wrong shape or precision.
+
+    level_gyro_bias, rad/s, is the standard deviation of the two level components of the gyro bias
+    where it is not std.gyro_bias (ours, for a raw gyro). Gravity shows these components within
+    seconds. Nothing shows the vertical one but the displacements, whose errors are temporally
+    correlated: a filter that learns it from them loses the yaw.
     """
     rotation = checked_array("rotation", rotation, (3, 3), config)
     check_rotation("rotation", rotation)
@@ -78,7 +84,7 @@ def initial_state(
         for name, value in given.items()
     ]
     check_numbers("std", std)
-    return without_clones(Mean(rotation, *vectors), std, config.clones)
+    return without_clones(Mean(rotation, *vectors), std, config.clones, level_gyro_bias)
 
 
 def level_state(

@@ -134,8 +134,12 @@ class FilterState(NamedTuple):
 
 # One program in place of thirty, which take three times as long at the first call.
 @functools.partial(jax.jit, static_argnames="clones")
-def without_clones(pose: Mean, std: InitialStd, clones: int) -> FilterState:
-    """The state at the start, in the precision of `pose`, with independent errors of `std`.
+def without_clones(
+    pose: Mean, std: InitialStd, clones: int, level_gyro_bias: Array | float | None = None
+) -> FilterState:
+    """The state at the start, in the precision of `pose`, with independent errors of `std`; the two
+    level components of the gyro bias have the standard deviation `level_gyro_bias`, rad/s, if it is
+    given.
 
     The whole uncertainty of the position is in the anchor, because there is no offset and no move
     yet.
@@ -146,6 +150,12 @@ def without_clones(pose: Mean, std: InitialStd, clones: int) -> FilterState:
     parts = (*std[:3], 0.0, std.gyro_bias, std.accel_bias, std.position, 0.0)
     each = jnp.stack([jnp.asarray(part, dtype) for part in parts])
     core_std = jnp.repeat(each, np.array([2, 1, 3, 3, 3, 3, 3, 3]), total_repeat_length=CORE)
+    covariance = jnp.diag(core_std**2)
+    if level_gyro_bias is not None:
+        up = pose.rotation[2]
+        vertical, eye = up[:, None] * up[None, :], np.eye(3, dtype=dtype)
+        of_bias = level_gyro_bias**2 * (eye - vertical) + std.gyro_bias**2 * vertical
+        covariance = covariance.at[GYRO_BIAS, GYRO_BIAS].set(of_bias.astype(dtype))
     return FilterState(
         rotation=pose.rotation,
         velocity=pose.velocity,
@@ -157,7 +167,7 @@ def without_clones(pose: Mean, std: InitialStd, clones: int) -> FilterState:
         correlated=jnp.zeros(0, dtype),
         clone_rotation=jnp.tile(jnp.eye(3, dtype=dtype)[None], (clones, 1, 1)),
         clone_offset=jnp.zeros((clones, 3), dtype),
-        core_covariance=jnp.diag(core_std**2),
+        core_covariance=covariance,
         cross_covariance=jnp.zeros((CORE, CLONE * clones), dtype),
         clone_covariance=jnp.zeros((CLONE * clones, CLONE * clones), dtype),
         step=jnp.int32(0),

@@ -94,13 +94,14 @@ def test_a_raw_gyro_starts_with_a_wider_bias(walks, swaying, compensated):
     attributes = {"imu_compensated": compensated, "placement": "unknown"}
     walk = walks[0]._replace(attributes=attributes)
     (recording,) = ready([walk], raw_gyro_bias=0.05)
-    own = evaluation.prepare([walk], CONFIG)[0][0].start.std.gyro_bias
+    own = evaluation.prepare([walk], CONFIG)[0][0].start.level_gyro_bias
     expected = 0.05 if compensated == "no" else own
-    assert recording.start.std.gyro_bias == expected and own < 0.01
+    assert recording.start.level_gyro_bias == expected and own < 0.01
+    assert recording.start.std.gyro_bias == own
     assert recording.start.raw_gyro == (compensated == "no") and recording.placement == ""
     rest = resting(swaying, BIAS)._replace(attributes=attributes)
     (recording,) = ready([rest], gyro_bias="rest", raw_gyro_bias=0.05)
-    assert recording.start.std.gyro_bias == own
+    assert recording.start.level_gyro_bias == own
 
 
 def test_other_rates_are_resampled():

@@ -26,7 +26,6 @@ from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
 from gnio_jax.evaluation.metrics import ate
 from gnio_jax.files import fingerprint, replacing_folder
-from gnio_jax.filtering import initial_state
 from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.models import Network
 
@@ -102,7 +101,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
             }
         windows = run.config.data
         walk = draw_walk(windows, setup, seconds)
-        start = initial_state(setup.config, *walk.start[:4], std=walk.start.std)
+        start = walk.start.state(setup.config)
         models = driver.open_models(folder)
         found = driver.walk(models, start_arrays(start, setup), walk.gyro, walk.accel)
         (own,) = estimate([walk], network, windows, setup._replace(considered=None))
