@@ -8,7 +8,6 @@ import pytest
 
 from gnio_jax.config import TrainConfig
 from gnio_jax.evaluation import Estimate, Trajectory, page, plots, report
-from gnio_jax.types import Waypoints
 from tests.support import browser
 from tests.support.estimates import SETTINGS, estimate, reported, with_covariance
 
@@ -45,9 +44,6 @@ def written(runs, tmp_path_factory):
     return path
 
 
-# --- columns
-
-
 def test_thinned_curves_keep_the_largest_innovation(walks):
     nis = np.full(400, 2.0)
     nis[[0, 201]], nis[3:6] = [np.nan, 70.0], np.nan
@@ -72,9 +68,6 @@ def test_the_map_has_room_for_the_ellipses(walks):
     nowhere = Trajectory(walk.reference.time, *(part * np.nan for part in walk.reference[1:]))
     lost = walk._replace(trajectory=nowhere, reference=nowhere)
     assert np.isfinite([*page.frame([run_of([lost])], "walk").values()]).all()
-
-
-# --- the file
 
 
 class Loads(html.parser.HTMLParser):
@@ -111,11 +104,12 @@ def test_the_page_is_one_file_that_loads_nothing(written, runs):
 
 
 def test_without_a_reference_nothing_is_called_an_error(estimates):
-    text = page.render("blind", [run_of([estimates[2]])])
+    text = page.render("blind", [run_of([estimates[2]._replace(name="a<b_c-d e")])])
     assert "error (m)" not in text
     assert r"3\\u03c3 (m)" in text  # as JSON in a script has it
     assert '"value":"start"' in text
     assert re.search(r"<label hidden>sequence", text)  # of a single one none is chosen
+    assert "<td>a&lt;b_<wbr>c-<wbr>d <wbr>e</td>" in text  # names break between their words
     # χ² does not go by the name of the network's gate.
     assert "refused above 11.3" in text and '"gate (11' not in text
 
@@ -125,11 +119,6 @@ def test_warnings_stand_before_the_figures_and_the_weights_once(estimates):
     text = page.render("walk", [run])
     assert text.count("of walks") == 1 and "warning: it &lt;moves&gt;" in text
     assert text.index("it &lt;moves&gt;") < text.index('class="figures"') < text.index("of walks")
-
-
-def test_names_break_between_their_words(estimates):
-    text = page.render("walk", [run_of([estimates[0]._replace(name="a<b_c-d e")])])
-    assert "<td>a&lt;b_<wbr>c-<wbr>d <wbr>e</td>" in text
 
 
 def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
@@ -164,8 +153,6 @@ def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
     assert first.summary["never moves"]["path_length_ratio"] == 0
 
 
-# --- in a browser
-
 needs_browser = pytest.mark.skipif(
     browser.NAME is None, reason="no Chromium here (apt-get install chromium)"
 )
@@ -180,48 +167,6 @@ CHOOSE = """(() => {
   document.querySelectorAll("tr[data-sequence]")[2].click();
   return document.getElementById("sequence").selectedOptions[0].textContent;
 })()"""
-
-
-LEGENDS = """(() => {
-  const found = {};
-  const visit = (view) => {
-    const model = view.model;
-    if (model.type === "Legend") {
-      const box = view.bbox, whole = view.parent.bbox;
-      const names = model.items.filter((item) => item.visible).map((item) => item.label.value);
-      if (names.length) found[model.id] = [names, box.x0 >= whole.x0 - 1, box.x1 <= whole.x1 + 1];
-    }
-    for (const child of view.children()) visit(child);
-  };
-  for (const view of Bokeh.index.roots) visit(view);
-  return Object.values(found);
-})()"""
-
-
-@pytest.mark.slow
-@needs_browser
-def test_legends_can_be_read_and_name_what_is_there(tmp_path, estimates):
-    """On a phone too, with long names; of a walk without poses nothing is called a reference."""
-    tapped = estimates[1]._replace(
-        reference=estimates[2].reference,
-        waypoints=Waypoints(
-            estimates[1].trajectory.time[[5, 200, 390]], estimates[1].trajectory.position[:3, :2]
-        ),
-    )
-    posed, path = estimates[0], tmp_path / "page.html"
-    mixed = run_of([posed, tapped])
-    summed = [Estimate(posed.name, posed.trajectory, posed.reference)]
-    page.write(path, "two", [mixed, run_of(summed, name="integrate, " + "orientation " * 6)])
-    with browser.browser() as tab:
-        for width in (1500, 390):
-            tab.open(path, width=width)
-            seen = tab.evaluate(LEGENDS)
-            names = {name for legend in seen for name in legend[0]}
-            assert {"reference", "3σ", "start"} <= names and "waypoint, error" not in names
-            assert all(left and right for _, left, right in seen)
-        tab.evaluate('document.querySelectorAll("tr[data-sequence]")[2].click()')
-        names = {name for legend in tab.evaluate(LEGENDS) for name in legend[0]}
-        assert "waypoint, error" in names and not {"reference", "error"} & names
 
 
 @pytest.mark.slow

@@ -20,9 +20,6 @@ def seeds_of(ates, names=None):
 ALONE = {name: name for name in "abcdefgh"}
 
 
-# --- the interval
-
-
 def test_it_is_students_interval_of_the_groups_means():
     """Of groups of one size, in any order; there is none of one group, nor of what is infinite."""
     values = np.random.default_rng(0).normal(5.0, 2.0, 7)
@@ -38,10 +35,10 @@ def test_it_is_students_interval_of_the_groups_means():
     assert interval(np.array([1e308, -1e308, 1e308]), "xyz") is None
 
 
-@pytest.mark.parametrize("groups", [2, 3, 6, 10])
+@pytest.mark.parametrize("groups", [2, 6])
 def test_it_covers_the_mean_as_often_as_it_says(groups):
-    """Walks of one person are alike. A percentile bootstrap over groups misses the mean in 50, 25,
-    15 and 10 % of the cases."""
+    """Walks of one person are alike. A percentile bootstrap over groups misses the mean in 50 and
+    15 % of the cases."""
     random, missed, trials = np.random.default_rng(groups), 0, 1000
     names = np.repeat(np.arange(groups), 4)
     for _ in range(trials):
@@ -49,9 +46,6 @@ def test_it_covers_the_mean_as_often_as_it_says(groups):
         low, high = interval(people[names] + 0.5 * random.normal(size=len(names)), names)
         missed += not low <= 0.0 <= high
     assert 0.03 < missed / trials < 0.07
-
-
-# --- means
 
 
 def test_divergence_never_improves_a_summary():
@@ -107,9 +101,6 @@ def test_seeds_are_averaged_over_the_sequences_that_all_have():
     assert summarise(whole, "ate", ALONE).seeds == [2.0, 4.0]
     mixed = seeds_of([[1.0, 2.0], [3.0, LOST]]), seeds_of([[LOST, LOST], [1.0, 1.0]])
     assert [summarise(each, "ate", ALONE).median for each in mixed] == [2.5, np.inf]
-
-
-# --- differences
 
 
 def test_the_interval_of_a_share_ends_where_shares_do():

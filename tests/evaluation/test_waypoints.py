@@ -54,9 +54,6 @@ def spread(points):
     return np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1)))
 
 
-# --- the alignment
-
-
 def least(path, waypoints):
     """The smallest root mean square there is, by a search over turn and shift."""
     ours = path.position[np.searchsorted(path.time, waypoints.time), :2]
@@ -108,9 +105,6 @@ def test_positions_lie_between_rows_and_not_beyond_the_ends():
     late = Waypoints(np.array([begin, end + 1.0, end + 2.0]), np.zeros((3, 2)))
     with pytest.raises(Undefined, match="fewer than two waypoints"):
         align(path, late)
-
-
-# --- metrics
 
 
 @pytest.mark.parametrize("scale", [0.8, 0.0])
@@ -171,9 +165,6 @@ def test_who_never_moves_and_who_diverged():
     assert measure(far, short.reference, waypoints=short.waypoints).diverged
 
 
-# --- from a sequence to an estimate
-
-
 def test_the_start_is_level_and_says_so(clean):
     (ready,), left_out = prepare([with_waypoints(clean)], CONFIG)
     assert not left_out and ready.waypoints is not None
@@ -188,9 +179,6 @@ def test_the_start_is_level_and_says_so(clean):
     for asked, remedy in (("gyro_bias", "--gyro-bias zero"), ("orientation", "--orientation f")):
         with pytest.raises(InputError, match=f"{clean.name}: has waypoints, no poses.*{remedy}"):
             prepare([with_waypoints(clean)], CONFIG, **{asked: "reference"})
-
-
-# --- the folder, the tables, and what is drawn
 
 
 @pytest.fixture(scope="module")

@@ -162,7 +162,11 @@ def test_gradient_against_differences():
     where they have no size."""
     x, broken = point(), EARLY._replace(valid=~np.isin(np.arange(N * INTERVALS), HOLES))
     _, history, _ = at([x], broken)
-    assert np.isnan(history.nis[0, CLONES:HALF]).any() and (history.gate_passed[0] < 0.999).any()
+    weight, nis = history.gate_passed[0, CLONES:], history.nis[0, CLONES:]
+    assert np.isnan(nis[: HALF - CLONES]).any() and (weight < 0.999).any()
+    wanted = np.where(weight < 1, 1 / (1 + np.exp((nis - 8.0) / 2.0)), weight)
+    np.testing.assert_allclose(weight, wanted, rtol=1e-9)
+    assert (history.accepted[0, CLONES:][np.isfinite(nis)] == 1).all()
     assert_slopes(x, broken, ["noise", "correlation", "factor", "std", "state", "network", "fix"])
     there = np.delete(np.arange(HALF * N), HOLES)
     assert_slopes(x, broken, ["gyro", "accel"], there)
@@ -202,15 +206,6 @@ def test_gradients_are_finite_for_hostile_input():
     for name, leaf in gradient.items():
         for kind, each in zip(points, leaf, strict=True):
             assert np.isfinite(each).all() and np.abs(each).max() > 0, (kind, name)
-
-
-def test_a_gate_with_a_slope_weights_and_never_refuses():
-    _, history, _ = at([point()], WHOLE)
-    weights, nis = history.gate_passed[0], history.nis[0]
-    watched = weights < 1
-    wanted = 1 / (1 + np.exp((nis[watched] - 8.0) / 2.0))
-    np.testing.assert_allclose(weights[watched], wanted, rtol=1e-9)
-    assert (history.accepted[0, CLONES:] == 1).all() and watched.sum() > 5
 
 
 def scanned(scan, start, inputs):
@@ -258,7 +253,7 @@ def derivatives_by_hand(cut):
     return derivatives(cut_by_hand(cut) if cut else jax.lax.scan)
 
 
-@pytest.mark.parametrize("every, cut", [(4, 0), (13, 0), (50, 0), (0, 5), (2, 5), (5, 5), (3, 20)])
+@pytest.mark.parametrize("every, cut", [(4, 0), (50, 0), (0, 5), (2, 5), (3, 20)])
 def test_checkpoints_and_cuts_of_any_scan(every, cut):
     """Whole blocks or not: checkpoints change no number, and cuts none but the gradient."""
     blocked = functools.partial(blocked_scan, checkpoint_every=every, truncate_every=cut)
