@@ -2,7 +2,6 @@
 
 import ast
 import importlib
-import os
 import re
 import shlex
 import shutil
@@ -260,34 +259,6 @@ def test_the_recipe_of_the_shipped_network_is_what_make_runs():
         else:
             assert asked.workdir in left
             left.add(f"{asked.workdir}_calibrated")
-
-
-@pytest.mark.skipif(not shutil.which("make"), reason="no make here")
-@pytest.mark.parametrize(
-    ("words", "installed"),
-    [
-        ("test", ".[test]"),
-        ("test EXTRAS=test,reference", ".[test,reference]"),
-        ("lint", ".[test,dev]"),
-        ("docs", ".[docs]"),
-        ("demo", "."),
-        ("pedestrian", "."),
-    ],
-)
-def test_make_installs_what_it_needs(words, installed, tmp_path):
-    """Into an environment of its own, before anything else runs there. The commands are known."""
-    command = ["make", "--dry-run", f"VENV={tmp_path / 'none'}", *words.split()]
-    alone = {"PATH": os.environ["PATH"]}  # without what the make of these tests was told
-    said = subprocess.run(
-        command, cwd=pages.ROOT, env=alone, capture_output=True, text=True, check=True
-    )
-    steps = [line for line in said.stdout.splitlines() if "/none/bin/" in line]
-    installs = [line for line in steps if "pip install" in line]
-    assert steps[: len(installs)] == installs
-    assert re.search(r"pip install .*-e '?([^' ]+)'?$", installs[-1])[1] == installed
-    assert len(steps) > 1
-    for _, *asked in commands_of(said.stdout):
-        understood(asked)
 
 
 def test_the_reference_has_every_room():

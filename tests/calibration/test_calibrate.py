@@ -93,6 +93,7 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     assert splits_read == ["val"]
     before, after = (checkpoint.load_run(folder) for folder in (run, out))
     assert after.config.model.equivariance == "four_headings"
+    assert after.model == models.from_config(after.config.model)
     same = {name: getattr(before.config, name) for name in ("workdir", "filter", "model")}
     assert dataclasses.replace(after.config, **same) == before.config
     jax.tree.map(np.testing.assert_array_equal, after.variables, before.variables)
@@ -108,47 +109,31 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     assert about["split"] == "val" and about["filter"] == plain(found)
 
 
-def test_the_network_is_averaged_over_four_headings(run):
-    averaged = evidence.load_run(run, CalibrateConfig(str(run), average_headings=True))
-    assert averaged.config.model.equivariance == "four_headings"
-    assert averaged.model == models.from_config(averaged.config.model)
-
-
-@pytest.mark.parametrize(
-    ("model", "augment", "problem"),
-    [
-        ({"equivariance": "canonical_frame"}, {}, "has a canonical frame"),
-        ({}, {"yaw": False}, "four_headings without augment.yaw"),
-    ],
-)
-def test_a_network_that_cannot_be_averaged(run, model, augment, problem):
+def test_a_network_that_cannot_be_averaged(run):
     loaded = checkpoint.load_run(run)
-    model = dataclasses.replace(loaded.config.model, **model)
-    augment = dataclasses.replace(loaded.config.augment, **augment)
-    config = dataclasses.replace(loaded.config, model=model, augment=augment)
-    with pytest.raises(InputError, match=f"the run.*{problem}"):
-        checkpoint.averaged_over_headings(loaded._replace(config=config), "the run")
+    model = dataclasses.replace(loaded.config.model, equivariance="canonical_frame")
+    augment = dataclasses.replace(loaded.config.augment, yaw=False)
+    for change, problem in (
+        ({"model": model}, "has a canonical frame"),
+        ({"augment": augment}, "four_headings without augment.yaw"),
+    ):
+        config = dataclasses.replace(loaded.config, **change)
+        with pytest.raises(InputError, match=f"the run.*{problem}"):
+            checkpoint.averaged_over_headings(loaded._replace(config=config), "the run")
 
 
-@pytest.mark.parametrize(
-    ("options", "problem"),
-    [
+def test_what_is_refused(run, splits_read, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    (tmp_path / "run" / "calibration.json").write_text("{}")
+    for options, problem in (
         ({"split": "test"}, "neither the validation nor the training split"),
         ({"out": "."}, "is there already"),
         ({"fit": ()}, "--fit: names nothing; name some of measurement, noise"),
-    ],
-)
-def test_what_is_refused(run, splits_read, options, problem):
-    with pytest.raises(InputError, match=problem):
-        calibration.calibrate(CalibrateConfig(workdir=str(run), **options))
+        ({"workdir": str(tmp_path / "run")}, "is a calibrated run; calibrate the run that it was"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            calibration.calibrate(CalibrateConfig(**{"workdir": str(run)} | options))
     assert splits_read == []
-
-
-def test_a_calibrated_run_is_not_calibrated_again(run, tmp_path):
-    shutil.copytree(run, tmp_path / "run")
-    (tmp_path / "run" / "calibration.json").write_text("{}")
-    with pytest.raises(InputError, match="is a calibrated run; calibrate the run that it was"):
-        calibration.calibrate(CalibrateConfig(workdir=str(tmp_path / "run")))
 
 
 @pytest.mark.parametrize(("asked", "split"), [(None, "val"), ("val", "val"), ("train", "train")])
@@ -214,34 +199,23 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(
         assert recording.name == name and tiny_run.same(variables, network.variables)
 
 
-@pytest.mark.parametrize(
-    ("folders", "split", "problem"),
-    [
-        ([0], None, "--out-of-fold: were trained on the splits train-0of2; train one run for each"),
-        ([0, 0], None, "were trained on the splits train-0of2, train-0of2"),
-        ([0, 1], "train", "--split train: is of no use with --out-of-fold"),
-    ],
-)
-def test_folds_that_do_not_make_a_whole_are_refused(
-    run, splits_read, fold_runs, folders, split, problem
-):
-    chosen = tuple(fold_runs[fold] for fold in folders)
-    with pytest.raises(InputError, match=problem):
-        calibration.calibrate(CalibrateConfig(workdir=str(run), out_of_fold=chosen, split=split))
-    assert splits_read == []
-
-
-def test_folds_of_another_experiment_are_refused(run, fold_runs):
+def test_folds_that_do_not_make_a_whole_are_refused(run, splits_read, fold_runs):
     config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
+    first, _ = fold_runs
+    for changes, problem in (
+        ({"out_of_fold": (first,)}, "were trained on the splits train-0of2; train one run for ea"),
+        ({"out_of_fold": (first, first)}, "were trained on the splits train-0of2, train-0of2"),
+        ({"split": "train"}, "--split train: is of no use with --out-of-fold"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            calibration.calibrate(dataclasses.replace(config, **changes))
+    assert splits_read == []
     loaded = checkpoint.load_run(run)
     other = dataclasses.replace(loaded.config.model, width=5)
     changed = loaded._replace(config=dataclasses.replace(loaded.config, model=other))
     with pytest.raises(InputError, match="fold0: differs from the calibrated run in 'model'"):
         evidence.sources(changed, config)
 
-
-# What is fitted
-# ------------------------------------------------------------------------------------------------
 
 PATHS = (*GROUPS["measurement"], *GROUPS["noise"], *GROUPS["window"])
 ERRORS = CorrelatedError(0.8, 0.5)

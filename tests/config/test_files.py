@@ -42,14 +42,10 @@ def refused(text):
     "text",
     [
         "seed: 1\nseed: 2",
-        "optim: {epochs: 3}\noptim: {batch_size: 8}",
         "optim: {epochs: 3, epochs: 4}",
         "seed: !!timestamp 2020-13-45",
-        "seed: !!timestamp today",
         "seed: !!int 0b_",
-        "seed: !!int ''",
         "seed: !!map [1, 2]",
-        "seed: !!set [1]",
         "data: {rate: !!float ''}",
         "augment: {yaw: !!bool maybe}",
         "seed: " + "9" * 5000,
@@ -65,10 +61,10 @@ def test_what_is_no_yaml_is_one_line_that_names_the_file(text):
     assert source == "f.yaml" and problem.startswith("is not YAML (")
 
 
-@pytest.mark.parametrize("text", ["", "# only a comment", "- 1"])
-def test_a_file_without_fields_is_refused(text):
-    source, problem, _ = refused(text)
-    assert source == "f.yaml" and ("empty" in problem or "[1]" in problem)
+def test_a_file_without_fields_is_refused():
+    for text in ("", "# only a comment", "- 1"):
+        source, problem, _ = refused(text)
+        assert source == "f.yaml" and ("empty" in problem or "[1]" in problem)
 
 
 @pytest.mark.parametrize(
@@ -148,10 +144,10 @@ def test_numbers_are_those_of_yaml_1_2():
     assert (found.optim.learning_rate, found.loss.mse_weight, found.data.rate) == (1e-3, 3.0, 200.0)
 
 
-@pytest.mark.parametrize("name", ["1e-3", "010", "yes", "null", "2020-01-01", "~", "a: b", "1:30"])
-def test_text_that_looks_like_something_else_survives_its_file(name):
-    config = TrainConfig(workdir=name, filter=changed(noise={"correlation": CorrelatedError()}))
-    assert read(configuration.text(config)) == config
+def test_text_that_looks_like_something_else_survives_its_file():
+    for name in ("1e-3", "010", "yes", "null", "2020-01-01", "~", "a: b", "1:30"):
+        config = TrainConfig(workdir=name, filter=changed(noise={"correlation": CorrelatedError()}))
+        assert read(configuration.text(config)) == config
 
 
 def experiment_of(*words):
@@ -205,9 +201,8 @@ def test_settings_are_assigned_by_name():
     assert off.filter.noise == noise._replace(correlation=None)
 
 
-@pytest.mark.parametrize(
-    ("assignment", "problem"),
-    [
+def test_an_assignment_that_makes_no_sense_is_named():
+    for assignment, problem in (
         ("optim.epochs", "is not a setting; write section.field=value"),
         ("=3", "is not a setting"),
         ("optim.epohcs=3", "unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"),
@@ -215,17 +210,14 @@ def test_settings_are_assigned_by_name():
         ("optim.epochs.x=3", "field 'optim.epochs' must be a whole number"),
         ("optim.epochs=3.5", "field 'optim.epochs' must be a whole number, found 3.5"),
         ("seed=[", "is not YAML"),
-    ],
-)
-def test_an_assignment_that_makes_no_sense_is_named(assignment, problem):
-    with pytest.raises(InputError) as refused:
-        configuration.assign(TrainConfig(), [assignment])
-    assert assignment in str(refused.value) and problem in str(refused.value)
+    ):
+        with pytest.raises(InputError) as refused:
+            configuration.assign(TrainConfig(), [assignment])
+        assert assignment in str(refused.value) and problem in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("hint", "words", "value"),
-    [
+def test_words_of_a_command_line_are_values():
+    for hint, words, value in (
         (int, ["3"], 3),
         (float, ["1e-3"], 1e-3),
         (float | None, ["null"], None),
@@ -238,27 +230,19 @@ def test_an_assignment_that_makes_no_sense_is_named(assignment, problem):
         (str | tuple[str, ...], ["one"], "one"),
         (str | tuple[str, ...], ["one", "two"], ("one", "two")),
         (Path, ["010"], Path("010")),
-    ],
-)
-def test_words_of_a_command_line_are_values(hint, words, value):
-    found = configuration.value_from_words(hint, words, "--x")
-    assert found == value and type(found) is type(value)
-
-
-@pytest.mark.parametrize(
-    ("hint", "words", "problem"),
-    [
+    ):
+        found = configuration.value_from_words(hint, words, "--x")
+        assert found == value and type(found) is type(value)
+    for hint, words, problem in (
         (int, ["3.5"], "--x: must be a whole number, found 3.5"),
         (str | tuple[int, ...], ["1", "x"], "--x: must be a whole number, found 'x'"),
         (int, ["0x10"], "--x: must be a whole number, found '0x10'"),
         (float, [".inf"], "--x: must be a number, found '.inf'"),
         (tuple[int, ...], ["1", "a"], "--x: must be a whole number, found 'a'"),
-    ],
-)
-def test_words_that_are_no_values_are_named(hint, words, problem):
-    with pytest.raises(InputError) as refused:
-        configuration.value_from_words(hint, words, "--x")
-    assert str(refused.value) == problem
+    ):
+        with pytest.raises(InputError) as refused:
+            configuration.value_from_words(hint, words, "--x")
+        assert str(refused.value) == problem
 
 
 def test_settings_of_a_program_may_be_numbers_of_numpy():
@@ -268,9 +252,6 @@ def test_settings_of_a_program_may_be_numbers_of_numpy():
     with pytest.raises(InputError, match=r"config: field 'filter\.noise\.gyro_density'"):
         configuration.validate(TrainConfig(filter=changed(noise={"gyro_density": np.float32(0)})))
 
-
-# Files of earlier versions
-# ------------------------------------------------------------------------------------------------
 
 OLD = """
 dataset: oxiod
@@ -334,18 +315,15 @@ def test_the_config_of_an_old_run_is_the_same_experiment():
     assert read(folded).data.train_split == "train-1of4"
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "problem"),
-    [
+def test_an_old_file_that_asks_for_what_is_gone_is_refused():
+    for before, after, problem in (
         ("scale_error_std: 0.0", "scale_error_std: 0.1", "'filter.scale_error_std' is 0.1, and"),
         ("ema_decay: 0.0", "ema_decay: 0.99", "field 'optim.ema_decay' is 0.99, and there is no"),
         ("tilt_std_degrees: 2.0", "tilt_std_degrees: a", "'filter.tilt_std_degrees' must be a num"),
         ("gyro_density: 0.02", "gyro_density: -1.0", "'filter.noise.gyro_density' must be posit"),
         ("yaw_std_degrees: 0.1", f"yaw_std_degrees: 1{'0' * 400}", "is larger than any number"),
         (OLD, "checkpoint_every_seconds: 600.0", "unknown field 'checkpoint_every_seconds'"),
-    ],
-)
-def test_an_old_file_that_asks_for_what_is_gone_is_refused(before, after, problem):
-    with pytest.raises(InputError) as refused:
-        read(OLD.replace(before, after))
-    assert problem in str(refused.value)
+    ):
+        with pytest.raises(InputError) as refused:
+            read(OLD.replace(before, after))
+        assert problem in str(refused.value)

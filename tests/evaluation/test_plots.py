@@ -92,19 +92,6 @@ def test_without_a_reference_nothing_is_called_an_error(estimates):
     assert len(plots.sequence(bare).axes) == 2
 
 
-def test_an_estimate_lost_before_the_reference_begins_is_drawn(estimates):
-    """No row has both, so nothing aligns it: the error is not there, its bounds are."""
-    whole, rows = estimates[0], np.arange(400)[:, None]
-    path, reference = (
-        Trajectory(of.time, *(np.where(there, part, np.nan) for part in of[1:]))
-        for of, there in ((whole.trajectory, rows < 5), (whole.reference, rows >= 10))
-    )
-    figure = plots.sequence(plots.view(whole._replace(trajectory=path, reference=reference)))
-    for axes in figure.axes[1:3]:
-        assert np.isnan(axes.get_lines()[0].get_ydata()).all()
-        assert np.isfinite(axes.collections[0].get_paths()[0].vertices).all()
-
-
 def test_the_distribution_of_errors_counts_what_diverged(with_divergence):
     of, made = with_divergence
     figure = plots.error_cdf([plots.view(each, "se3") for each in of], made)

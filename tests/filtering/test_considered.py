@@ -150,10 +150,6 @@ def test_nothing_considered_adds_nothing_and_a_negative_size_is_refused():
             filtering.considered_covariance(ones, STD._replace(**{name: wrong}))
 
 
-# The tracker
-# ------------------------------------------------------------------------------------------------
-
-
 class Told:
     """A network whose next displacement the test chooses, and the number of its calls."""
 

@@ -166,8 +166,7 @@ def test_windows_with_a_long_hole_are_no_measurements(config, last):
 
 
 def test_unhealthy_once_is_unhealthy_for_good(tracker):
-    """A knock to some 140 m/s and back: the filter comes back, so nothing but memory can tell. What
-    begins with its state is unhealthy, too."""
+    """A knock to some 140 m/s and back: the filter comes back, so nothing but memory can tell."""
     gyro, accel = (signal.copy() for signal in recording())
     accel[98:106] += [900.0, 0, 0]
     accel[106:114] -= [900.0, 0, 0]
@@ -181,8 +180,6 @@ def test_unhealthy_once_is_unhealthy_for_good(tracker):
     assert not final.healthy and not tracker.filter_state().healthy
     tracker._start(tracker.filter_state())
     assert tracker.pose().healthy is False
-    _, again = scan(final, *recording(), np.ones(len(gyro), bool))
-    assert (np.asarray(again.healthy) == 0).all()
 
 
 def test_a_stop_of_the_stream_is_caught_up_in_one_push(tracker):
@@ -362,10 +359,6 @@ def test_a_rest_without_gravity_is_told_once_and_another_starts(built):
         tracker.push(time[-1], gyro[0], accel[0])
 
 
-# A faster IMU
-# ------------------------------------------------------------------------------------------------
-
-
 @functools.cache
 def walk(rate):
     """8 s on foot, shaken at 44, 49 and 40 Hz: at 50 Hz aliases to 6, 1 and 10 Hz. A start, and
@@ -452,9 +445,6 @@ def test_the_rate_is_measured_as_long_as_the_stream_lasts(tracker, kind):
     assert kind != "a change"
 
 
-# The example
-# ------------------------------------------------------------------------------------------------
-
 ROOT = Path(__file__).parents[2]
 
 
@@ -518,17 +508,3 @@ def test_a_recording_is_replayed(workdir, replay, tmp_path, monkeypatch, capsys)
     np.testing.assert_allclose(np.linalg.norm(found[:, 4:], axis=1), 1, atol=1e-6)
     assert (tmp_path / "out" / "found.png").read_bytes()[:4] == b"\x89PNG"
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["found.png", "found.txt"]
-
-
-def test_a_mistake_of_a_replay_is_one_line(workdir, replay, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(online, "compile_programs", lambda *_: (None, None))  # no pose is made
-    write_walk(tmp_path / "walk.csv")
-    lines = (tmp_path / "walk.csv").read_text().splitlines()
-    (tmp_path / "short.csv").write_text("\n".join(lines[:30]))
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(SystemExit) as left:
-        replay("--csv", "short.csv", "--weights", workdir)
-    out, err = capsys.readouterr()
-    assert left.value.code == 2 and out == "" and len(err.splitlines()) == 1
-    assert "short.csv: ends before the device was still for 1 s" in err
-    assert sorted(tmp_path.rglob("*")) == before

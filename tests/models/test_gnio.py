@@ -6,7 +6,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from flax import linen as nn
 
 from gnio_jax import models
@@ -19,9 +18,6 @@ from tests.support.networks import drawn, predicted, shapes
 from tests.support.numpy_layers import conv, float64, linear, relu, resnet, sigmoid, softmax
 from tests.support.numpy_layers import conv_norm as numpy_conv_norm
 from tests.support.tiny_network import Tiny
-
-# How it starts
-# ------------------------------------------------------------------------------------------------
 
 
 def test_the_bank_starts_alive():
@@ -79,10 +75,6 @@ def test_first_parameters_are_those_of_flax_and_another_seed_compiles_nothing(ca
     assert jax.tree.structure(shapes) == jax.tree.structure(found)
     for shape, leaf in zip(*map(jax.tree.leaves, (shapes, found)), strict=True):
         assert (shape.shape, shape.dtype) == (leaf.shape, leaf.dtype)
-
-
-# What it computes
-# ------------------------------------------------------------------------------------------------
 
 
 def block(x, q, s, stride):
@@ -190,40 +182,3 @@ def test_training_mode_updates_the_statistics_with_momentum():
     for name, batch in (("mean", x.mean((0, 1))), ("var", x.var((0, 1)))):
         wanted = 0.9 * before["stem_bn"][name] + 0.1 * batch
         np.testing.assert_allclose(after[name], wanted, rtol=1e-4, atol=1e-5)
-
-
-# What it costs
-# ------------------------------------------------------------------------------------------------
-
-
-def test_a_window_costs_what_is_counted_by_hand():
-    """Cost of the compiled program: the multiply-adds of a window counted by hand, the bank's
-    projections not repeated per window."""
-
-    def products(length, size, stride, channels, features):  # those that do not meet the padding
-        before = (size - 1) // 2
-        outputs = (length + 2 * before - size) // stride + 1
-        inside = sum(
-            0 <= i * stride + j - before < length for i in range(outputs) for j in range(size)
-        )
-        return inside * channels * features, outputs
-
-    total, length = products(200, 7, 2, 6, 64)
-    length, channels = (length - 1) // 2 + 1, 64
-    for features, stride in ((64, 1), (128, 2), (256, 2), (512, 2)):
-        shortcut = 0 if stride == 1 else products(length, 1, stride, channels, features)[0]
-        first, length = products(length, 3, stride, channels, features)
-        total += first + shortcut + 3 * products(length, 3, 1, features, features)[0]
-        channels = features
-    # The bank's query, output, scores and context, and the heads.
-    total += 2 * 512 * 512 + 2 * 64 * 512 + 3 * 3 * 512
-    model, variables = models.create("gnio"), shapes("gnio")
-
-    @functools.cache
-    def flops(batch):
-        windows = jax.ShapeDtypeStruct((batch, 200, 6), jnp.float32)
-        return jax.jit(model.apply).lower(variables, windows).cost_analysis()["flops"]
-
-    per_window = (flops(65) - flops(1)) / 64
-    assert per_window == pytest.approx(2 * total, rel=0.02)
-    assert flops(1) - per_window == pytest.approx(2 * 2 * 64 * 512 * 512, rel=0.05)

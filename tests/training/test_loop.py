@@ -74,10 +74,6 @@ def test_validation_is_the_plain_mean_over_every_window(recording, finished):
     assert rows(finished[0])[-1]["val_mse"] == pytest.approx(found, rel=1e-4)
 
 
-# Resuming
-# ------------------------------------------------------------------------------------------------
-
-
 def test_stopped_and_killed_and_resumed_gives_the_same_bits(
     recording, finished, tmp_path, monkeypatch
 ):
@@ -200,10 +196,6 @@ def test_two_trainings_in_one_folder(recording, tmp_path):
     assert (tmp_path / "run" / "config.yaml").read_bytes() == written
 
 
-# Loading
-# ------------------------------------------------------------------------------------------------
-
-
 def test_runs_that_cannot_be_loaded(recording, finished, tmp_path):
     def refused(problem, run):
         with pytest.raises(InputError, match=problem):
@@ -233,10 +225,6 @@ def test_a_run_of_an_earlier_version_is_evaluated_and_not_resumed(recording, fin
     assert same(arrays(tmp_path / "run", "best"), arrays(finished[0], "best"))
     with pytest.raises(InputError, match=r"is of an earlier version of .*; begin .* --init-from"):
         loop.train(config(recording, tmp_path / "run"), resume=True)
-
-
-# Networks that go astray
-# ------------------------------------------------------------------------------------------------
 
 
 def test_a_head_that_no_gradient_reaches_is_told_of(recording, finished):
@@ -301,10 +289,6 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
     assert len(texts) >= 2
     assert all("xf32>" in text and "f64" not in text for text in texts)
     assert {leaf.dtype for leaf in jax.tree.leaves(trained)} == {np.dtype("float32")}
-
-
-# What validation decides
-# ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
