@@ -3,11 +3,7 @@
 import ast
 import importlib
 import re
-import shlex
-import shutil
-import subprocess
 import tomllib
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -232,33 +228,6 @@ def test_what_else_the_shell_is_told_is_there():
         for module in re.findall(r"^python -m ((?:gnio_jax|benchmarks)[\w.]*)", line):
             path = pages.ROOT / module.replace(".", "/")
             assert path.is_dir() or path.with_suffix(".py").is_file(), f"{page}: {module}"
-
-
-def commands_of(shell):
-    """The words of each call of gnio."""
-    lines = [shlex.split(line) for line in shell.replace("\\\n", " ").splitlines()]
-    return [words for words in lines if words and Path(words[0]).name == "gnio"]
-
-
-@pytest.mark.skipif(not shutil.which("make"), reason="no make here")
-def test_the_recipe_of_the_shipped_network_is_what_make_runs():
-    text = configuration.find("pedestrian").read_text(encoding="utf-8")
-    told = commands_of("\n".join(re.findall(r"^#   +(.*)$", text, re.M)))
-    command = ["make", "--dry-run", "pedestrian", "RUNS=runs"]
-    said = subprocess.run(command, cwd=pages.ROOT, capture_output=True, text=True, check=True)
-    made = commands_of(said.stdout)
-    assert [sorted(words[1:]) for words in made] == [sorted(words[1:]) for words in told]
-    # Each step reads what an earlier one has left.
-    left = set()
-    for _, command, *words in made:
-        asked = understood([command, *words])
-        if command == "train":
-            poses = [each.partition("=")[2] for each in asked.set]
-            assert set(poses) <= left
-            left.add(asked.workdir)
-        else:
-            assert asked.workdir in left
-            left.add(f"{asked.workdir}_calibrated")
 
 
 def test_the_reference_has_every_room():

@@ -104,7 +104,11 @@ def test_the_page_is_one_file_that_loads_nothing(written, runs):
 
 
 def test_without_a_reference_nothing_is_called_an_error(estimates):
-    text = page.render("blind", [run_of([estimates[2]._replace(name="a<b_c-d e")])])
+    run = run_of([estimates[2]._replace(name="a<b_c-d e")])
+    run = run._replace(warnings=("it <moves>",), about={"weights": "of walks"})
+    text = page.render("blind", [run])
+    assert text.count("of walks") == 1 and "warning: it &lt;moves&gt;" in text
+    assert text.index("it &lt;moves&gt;") < text.index('class="figures"') < text.index("of walks")
     assert "error (m)" not in text
     assert r"3\\u03c3 (m)" in text  # as JSON in a script has it
     assert '"value":"start"' in text
@@ -112,13 +116,6 @@ def test_without_a_reference_nothing_is_called_an_error(estimates):
     assert "<td>a&lt;b_<wbr>c-<wbr>d <wbr>e</td>" in text  # names break between their words
     # χ² does not go by the name of the network's gate.
     assert "refused above 11.3" in text and '"gate (11' not in text
-
-
-def test_warnings_stand_before_the_figures_and_the_weights_once(estimates):
-    run = run_of(estimates[:1])._replace(warnings=("it <moves>",), about={"weights": "of walks"})
-    text = page.render("walk", [run])
-    assert text.count("of walks") == 1 and "warning: it &lt;moves&gt;" in text
-    assert text.index("it &lt;moves&gt;") < text.index('class="figures"') < text.index("of walks")
 
 
 def test_evaluations_beside_are_read_back(tmp_path, estimates, made):

@@ -79,21 +79,18 @@ def test_a_difference_has_the_digits_of_its_interval_and_a_mean_its_seeds():
     assert tabulate.mean(mean._replace(mean=None, seeds=[]), 2) == "–"
 
 
-MEAN, LESS = Summary(1.0, [1.0], 1.0, None, 3, 2, 0, 3), Difference(-1, (-2, 0), 50, 2, 3, 3, 2)
-
-
-@pytest.mark.parametrize(
-    "mean, difference, beginnings",
-    [
-        (MEAN, LESS, ["The interval is Student's t over people or sessions; there are 2."]),
-        (MEAN, LESS._replace(compared=2), ["The interval", "A difference is over"]),
-        (MEAN._replace(diverged=1), LESS, ["The interval", "† "]),
-        (MEAN, Difference(None, None, None, 0, 3, 3, 1, True), ["‡ "]),
-        (MEAN._replace(seeds=[np.inf]), None, ["∞"]),
-        (MEAN._replace(mean=None, seeds=[]), None, ["–"]),
-    ],
-)
-def test_marks_are_explained(mean, difference, beginnings):
-    found = tabulate.marks([Cell(MEAN, None), Cell(mean, difference)])
-    assert len(found) == len(beginnings)
-    assert all(line.startswith(words) for line, words in zip(found, beginnings, strict=True))
+def test_marks_are_explained():
+    mean = Summary(1.0, [1.0], 1.0, None, 3, 2, 0, 3)
+    less = Difference(-1, (-2, 0), 50, 2, 3, 3, 2)
+    withheld = Difference(None, None, None, 0, 3, 3, 1, True)
+    for cell, beginnings in (
+        (Cell(mean, less), ["The interval is Student's t over people or sessions; there are 2."]),
+        (Cell(mean, less._replace(compared=2)), ["The interval", "A difference is over"]),
+        (Cell(mean._replace(diverged=1), less), ["The interval", "† "]),
+        (Cell(mean, withheld), ["‡ "]),
+        (Cell(mean._replace(seeds=[np.inf]), None), ["∞"]),
+        (Cell(mean._replace(mean=None, seeds=[]), None), ["–"]),
+    ):
+        found = tabulate.marks([Cell(mean, None), cell])
+        assert len(found) == len(beginnings)
+        assert all(line.startswith(words) for line, words in zip(found, beginnings, strict=True))

@@ -152,13 +152,3 @@ def test_it_is_chosen_when_the_network_is_made(monkeypatch, calls, name):
     windows = jnp.zeros((1, 64, 6), jnp.float32)
     jax.eval_shape(lambda key: made.init(key, windows, train=True), jax.random.key(0))
     assert calls
-
-
-@pytest.mark.parametrize("length", [50, 13])
-def test_max_pool_against_torch_convention(length):
-    """Of negative numbers: a zero padding would show."""
-    x = -1 - np.random.default_rng(0).random((2, length, 3)).astype(np.float32)
-    rows = range(0, length + 2 - 3 + 1, 2)
-    padded = np.pad(x, ((0, 0), (1, 1), (0, 0)), constant_values=-np.inf)
-    wanted = np.stack([padded[:, r : r + 3].max(axis=1) for r in rows], axis=1)
-    np.testing.assert_array_equal(quick(convolution.max_pool)(jnp.asarray(x)), wanted)
