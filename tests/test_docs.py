@@ -66,7 +66,6 @@ def run(page, code, names=None):
 
 
 def code_of(page):
-    """The blocks of a page that run, one after another."""
     return "\n".join(block.code for block in RUN if block.page == page)
 
 
@@ -83,7 +82,6 @@ def test_the_example_of_the_readme(one_walk, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_the_loop_of_ones_own(one_walk, capsys):
-    """A quarter of its piece and of its steps."""
     run("docs/differentiable_filter.md", code_of("docs/differentiable_filter.md"))
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     losses = [float(loss) for _, loss in lines[:5]]
@@ -118,7 +116,6 @@ def test_a_head_of_ones_own(monkeypatch):
 
 
 def test_a_dataset_of_two_csv_files(walks, tmp_path):
-    """A walk in the layout of the example is read back."""
     walk = data.resample(walks[0], 100.0)
     (tmp_path / "anna_1").mkdir()
     (tmp_path / "test.txt").write_text("anna_1\n", encoding="utf-8")
@@ -169,7 +166,6 @@ def test_code_names_what_there_is(place):
 
 
 def member(module, name):
-    """What `from module import name` gives."""
     try:
         return importlib.import_module(f"{module}.{name}")
     except ModuleNotFoundError:
@@ -214,7 +210,6 @@ def test_a_command_line_of_yesterday_is_not():
 
 
 def test_what_else_the_shell_is_told_is_there():
-    """Targets of make, extras of pip, modules and scripts of Python."""
     makefile = (pages.ROOT / "Makefile").read_text(encoding="utf-8")
     targets = set(re.findall(r"^([a-z]+):", makefile, re.M))
     project = tomllib.loads((pages.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -275,6 +270,5 @@ def test_a_link_within_the_repository_leads_somewhere(page):
 
 
 def headings(page):
-    """The anchors of a page, as MkDocs and GitHub name them."""
     found = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title).lower().replace(" ", "-") for title in found}

@@ -26,7 +26,6 @@ slopes_of_integrate_turns = jax.jit(jax.jacrev(geometry.integrate_turns, (0, 1))
 
 @jax.jit
 def curvature_of_exp(phi, along):
-    """The second derivative along one direction."""
     slope = lambda p: jax.jvp(geometry.exp, (p,), (along,))[1]  # noqa: E731
     return jax.jvp(slope, (phi,), (along,))[1]
 
@@ -208,8 +207,6 @@ def alignment(x, y, weight):
 
 @pytest.mark.parametrize("collinear", [False, True])
 def test_planar_alignment(collinear):
-    """Against SciPy's least squares over angle and shift, and its derivatives against
-    differences."""
     rng = np.random.default_rng(0)
     weight = rng.uniform(0.1, 2, 6)
     x = np.outer(rng.normal(size=6), [2.0, 1.0]) if collinear else rng.normal(size=(6, 2))

@@ -40,7 +40,6 @@ LIMIT = 300
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A TLIO folder of three short walks."""
     return write_splits(tmp_path_factory.mktemp("tlio"))
 
 
@@ -99,7 +98,6 @@ def trained_together(
 
 
 def assert_same_run(workdir, other):
-    """The losses of both, and what they have learnt."""
     ours, theirs = tiny_run.rows(workdir), tiny_run.rows(other)
     assert [row["step"] for row in ours] == [row["step"] for row in theirs]
     for name in ("loss", "val_loss", "val_mse", "val_nll"):
@@ -109,7 +107,6 @@ def assert_same_run(workdir, other):
 
 @pytest.fixture(scope="module")
 def alone(run, tmp_path_factory):
-    """One process with one device, uninterrupted."""
     workdir = tmp_path_factory.mktemp("alone") / "run"
     (end,) = run(workdir, 1, 1)
     assert end[0] == 0, end
@@ -130,7 +127,6 @@ def test_processes_and_devices_change_nothing_but_rounding(
 
 @pytest.mark.slow
 def test_processes_that_do_not_belong_together_are_refused(run, tmp_path):
-    """One has other settings: none of them trains."""
     ends = run(tmp_path / "run", 2, 1, options_of={1: ("--optim.epochs", "3")})
     assert [status for status, _ in ends] == [2, 2], ends
     for _, lines in ends:
@@ -293,7 +289,6 @@ def test_a_wrong_text_is_one_line():
 
 
 def test_one_process_meets_nobody(monkeypatch):
-    """Also with a launcher's variable that is empty, or says 1."""
     monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: pytest.fail("it meets"))
     for count in ("", "1"):
         monkeypatch.setenv("SLURM_STEP_NUM_TASKS", count)

@@ -257,7 +257,6 @@ def test_the_noises_and_errors_of_simulated_walks_are_found():
 
 
 def test_the_gradient_is_that_of_the_likelihood():
-    """Along two directions, in which all of the numbers change."""
     free = free_parameters(TRUE, PATHS)
     fixed = {"names": tuple(free), "config": innovation_config(DATA, TRUE)}
     free, rng = np.array(list(free.values())), np.random.default_rng(0)
@@ -276,7 +275,6 @@ def test_the_gradient_is_that_of_the_likelihood():
 
 @pytest.mark.parametrize(("raw", "expected"), [(True, 0.05), (False, 1e-3)])
 def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(raw, expected):
-    """Every other walk starts as the settings say, whatever it was prepared with."""
     settings = dataclasses.replace(TRUE, raw_gyro_bias=0.05)
     walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
     walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
@@ -286,7 +284,6 @@ def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(raw, ex
 
 
 def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told(monkeypatch):
-    """Of other walks, with other factors of the axes and another start."""
     given, _ = walks_and_truth()
     monkeypatch.setitem(fitting.PHYSICAL, "noise.measurement_scale", (1e8, 1e9))
     warning, outside = fit(given, TRUE, most_steps=1).warnings
@@ -302,7 +299,6 @@ def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told
 
 
 def test_a_search_begins_anew_until_that_gains_nothing(monkeypatch):
-    """Where one ended too early, e.g. after a trial step to where the gradient explodes."""
     begun = []
 
     def minimize(function, at, options, **_):
@@ -441,7 +437,6 @@ def test_the_prior_counts_as_many_independent_errors_as_there_are():
 
 
 def nees(found):
-    """Mean over all positions of eᵀ P⁻¹ e / 3."""
     inverse = np.linalg.inv(found.covariance)
     return np.einsum("ki,kij,kj->k", found.error, inverse, found.error).mean() / 3
 

@@ -31,7 +31,6 @@ def read(text):
 
 
 def refused(text):
-    """Place, problem and remedy of the mistake in a file."""
     with pytest.raises(InputError) as mistake:
         read(text)
     assert "\n" not in str(mistake.value) and len(str(mistake.value)) < 400
@@ -246,7 +245,6 @@ def test_words_of_a_command_line_are_values():
 
 
 def test_settings_of_a_program_may_be_numbers_of_numpy():
-    """They are what a calibration gives; their bounds hold for them too."""
     config = TrainConfig(filter=changed(noise={"gyro_density": np.float32(1e-3)}))
     assert configuration.validate(config) is config
     with pytest.raises(InputError, match=r"config: field 'filter\.noise\.gyro_density'"):

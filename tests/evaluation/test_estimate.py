@@ -87,7 +87,6 @@ def test_integration_against_a_loop(walks):
 
 
 def test_a_stride_without_a_window_goes_on_as_before():
-    """Those before all windows take the movement of the first."""
     nan = np.nan
     steps = np.array([nan, nan, 1, 1, nan, nan, nan, 2])[:, None] * np.ones(3)
     np.testing.assert_allclose(mean_over_windows(steps, 2)[:, 0], [1, 1, 1, 1, 1, 1, 1, 2, 2])
@@ -163,7 +162,6 @@ def same(a, b, tolerance):
 
 
 def test_batches_change_nothing(walks):
-    """Nor does padding, nor a batch that is filled up; answers are in order."""
     recordings, told = ready(walks), []
     for way, tolerance in ((tight, 1e-5), (with_truth, 1e-9)):
         pairs = way(recordings, batch_size=2, progress=told.append)
@@ -187,7 +185,6 @@ def test_batches_are_of_few_lengths_and_little_padded():
 
 
 def test_one_program_serves_every_scale_and_every_source_of_displacements(walks):
-    """A standard deviation is a number of the run, and so is where displacements are from."""
     recordings = ready(walks[:2], orientation="reference")
     (_, one), _, _ = tight(recordings), loose(recordings), imu_only(recordings)
     programs, scale = _run._cache_size(), OPTIONS.noise.measurement_scale
@@ -205,7 +202,6 @@ def test_one_program_serves_every_scale_and_every_source_of_displacements(walks)
 
 
 def test_what_the_filter_calls_void_has_diverged(walks):
-    """One leap of the accelerometer: all numbers stay finite."""
     accel, row = walks[0].accel.copy(), 91
     accel[450] *= 1e5
     void, whole = tight(ready([walks[0]._replace(accel=accel), walks[1]]))
@@ -238,7 +234,6 @@ def test_tight_and_loose_see_the_same_windows(clean, walks):
 
 @pytest.mark.parametrize("way", [tight, loose, summed])
 def test_every_estimator_takes_waypoints_along(walks, way):
-    """And a recording with poses beside them is as it was."""
     both = ready([walks[0], with_waypoints(walks[1])], orientation="filter")
     (first, second), (own, _) = way(both), way(ready(walks[:2], orientation="filter"))
     np.testing.assert_allclose(first.trajectory.position, own.trajectory.position, atol=1e-6)

@@ -186,7 +186,6 @@ def test_folders_tell_choices_apart():
 
 
 def test_figures_of_other_recordings_are_left_alone(tmp_path, monkeypatch):
-    """Also where both folders of data bear the dataset's name, and where $GNIO_DATA names them."""
     roots = [tmp_path / name / "csv" for name in "ABC"]
     for root in roots:
         root.mkdir(parents=True)

@@ -57,7 +57,6 @@ def test_thinned_curves_keep_the_largest_innovation(walks):
 
 
 def test_the_map_has_room_for_the_ellipses(walks):
-    """However large they are."""
     walk = walks[0]
     for size in (1.0, 1e6):
         seen = run_of([with_covariance(walk, size * walk.filtered.covariance)])
@@ -119,7 +118,6 @@ def test_without_a_reference_nothing_is_called_an_error(estimates):
 
 
 def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
-    """With their paths and figures; what is of other recordings or another network is left away."""
     settings = SETTINGS | {"model": "gnio", "checkpoint": "best", "step": 7}
     settings |= {"rate": 100.0, "window_seconds": 1.0, "context_seconds": 0.0}
     summed = {"estimator": "integrate", "coupling": None, "orientation_source": "device"}
@@ -169,8 +167,6 @@ CHOOSE = """(() => {
 @pytest.mark.slow
 @needs_browser
 def test_in_a_browser(written, walks):
-    """It opens from the disk, asks for nothing, has equal axes and says where the walk is; on a
-    phone it is one column."""
     whole = plots.view(walks[0])
     error = np.linalg.norm((whole.position - whole.reference)[:, :2], axis=1)
     shapes = plots.ellipses(whole.filtered.covariance)

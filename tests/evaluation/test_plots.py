@@ -79,7 +79,6 @@ def test_the_picture_of_a_sequence(estimates):
 
 
 def test_without_a_reference_nothing_is_called_an_error(estimates):
-    """And without a gate it is shown which displacements were used; without a filter neither."""
     blind = estimates[2]
     blind = blind._replace(displacements=blind.displacements._replace(diagnostics={}))
     figure = plots.sequence(plots.view(blind, alignment=None))

@@ -31,7 +31,6 @@ def rows(folder):
 
 
 def test_what_is_written_is_read_back_whole(tmp_path, estimates, made, with_divergence):
-    """Infinite figures too; each sequence has its files."""
     made = made._replace(placements={"room 1/walk": "in a hand"})
     for place, of, wanted in (
         (tmp_path / "a", *with_divergence),
@@ -63,7 +62,6 @@ def test_what_is_written_is_read_back_whole(tmp_path, estimates, made, with_dive
 
 
 def test_what_the_estimator_gave_is_there_for_numpy(tmp_path, estimates):
-    """Without a filter nothing is there of one."""
     walk, summed = estimates[0], estimates[1]._replace(filtered=None, states=None)
     write(tmp_path, reported([walk, summed]), [walk, summed])
     first, second = (np.load(tmp_path / "states" / f"room_1_walk{end}.npz") for end in ("", "_"))
@@ -78,7 +76,6 @@ def test_what_the_estimator_gave_is_there_for_numpy(tmp_path, estimates):
 
 
 def test_trajectories_are_read_back_at_their_own_stamps(tmp_path, estimates, made):
-    """The reference where it is known, the estimate up to where it diverged."""
     whole, rows = estimates[0], np.arange(400)
     holes, ends = (rows >= 20) & (rows < 30), rows >= 390
 
@@ -116,7 +113,6 @@ def test_divergence_is_in_the_files(tmp_path, with_divergence):
 
 
 def test_no_page_is_lost_and_none_is_of_other_figures(tmp_path, estimates, made, no_pictures):
-    """Figures that are made anew without pictures take those that were there along."""
     folder, of = tmp_path / "e", estimates[:1]
     first = made._replace(scores=score(of))
     write(folder, first, of)

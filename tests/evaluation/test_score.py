@@ -15,8 +15,6 @@ SPIN = Rotation.from_euler("z", 0.7)
 
 @pytest.fixture
 def files(tmp_path):
-    """Writes a reference and an estimate."""
-
     def write(reference, estimate):
         for name, path in (("truth", reference), ("odometry", estimate)):
             write_tum(tmp_path / f"{name}.txt", path)
@@ -34,7 +32,6 @@ def thinned(path, every, shift=0.0, seed=0):
 
 @pytest.mark.parametrize("of_truth, of_estimate", [(1, 5), (5, 1), (2, 3)])
 def test_poses_are_matched_as_evo_matches_them(files, of_truth, of_estimate):
-    """Whichever file has more of them; a hole of the reference counts nowhere."""
     pytest.importorskip("evo.core.sync")
     from evo.core import metrics, sync
     from evo.tools.file_interface import read_tum_trajectory_file

@@ -16,7 +16,6 @@ def text(report, width=80):
 
 
 def rows(report, width=80):
-    """First cell -> the line's words."""
     lines = [line for line in text(report, width).splitlines() if line.startswith("  ")]
     return {line.split("  ")[1].strip(): line.split() for line in lines}
 
@@ -38,8 +37,6 @@ def test_the_table_says_what_matters(made):
 
 @pytest.mark.parametrize("tapped", [False, True])
 def test_the_table_fits_into_80_columns_and_breaks_names_between_their_words(made, tapped):
-    """Also with large errors, and with walks that have waypoints: what a reader asks first is there
-    for every sequence."""
     name, measured = "2023-11-25T12-30_person-17_pocket_left_down", made.scores["room 1/walk"]
     values = dict.fromkeys([*measured.values, *(OF_WAYPOINTS if tapped else ())], 123456.7)
     scores = {name: measured._replace(values=values), "b": measured}

@@ -125,8 +125,6 @@ def test_settings_that_make_no_sense_are_refused_by_name():
 
 
 def test_the_precision_is_asked_for():
-    """float32 only where the settings allow it; without x64 the message says how to switch it
-    on."""
     single = [part.astype(np.float32) for part in POSE]
     with pytest.raises(ValueError, match=r"^rotation: .*float64, found float32.*allow_float32"):
         filtering.initial_state(CONFIG, *single)

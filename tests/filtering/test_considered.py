@@ -35,7 +35,6 @@ def walks():
 
 
 def drawn():
-    """The errors of each run, from `STD`."""
     return SPREAD * np.random.default_rng(1).standard_normal((RUNS, 6))
 
 
@@ -172,7 +171,6 @@ TOLD = Told()
 
 @pytest.fixture(scope="module")
 def ready():
-    """The programs of every tracker below."""
     tracker = filtering.Tracker(TOLD, CONFIG, NOISE, started(0), considered=STD)
     return tracker._advance, tracker._look_ahead
 
@@ -183,14 +181,12 @@ def built(monkeypatch, ready):
 
 
 def started(r):
-    """The start of a run with its own errors."""
     runs, _ = walks()
     pose = runs.rotation0[r], runs.velocity0[r], runs.position0[r]
     return filtering.initial_state(CONFIG, *pose, drawn()[r, :3], std=START)
 
 
 def test_the_tracker_has_the_covariance_of_the_whole_run(built):
-    """At clone steps; between them it goes on like the filter's own."""
     (history, _, added), _ = filtered()
     (runs, _), wanted = walks(), history.covariance + added
     TOLD.calls = 0

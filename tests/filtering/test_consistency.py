@@ -118,7 +118,6 @@ def correlated():
 
 
 def test_it_is_as_certain_as_it_may_be_with_correlated_errors():
-    """Taken for white they make the filter too certain, and worse."""
     runs, position = correlated(), PARTS["position"]
     error, spread, nis, _ = monte_carlo(runs, CORRELATED_SIGMA, ERRORS.share)
     assert 0.9 < nis[:, 100:].mean() / 3 < 1.1

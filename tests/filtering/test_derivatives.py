@@ -176,8 +176,6 @@ def test_gradient_against_differences():
 
 
 def test_a_truncated_gradient_takes_the_state_for_given():
-    """What is felt behind the cut has no derivative by what lies before it, and its whole one by
-    what lies behind."""
     x, samples = point(), slice(HALF * N, None)
     _, _, gradient = at([x], LATE)
     for name in ("std", "state", "fix"):
@@ -209,8 +207,6 @@ def test_gradients_are_finite_for_hostile_input():
 
 
 def scanned(scan, start, inputs):
-    """A scalar of a scan's carry and of all that it returns."""
-
     def step(carry, x):
         carry = jnp.tanh(carry @ (jnp.eye(2) + x["turn"])) + x["push"]
         return carry, {"square": carry**2, "first": carry[0]}
@@ -221,8 +217,6 @@ def scanned(scan, start, inputs):
 
 
 def cut_by_hand(every):
-    """A scan whose carry is handed on without gradient after so many steps."""
-
     def scan(step, carry, inputs):
         rows = []
         for first in range(0, 13, every):

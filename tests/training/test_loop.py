@@ -57,7 +57,6 @@ def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished)
 
 
 def test_validation_is_the_plain_mean_over_every_window(recording, finished):
-    """With the parameters that evaluation loads."""
     (walk,) = data.load("tlio", recording, "val")
     found = mean_square_error(checkpoint.load_run(finished[0], "latest"), walk)
     assert rows(finished[0])[-1]["val_mse"] == pytest.approx(found, rel=1e-4)
@@ -207,7 +206,6 @@ def test_runs_that_cannot_be_loaded(recording, finished, tmp_path):
 
 
 def test_a_run_of_an_earlier_version_is_evaluated_and_not_resumed(recording, finished, tmp_path):
-    """Its weights are read; the optimizer's state was another."""
     age(shutil.copytree(finished[0], tmp_path / "run"))
     assert same(arrays(tmp_path / "run", "best"), arrays(finished[0], "best"))
     with pytest.raises(InputError, match=r"is of an earlier version of .*; begin .* --init-from"):
@@ -338,7 +336,6 @@ def test_nan_on_validation_is_never_the_best(counted, tmp_path):
 
 
 def test_a_rate_that_has_fallen_stays_fallen_in_a_resumed_run(counted, tmp_path, monkeypatch):
-    """The plateau's factor, best value and idle epochs are kept with the checkpoint."""
     monkeypatch.setattr(optimizer, "PLATEAU_EPOCHS", 1)
     figures = [(1.0, 1.0), *[(2.0, 2.0)] * 5]  # the rate falls after epochs 2 and 4
     _, factors = counted(figures, "alone")

@@ -174,7 +174,6 @@ def by_formula(step, steps_per_epoch, warmup, epochs):
 
 @pytest.mark.parametrize("epochs, warmup", [(200, 5), (4, 2)])
 def test_schedule_of_the_paper(epochs, warmup):
-    """Short runs (4 epochs for a warm-up of 5) warm up for their first half."""
     rate = optimizer.schedule(OptimConfig(epochs=epochs), 7)
     steps = np.arange(7 * epochs + 1)
     expected = [by_formula(step, 7, warmup, epochs) for step in steps]
@@ -245,8 +244,6 @@ def test_adam_against_numpy(clip, decay, loss):
 
 @functools.partial(jax.jit, static_argnames="config")
 def value_and_slopes(log_std, error, config):
-    """The likelihood of one window, and its derivatives."""
-
     def likelihood(log_std, error):
         prediction = Prediction(jnp.zeros((1, 3)), jnp.array([[log_std, 0, 0]]), {})
         return found_losses(prediction, target([[error, 0, 0]]), config).nll

@@ -43,7 +43,6 @@ def experiment(run, workdir="", **changes):
 
 
 def read(monkeypatch, walks, run, workers=1):
-    """The recordings at 50 Hz of a split with these walks."""
     monkeypatch.setattr(loading, "read_split", lambda *_: iter(walks))
     config, samples = experiment(run), {}
     poses = recordings._poses_by(config, Lines(), load_run)
@@ -86,7 +85,6 @@ def smoothed(earlier, monkeypatch):
 
 
 def tapped(seed):
-    """A walk whose first leg nobody tapped."""
     walk = survey(seed).tapped(np.zeros(9))
     assert walk.waypoints is not None
     return walk._replace(waypoints=Waypoints(*(part[1:] for part in walk.waypoints)))
@@ -191,7 +189,6 @@ def test_a_run_that_is_not_calibrated_is_warned_of(tmp_path, capsys):
 def test_a_resumed_run_takes_the_same_poses_from_another_place(
     earlier, smoothed, monkeypatch, tmp_path
 ):
-    """And refuses those of another network. What is compiled does not depend on the place."""
     seeds = {"train": 0, "val": 2}
     monkeypatch.setattr(
         loading, "read_split", lambda _, __, split, *___: iter([tapped(seeds[split])])
@@ -217,7 +214,6 @@ def test_a_resumed_run_takes_the_same_poses_from_another_place(
 
 @pytest.mark.slow
 def test_processes_make_the_poses_that_one_makes(earlier, monkeypatch):
-    """Of the run's network and its smoother, which needs float64 in every process."""
     config = load_run(earlier).config
     width = dataclasses.replace(config.model, name="gnio", width=2, uncertainty=None)
     config = dataclasses.replace(config, model=width, data=DataConfig(rate=50.0))

@@ -86,7 +86,6 @@ def test_no_segment_at_all_is_a_mistake():
 
 
 def test_a_start_is_off_the_truth_by_the_priors_deviations():
-    """The attitude's error turns it in the world."""
     std = InitialStd(0.001, 0.002, 0.3, 0.4, 0.5, 0.6)
     source = segments.segment_source([sequence(40, seed=3)], SAMPLES)
     truth = segments.cut_segment(source, jnp.int32(0), 5, 4).truth

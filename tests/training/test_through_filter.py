@@ -86,7 +86,6 @@ def tiny(recording, workdir, **changes):
 
 @pytest.fixture(scope="module")
 def finished(recording, tmp_path_factory):
-    """A run of two epochs that nothing interrupted."""
     workdir = tmp_path_factory.mktemp("finished") / "run"
     loop.train(tiny(recording, workdir))
     return workdir
@@ -153,7 +152,6 @@ def test_a_copy_with_other_options_has_them(finished, tmp_path):
 
 
 def test_what_an_earlier_version_has_trained_is_told(finished, tmp_path):
-    """The filter's numbers had other names then."""
     run = shutil.copytree(finished, tmp_path / "run")
     tiny_run.age(run)
     with pytest.raises(InputError, match=r"is of an earlier version of .*; train it again from"):
@@ -162,7 +160,6 @@ def test_what_an_earlier_version_has_trained_is_told(finished, tmp_path):
 
 @pytest.fixture(scope="module")
 def training(recording):
-    """Task and segments of a run that is never written."""
     with jax.enable_x64(True):
         found, recordings = set_up(FilterTask, tiny(recording, "unused"), Silence())
     return found, recordings.source
@@ -170,7 +167,6 @@ def training(recording):
 
 @pytest.fixture(scope="module")
 def start(recording):
-    """The variables that training starts from."""
     return checkpoint.load_run(recording / "initial").variables
 
 
@@ -189,7 +185,6 @@ KEY = jax.random.key(0)
 
 
 def begun(training, start):
-    """The oracle at step 0, in memory of its own."""
     return oracle(parallel.everywhere(training.initial_state(KEY, start)))
 
 
@@ -230,7 +225,6 @@ def test_wild_steps_are_skipped_and_counted(training, start):
 def test_a_step_is_skipped_where_the_filter_diverged_or_the_loss_is_infinite(
     training, start, monkeypatch
 ):
-    """Whatever its gradient: the filter diverges in step 1, the loss is infinite in step 2."""
     training, source = training
 
     def found(trained, variables, batch, step, task_):

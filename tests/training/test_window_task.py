@@ -28,7 +28,6 @@ KEY = jax.random.key(0)
 
 @pytest.fixture(scope="module")
 def training(recording):
-    """Task, recordings and a state whose parameters NumPy has drawn."""
     with jax.enable_x64(False):
         given = config(recording, "")
         found, recordings = set_up(WindowTask, given, Silence())
@@ -67,7 +66,6 @@ class Flat(Tiny):
 
 
 def test_the_vertical_counts_only_where_it_is_predicted(training, monkeypatch):
-    """In the steps and in the validation."""
     training, (source, held_out, _), state = training
     axes = []
 
@@ -96,7 +94,6 @@ def test_an_order_shorter_than_a_batch_is_refused(training):
 
 
 def test_no_type_of_a_fresh_state_is_weak(recording):
-    """Steps give types that are none: the second one would be compiled anew."""
     create = functools.partial(fresh_state, Tiny(), config(recording, ""), 3)
     with jax.enable_x64(False):
         fresh = jax.eval_shape(create, jax.random.key(0))
@@ -111,7 +108,6 @@ def estimated(training, state, source, key=7):
 
 
 def with_statistics(training, windows):
-    """The task with so many windows for the statistics."""
     optim = dataclasses.replace(training.config.optim, statistics_windows=windows)
     return dataclasses.replace(training, config=dataclasses.replace(training.config, optim=optim))
 
