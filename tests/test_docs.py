@@ -3,7 +3,6 @@
 import ast
 import importlib
 import re
-import tomllib
 
 import jax
 import numpy as np
@@ -207,22 +206,6 @@ def test_a_command_line_is_understood(line, monkeypatch):
 def test_a_command_line_of_yesterday_is_not():
     with pytest.raises(InputError, match="unknown option"):
         understood(["track", "walk.zip", "--wieghts", "mine"])
-
-
-def test_what_else_the_shell_is_told_is_there():
-    makefile = (pages.ROOT / "Makefile").read_text(encoding="utf-8")
-    targets = set(re.findall(r"^([a-z]+):", makefile, re.M))
-    project = tomllib.loads((pages.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    for page, line in pages.shell_lines():
-        for target in re.findall(r"^(?:\w+=\S+ )?make ([a-z]+)", line):
-            assert target in targets, f"{page}: make {target}"
-        for extra in re.findall(r"pip install .*(?:gnio-jax|\.)\[(\w+)\]", line):
-            assert extra in project["optional-dependencies"], f"{page}: {extra}"
-        for script in re.findall(r"^python ([\w/]+\.py)", line):
-            assert (pages.ROOT / script).is_file(), f"{page}: {script}"
-        for module in re.findall(r"^python -m ((?:gnio_jax|benchmarks)[\w.]*)", line):
-            path = pages.ROOT / module.replace(".", "/")
-            assert path.is_dir() or path.with_suffix(".py").is_file(), f"{page}: {module}"
 
 
 def test_the_reference_has_every_room():

@@ -120,13 +120,3 @@ def test_help_and_version_need_no_jax(gnio):
     version, place, weight = gnio("-c", check, program="python").stdout.split()
     assert version[0].isdigit() and weight == "light"
     assert not place.startswith(str(ROOT))
-
-
-def test_the_facade_is_readmes():
-    check = (
-        "import sys\n"
-        "from gnio_jax import data, evaluation, filtering, geometry, interop, models, training\n"
-        "slow = {'scipy.signal', 'scipy.stats', 'matplotlib.figure'} & set(sys.modules)\n"
-        "assert not slow, slow"
-    )
-    subprocess.run([sys.executable, "-c", check], check=True, cwd=ROOT)

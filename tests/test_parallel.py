@@ -1,6 +1,7 @@
 """A batch that devices and processes share: the same numbers as on one device of one process. Runs
 in several processes on localhost are stopped and killed, and go on in another number of them."""
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -242,33 +243,24 @@ def test_processes_with_other_samples_or_weights_are_refused(monkeypatch):
     """As if another process had sent the numbers of the first call."""
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     monkeypatch.setattr(parallel, "on_host", lambda tree: tree)
-    sent = []
+    sent, samples = [], np.arange(12.0).reshape(4, 3)
 
-    def compare(samples, weights):
-        tree = {"imu": samples, "start": np.arange(3)}
-        recordings = Recordings(tree, {}, {"train": ["a"]})
-        run_folder.compare_processes(TrainConfig(), recordings, {"scale": weights})
-
-    monkeypatch.setattr(parallel, "largest", lambda *given: sent.append(given) or given)
-    samples, weights = np.arange(12.0).reshape(4, 3), jnp.float32(1)
-    compare(samples, weights)
-    assert len(sent) == 3
-    for other, what in (
-        ((samples, weights), None),
-        ((samples[:3], weights), "recordings"),
-        ((samples + 1e-9, weights), "recordings"),
-        ((samples, jnp.float32(2)), "weights to begin with"),
-    ):
-        first = iter(sent)
-        largest = lambda *given: tuple(map(max, given, next(first)))  # noqa: B023, E731
+    def compare(samples, weight, largest):
         monkeypatch.setattr(parallel, "largest", largest)
-        if what is None:
-            compare(*other)
-            continue
-        with pytest.raises(
-            InputError, match=f"the processes have different {what}; (give|start) all"
-        ):
-            compare(*other)
+        recordings = Recordings({"imu": samples, "start": np.arange(3)}, {}, {"train": ["a"]})
+        run_folder.compare_processes(TrainConfig(), recordings, {"scale": jnp.float32(weight)})
+
+    compare(samples, 1, lambda *given: sent.append(given) or given)
+    assert len(sent) == 3
+    for other, weight, what in (
+        (samples, 1, None),
+        (samples[:3], 1, "recordings"),
+        (samples + 1e-9, 1, "recordings"),
+        (samples, 2, "weights to begin with"),
+    ):
+        first, words = iter(sent), f"the processes have different {what}; (give|start) all"
+        with pytest.raises(InputError, match=words) if what else contextlib.nullcontext():
+            compare(other, weight, lambda *given, first=first: (*map(max, given, next(first)),))
 
 
 def test_a_wrong_text_is_one_line():

@@ -21,18 +21,6 @@ from gnio_jax import calibration, data, filtering, models
 from gnio_jax.calibration import evidence
 from gnio_jax.calibration import fit as fitting
 from gnio_jax.calibration import run as calibrating
-from gnio_jax.calibration.fit import (
-    CONSIDERED,
-    GROUPS,
-    Positions,
-    filtered_positions,
-    fit_considered,
-    fit_innovations,
-    innovation_config,
-    start_of_fit,
-    std_factors,
-    unphysical,
-)
 from gnio_jax.commands import app
 from gnio_jax.config import (
     CalibrateConfig,
@@ -154,11 +142,11 @@ def test_the_factors_are_those_of_the_errors():
     error = std * np.array([1.5, 0.5, 3.0]) * rng.choice([-1.0, 1.0], (400, 3))
     truth = np.ones((400, 3))
     truth[:50, 1] = np.nan
-    found = std_factors([estimate(error, std)], [truth])
+    found = fitting.std_factors([estimate(error, std)], [truth])
     np.testing.assert_allclose(found, [1.5, 0.5, 3.0], rtol=1e-12)
     with pytest.raises(ValueError, match="10 windows have a reference"):
         truth[:390] = np.nan
-        std_factors([estimate(error, std)], [truth])
+        fitting.std_factors([estimate(error, std)], [truth])
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +198,7 @@ def test_folds_that_do_not_make_a_whole_are_refused(run, splits_read, fold_runs)
         evidence.sources(changed, config)
 
 
-PATHS = (*GROUPS["measurement"], *GROUPS["noise"], *GROUPS["window"])
+PATHS = (*fitting.GROUPS["measurement"], *fitting.GROUPS["noise"], *fitting.GROUPS["window"])
 ERRORS = CorrelatedError(0.8, 0.5)
 TRUE = changed(
     noise={
@@ -240,7 +228,7 @@ def walks_and_truth():
 
 
 def fit(walks, settings, **options):
-    return fit_innovations(walks, DATA, settings, PATHS, lambda calls: None, **options)
+    return fitting.fit_innovations(walks, DATA, settings, PATHS, lambda calls: None, **options)
 
 
 def test_the_noises_and_errors_of_simulated_walks_are_found():
@@ -258,7 +246,7 @@ def test_the_noises_and_errors_of_simulated_walks_are_found():
 
 def test_the_gradient_is_that_of_the_likelihood():
     free = free_parameters(TRUE, PATHS)
-    fixed = {"names": tuple(free), "config": innovation_config(DATA, TRUE)}
+    fixed = {"names": tuple(free), "config": fitting.innovation_config(DATA, TRUE)}
     free, rng = np.array(list(free.values())), np.random.default_rng(0)
 
     def at(vector):
@@ -278,7 +266,7 @@ def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(raw, ex
     settings = dataclasses.replace(TRUE, raw_gyro_bias=0.05)
     walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
     walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
-    _, state, _ = fitting._repeated(walk, settings, innovation_config(DATA, settings))
+    _, state, _ = fitting._repeated(walk, settings, fitting.innovation_config(DATA, settings))
     found = np.sqrt(np.diag(state.core_covariance))[GYRO_BIAS]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
@@ -343,7 +331,7 @@ def test_searches_that_ended_too_early_are_told_of(monkeypatch, searches, proble
 def test_values_outside_what_is_physical_are_named():
     noise = {"accel_bias_walk": 2.656, "correlation": CorrelatedError(0.9999, 5.9e4)}
     names = ("noise.gyro_density", "noise.accel_bias_walk", "noise.correlation.share")
-    told = unphysical(changed(TRUE, noise=noise), (*names, "noise.correlation.seconds"))
+    told = fitting.unphysical(changed(TRUE, noise=noise), (*names, "noise.correlation.seconds"))
     assert [line.split(" came out as ")[0] for line in told] == [
         "filter.noise.accel_bias_walk",
         "filter.noise.correlation.share",
@@ -354,12 +342,12 @@ def test_values_outside_what_is_physical_are_named():
 
 def test_what_is_switched_off_and_has_no_start_cannot_be_fitted():
     off = changed(TRUE, start={"gyro_bias": 0.0})
-    begun = start_of_fit(off, (*GROUPS["noise"], *GROUPS["window"]))
+    begun = fitting.start_of_fit(off, (*fitting.GROUPS["noise"], *fitting.GROUPS["window"]))
     assert begun.noise.correlation == CorrelatedError(0.8, 0.5)
     own = changed(TRUE, noise={"correlation": CorrelatedError(0.3, 0.7)})
-    assert start_of_fit(own, GROUPS["window"]) == own
+    assert fitting.start_of_fit(own, fitting.GROUPS["window"]) == own
     with pytest.raises(InputError, match=r"filter.start.gyro_bias: is 0 .*leave its group out"):
-        start_of_fit(off, GROUPS["start"])
+        fitting.start_of_fit(off, fitting.GROUPS["start"])
 
 
 def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
@@ -402,9 +390,9 @@ def test_what_the_errors_were_drawn_with_is_found():
     wanted = np.array([2e-3, 2e-3, 2e-3, 0.1, np.deg2rad(8.0), 0.01])
     drawn = np.einsum("kij,kj->ki", root, rng.standard_normal((rows, 3)))
     error = drawn + np.einsum("kic,kc->ki", sensitivity, wanted * rng.standard_normal((rows, 6)))
-    positions = Positions(error, covariance, sensitivity)
+    positions = fitting.Positions(error, covariance, sensitivity)
     options = changed(considered={"scale": 0.7})  # of an earlier calibration
-    found = fit_considered(positions, 0.1, options)
+    found = fitting.fit_considered(positions, 0.1, options)
     assert found.before > 2 and found.after == pytest.approx(1, abs=0.05)
     np.testing.assert_allclose(
         found.settings.considered, [2e-3, 0.1, np.deg2rad(8.0), 0.01], rtol=0.1
@@ -419,16 +407,18 @@ def test_the_prior_counts_as_many_independent_errors_as_there_are():
     error[:, 0] = 0.3 * np.where(np.arange(rows) % 2, 1.0, -1.0)
     covariance, sensitivity = np.tile(1e-4 * np.eye(3), (rows, 1, 1)), np.zeros((rows, 3, 6))
     sensitivity[:, 0, 5] = 1.0  # the slope alone, in metres for a unit
-    found = fit_considered(Positions(error, covariance, sensitivity), stride, FilterSettings())
+    found = fitting.fit_considered(
+        fitting.Positions(error, covariance, sensitivity), stride, FilterSettings()
+    )
     for name in ("gyro_bias", "scale", "heading"):
         assert getattr(found.settings.considered, name) == pytest.approx(
-            getattr(CONSIDERED, name), rel=1e-3
+            getattr(fitting.CONSIDERED, name), rel=1e-3
         )
 
     def negative_log_posterior(log_std):
         variance = 1e-4 + np.exp(2 * log_std)
         likelihood = 4 * 0.5 * (0.3**2 / variance + np.log(variance))
-        return likelihood + 0.5 * ((log_std - np.log(CONSIDERED.slope)) / 2.0) ** 2
+        return likelihood + 0.5 * ((log_std - np.log(fitting.CONSIDERED.slope)) / 2.0) ** 2
 
     grid = np.linspace(np.log(0.05), np.log(0.5), 20001)
     wanted = np.exp(grid[np.argmin(negative_log_posterior(grid))])
@@ -449,25 +439,25 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     truth = truth.copy()
     options = changed(TRUE, noise={"measurement_scale": 9.0})  # σ is three times what is said
     truth[0, 300:] = np.nan
-    found = filtered_positions(walks, truth, DATA, options)
+    found = fitting.filtered_positions(walks, truth, DATA, options)
     assert len(found.error) == np.isfinite(truth).all(2).sum()
     assert nees(found) == pytest.approx(1, abs=0.5)
-    off = filtered_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
+    off = fitting.filtered_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
     assert nees(off) > 3 * nees(found)
 
     accel, raw = walks.accel.copy(), np.arange(WALKS) == 0
     accel[1, 100:] += 1e4
     marked = walks._replace(start=walks.start._replace(raw_gyro=raw), accel=accel)
-    some = filtered_positions(marked, truth, DATA, options)
+    some = fitting.filtered_positions(marked, truth, DATA, options)
     assert 0 < len(some.error) < 50 and np.abs(some.error).max() < 50
     marked = walks._replace(start=walks.start._replace(raw_gyro=raw | True))
-    assert len(filtered_positions(marked, truth, DATA, options).error) == len(found.error)
+    assert len(fitting.filtered_positions(marked, truth, DATA, options).error) == len(found.error)
 
 
 def test_no_positions_and_no_likelihood_are_named():
-    none = Positions(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 6)))
+    none = fitting.Positions(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 6)))
     with pytest.raises(InputError, match="not healthy where these recordings have a reference"):
-        fit_considered(none, 0.1, FilterSettings())
-    lost = Positions(np.ones((9, 3)), np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)))
+        fitting.fit_considered(none, 0.1, FilterSettings())
+    lost = fitting.Positions(np.ones((9, 3)), np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)))
     with pytest.raises(InputError, match="no positive definite covariance"):
-        fit_considered(lost, 0.1, FilterSettings())
+        fitting.fit_considered(lost, 0.1, FilterSettings())

@@ -64,7 +64,7 @@ def asked(workdir, **options):
 
 
 def test_end_to_end(workdir, command, capsys, tmp_path):
-    command("--workdir", workdir, "--batch-size", 2)
+    command("--workdir", workdir)
     printed = capsys.readouterr()
     folder = workdir / "eval" / "synthetic_test_ekf"
     assert "\x1b" not in printed.out and printed.err == ""
@@ -83,12 +83,11 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     assert len(np.loadtxt(folder / "trajectories" / "synthetic_1_handheld.txt")) == 150
     assert len(list((folder / "plots").iterdir())) == 3
     page = (folder / "report.html").read_text(encoding="utf-8")
-    assert f"<code>python evaluate.py --workdir {workdir} --batch-size 2</code>" in page
+    assert f"<code>python evaluate.py --workdir {workdir}</code>" in page
     assert f"page: {folder / 'report.html'}" in printed.out
     command("--workdir", workdir, "--estimator", "integrate", "--no-plots")
     rerun = ["--rerun", tmp_path / "w.rrd"] if importlib.util.find_spec("rerun") else []
     imu_only = ("--estimator", "imu_only", "--init", "static", "--no-plots", *rerun)
-    imu_only += ("--batch-size", 2)
     assert "has learnt from" not in "".join(capsys.readouterr())
     (workdir / "splits.yaml").write_text("train: {synthetic_2_handheld: 1500, other: 1}")
     command("--workdir", workdir, *imu_only)

@@ -395,9 +395,9 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
     assert (np.asarray(statistics["uncertainty"]["log_factor"]) == 0).all()
 
 
-@pytest.mark.parametrize(
-    "changes, expected",
-    [
+def test_mistakes(recording, tmp_path):
+    longer = {"data": DataConfig(rate=50.0, window_seconds=1.0)}
+    for changes, expected in (
         ({"init_from": None}, r"'through_filter.learn' needs the weights .*--init-from"),
         (
             {"data": DataConfig(rate=100.0, window_seconds=WINDOW)},
@@ -408,10 +408,7 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
             r"'through_filter.piece_seconds' is not a whole number of strides of 0.1 s",
         ),
         (
-            {
-                "through_filter": ThroughFilter(LEARN, 1.0),
-                "data": DataConfig(rate=50.0, window_seconds=1.0),
-            },
+            longer | {"through_filter": ThroughFilter(LEARN, 1.0)},
             r"'through_filter.piece_seconds' must be longer than the 1 s that the network sees",
         ),
         (
@@ -423,9 +420,7 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
             r"'filter.mahalanobis_fail_scale' makes no sense beside the soft gate",
         ),
         ({"optim": OptimConfig(batch_size=64)}, "is 64, but there are only 10 segments"),
-    ],
-)
-def test_mistakes(recording, tmp_path, changes, expected):
-    with pytest.raises(InputError, match=expected):
-        loop.train(tiny(recording, tmp_path / "run", **changes))
-    assert not (tmp_path / "run").exists()
+    ):
+        with pytest.raises(InputError, match=expected):
+            loop.train(tiny(recording, tmp_path / "run", **changes))
+        assert not (tmp_path / "run").exists()

@@ -86,13 +86,6 @@ def test_the_vertical_counts_only_where_it_is_predicted(training, monkeypatch):
     assert axes == [3, 3, 2, 2]
 
 
-def test_an_order_shorter_than_a_batch_is_refused(training):
-    training, (source, *_), state = training
-    order, numbers = jnp.zeros(15, jnp.int32), (jnp.int32(0), jnp.int32(1), jnp.float32(1))
-    with jax.enable_x64(False), pytest.raises(AssertionError, match="dimension"):
-        jax.eval_shape(lambda: training.take_steps(state, source, order, *numbers, KEY))
-
-
 def test_no_type_of_a_fresh_state_is_weak(recording):
     create = functools.partial(fresh_state, Tiny(), config(recording, ""), 3)
     with jax.enable_x64(False):
