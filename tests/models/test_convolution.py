@@ -7,7 +7,7 @@ import pytest
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from gnio_jax import models
-from gnio_jax.models import convolution, layers, resnet
+from gnio_jax.models import convolution, resnet
 from gnio_jax.models.convolution import (
     convolve,
     convolve_depthwise,
@@ -116,25 +116,6 @@ def calls(monkeypatch):
     found = []
     monkeypatch.setattr(convolution, "convolve_three", lambda *x: found.append(x) or x[0])
     return found
-
-
-def test_training_uses_it_where_it_is_quicker(calls):
-    for used, given in (
-        (True, {}),
-        (True, {"length": 3}),
-        (False, {"length": 2}),
-        (False, {"channels": 32}),
-        (False, {"stride": 2}),
-        (False, {"train": False}),
-        (False, {"winograd": False}),
-    ):
-        of = {"channels": 64, "length": 8, "stride": 1, "train": True, "winograd": True} | given
-        channels, length = of["channels"], of["length"]
-        layer = layers.conv(channels, 3, of["stride"], of["train"], "c", winograd=of["winograd"])
-        x = jnp.zeros((1, length, channels), jnp.float32)
-        calls.clear()
-        jax.eval_shape(layer.init, jax.random.key(0), x)
-        assert bool(calls) == used, given
 
 
 @pytest.mark.parametrize("name", ["gnio", "tlio", "ronin_resnet"])
