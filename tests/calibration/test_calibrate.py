@@ -317,6 +317,7 @@ def test_searches_that_ended_too_early_are_told_of(monkeypatch, searches, proble
     ends = iter(searches)
 
     def minimize(function, at, **_):
+        function(at)
         value, steps, success = next(ends)
         return OptimizeResult(x=at, fun=value, nit=steps, success=success)
 

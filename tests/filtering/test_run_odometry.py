@@ -119,12 +119,8 @@ def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     """With `history.given`, which takes the factors of the axes off again. The network's log
     standard deviation is raised to a floor."""
     gyro, accel = recording(1)
-    valid = np.ones(len(gyro), bool)
-    valid[5 * N : 5 * N + 2] = False
-    network = functools.partial(predict, base=BASE, slope=SLOPE)
-    arguments = start(CONFIG), gyro, accel, CONFIG, NOISE, valid
-    final, history = jax.jit(lambda: filtering.run_odometry(network, *arguments))()
-    fixed = CONFIG, NOISE, valid, CONFIG.displacement_frame
+    final, history = program(CONFIG)(start(CONFIG), gyro, accel, BASE, SLOPE)
+    fixed = CONFIG, NOISE, None, CONFIG.displacement_frame
     given = start(CONFIG), gyro, accel, *history.given(NOISE)
     again_final, again = filtering.run_filter(*given, *fixed)
     assert again.diagnostics == {}

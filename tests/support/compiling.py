@@ -8,6 +8,15 @@ import jax
 quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 """Without the compiler's optimisation: half the time, and what runs once is as quick."""
 
+literal = functools.partial(
+    jax.jit,
+    compiler_options={
+        "xla_backend_optimization_level": 0,
+        "xla_disable_hlo_passes": "algsimp",
+    },
+)
+"""Without the simplifications either, which would make 0 of 0 · NaN."""
+
 optimised = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})
 """With the compiler's optimisation: for what runs longer than it takes to compile."""
 
