@@ -44,10 +44,10 @@ def recording(tmp_path_factory):
     return write_splits(tmp_path_factory.mktemp("tlio"))
 
 
-def started(module, *arguments):
-    """A process of `tests.support`; all share what they compile."""
+def started(*arguments):
+    """A process that trains; all share what they compile."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    command = [sys.executable, "-m", f"tests.support.{module}_process", *arguments]
+    command = [sys.executable, "-m", "tests.support.training_process", *arguments]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=ROOT, env=environment, **pipes)
 
@@ -94,7 +94,7 @@ def trained_together(
         if processes > 1:
             command += ["--distributed", f"{coordinator},{processes},{k}"]
         command += ["--devices", str(devices), *dict(options_of).get(k, ())]
-        running.append(started("training", *command))
+        running.append(started(*command))
     return ends_of(running)
 
 
@@ -161,21 +161,6 @@ def test_a_run_goes_on_in_other_numbers_of_processes_and_devices(run, alone, tmp
 def latest(workdir):
     (step,) = (workdir / "checkpoints" / "latest").glob("[0-9]*")
     return int(step.name)
-
-
-@pytest.mark.slow
-def test_processes_share_sequences_and_each_has_all_results(tmp_path):
-    """Four devices in two processes, and five sequences: in order, and the same ones."""
-    coordinator = free_address()
-    given = [(f"{coordinator},2,{k}", str(tmp_path / f"{k}.npz")) for k in range(2)]
-    ends = ends_of([started("sequences", *each) for each in given])
-    assert [status for status, _ in ends] == [0, 0], ends
-    steps = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
-    for k in range(2):
-        found = np.load(tmp_path / f"{k}.npz")
-        np.testing.assert_allclose(found["path"], 2 * np.cumsum(steps, axis=1), rtol=1e-5)
-        np.testing.assert_array_equal(found["largest"], steps.max(axis=(1, 2)))
-        np.testing.assert_array_equal(found["one"], found["path"][:1])
 
 
 @pytest.fixture(scope="module")

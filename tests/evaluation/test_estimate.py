@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import evaluation
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.evaluation import infer, metrics
-from gnio_jax.evaluation.estimate import PERFECT_STD, _batches, _run, mean_over_windows
+from gnio_jax.evaluation.estimate import PERFECT_STD, _batches, mean_over_windows
 from gnio_jax.filtering import CorrelatedError
 from tests.support.estimators import (
     CONFIG,
@@ -182,23 +182,6 @@ def test_batches_are_of_few_lengths_and_little_padded():
     assert all(own <= padded <= max(20, 1.26 * own) for own, padded in found.items())
     assert found.keys() == set(strides) and len(set(found.values())) < 30
     assert {len(batch.members) for batch in _batches(strides, 16)} == {16}
-
-
-def test_one_program_serves_every_scale_and_every_source_of_displacements(walks):
-    recordings = ready(walks[:2], orientation="reference")
-    (_, one), _, _ = tight(recordings), loose(recordings), imu_only(recordings)
-    programs, scale = _run._cache_size(), OPTIONS.noise.measurement_scale
-    options = changed(OPTIONS, noise={"measurement_scale": 9 * scale})
-    (_, scaled) = tight(recordings, options=options)
-    loose(recordings, options=options), with_truth(recordings, options=options)
-    assert _run._cache_size() == programs
-    std, first_std = scaled.displacements.std, one.displacements.std
-    first = np.isfinite(first_std).all(axis=1).argmax()  # a later window is seen turned
-    np.testing.assert_allclose(std[first], 3 * first_std[first], rtol=1e-12)
-    np.testing.assert_allclose(first_std[first], np.exp(-3.0) * scale**0.5, rtol=0.5)
-    options = changed(OPTIONS, noise={"std_factor": (3.0, 3.0, 3.0)})
-    (_, same_filter) = tight(recordings, options=options)
-    same(scaled, same_filter, 1e-9)
 
 
 def test_what_the_filter_calls_void_has_diverged(walks):
