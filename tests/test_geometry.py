@@ -16,7 +16,6 @@ from gnio_jax import geometry
 ANGLES = [0.0, 1e-12, 1e-8, 1e-4, 9.99e-2, 1.001e-1, 0.7, 3.0, np.pi, 6.0]
 AXIS = np.array([0.36, -0.48, 0.8])
 
-# One program for every angle, in place of one for every operation.
 exp, right_jacobian = map(jax.jit, (geometry.exp, geometry.right_jacobian))
 slope_of_exp = jax.jit(jax.jacrev(geometry.exp))
 slope_of_right_jacobian = jax.jit(jax.jacrev(geometry.right_jacobian))

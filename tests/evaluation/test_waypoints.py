@@ -1,5 +1,4 @@
-"""Walks with waypoints in the place of poses: start, alignment, metrics, folder and pictures, on
-walks whose whole truth is known."""
+"""Walks with waypoints in the place of poses, whose whole truth is known."""
 
 import math
 

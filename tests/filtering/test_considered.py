@@ -1,5 +1,4 @@
-"""Errors that are considered and not estimated: their sensitivity against filters that have them,
-and whether the covariance with them is that of the errors of simulated walks."""
+"""Errors that are considered and not estimated: their sensitivity against filters that have them."""
 
 import functools
 

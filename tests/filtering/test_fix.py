@@ -1,5 +1,4 @@
-"""Fixes of position as they are laid onto intervals and refused. The filter with fixes is in
-`test_scan`, its derivatives in `test_derivatives`, the smoother in `test_smoother`."""
+"""Fixes of position as they are laid onto intervals and refused."""
 
 import numpy as np
 import pytest

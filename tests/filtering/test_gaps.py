@@ -27,7 +27,6 @@ def run(valid=THERE, gyro=WALK[1], displacement=WALK[3]):
     return filtering.run_filter(start(), *given)
 
 
-# One program in place of one for every operation.
 bridge = jax.jit(gaps.bridge, static_argnums=4)
 
 

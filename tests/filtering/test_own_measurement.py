@@ -85,7 +85,6 @@ def test_rows_that_are_missing_are_refused_by_name():
 
 
 def test_known_displacements_are_those_of_the_filter():
-    """Between the poses at the ends of intervals, in the yaw frame of the earlier one."""
     rng = np.random.default_rng(0)
     (rotation, _, _), turn = START, rng.normal(size=3)
     angles = np.arange(INTERVALS + 1)[:, None] * 0.1 * turn

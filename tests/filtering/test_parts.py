@@ -82,7 +82,6 @@ def update_gradient(state, displacement, covariance, frame):
     ids=["gimbal lock", "almost", "close by", "own frame, never locked", "coincident clones"],
 )
 def test_update_has_finite_derivatives_everywhere(frame, pitch, apart, accepted):
-    """Of clones and a measurement at a point where a careless branch has none."""
     rotation = Rotation.from_euler("y", pitch).as_matrix()
     state = filtering.initial_state(CONFIG, rotation, np.zeros(3), np.zeros(3))._replace(
         clone_rotation=np.tile(rotation, (3, 1, 1)),

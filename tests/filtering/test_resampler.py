@@ -1,5 +1,4 @@
-"""The low-pass of a stream against pure tones and a slow resampler of SciPy's parts. The tracker
-behind it is in `test_tracker`."""
+"""The low-pass of a stream against pure tones and a slow resampler of SciPy's parts."""
 
 import itertools
 

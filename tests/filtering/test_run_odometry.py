@@ -62,7 +62,6 @@ turned by its own rate or by that of the one before."""
 
 
 def by_hand(config, cut, gyro, accel):
-    """The filter in NumPy, its windows cut sample by sample."""
     (lead, corrected, own), context = cut, config.context_samples
 
     def measure(k, clone_rotation, gyro_bias, accel_bias):

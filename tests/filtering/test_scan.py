@@ -1,5 +1,4 @@
-"""The filter against recorded runs of TLIO's tracker and against a plain NumPy filter, which has
-fixes of position and temporally correlated errors too."""
+"""The filter against recorded runs of TLIO's tracker and against a plain NumPy filter."""
 
 import functools
 from pathlib import Path
@@ -18,7 +17,6 @@ from tests.support.random_walk import random_walk
 
 RECORDED = Path(__file__).parents[1] / "recorded" / "scekf"
 DECISIONS = ("accepted", "gate_passed")
-# One program in place of one for every operation.
 covariance = jax.jit(whole_covariance.covariance)
 MEAN = ("rotation", "velocity", "position", "gyro_bias", "accel_bias")
 
@@ -202,7 +200,6 @@ def test_random_walk(fail_scale, correlation, axes, every):
 
 
 def test_what_was_measured_can_be_given_again():
-    """With covariances whose axes are correlated."""
     config = GATED(DT, N, CLONES)
     noise = noise_of(config)._replace(std_factor=(1.5, 0.5, 2.0))
     _, history = ours(config, noise)

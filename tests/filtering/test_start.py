@@ -12,7 +12,6 @@ from gnio_jax.filtering.start import rest_at_start
 N, CLONES, DT = 5, 4, 0.02
 CONFIG = filtering.FilterConfig(DT, N, CLONES)
 
-# One program in place of one for every operation.
 level, slope_of_level = jax.jit(geometry.level), jax.jit(jax.jacrev(geometry.level))
 
 
@@ -71,7 +70,6 @@ def test_level_state_says_how_far_the_velocity_can_be_from_zero():
 
 @pytest.mark.parametrize("samples, gyro_std, accel_std", [(49, 0, 0), (50, 0.02, 0), (50, 0, 0.2)])
 def test_level_state_takes_the_bias_of_a_second_on_a_table(samples, gyro_std, accel_std):
-    """The mean of the gyro, and nothing of a shorter or a shaken rest."""
     rng, bias = np.random.default_rng(3), np.array([0.02, -0.01, 0.03])
     noise = rng.standard_normal((2, 50, 3))
     gyro, accel = bias + 0.002 * noise[0], [0, 0, 9.81] + 0.02 * noise[1]
@@ -87,7 +85,6 @@ def test_level_state_takes_the_bias_of_a_second_on_a_table(samples, gyro_std, ac
 
 
 def test_level_state_refuses_accelerations_without_gravity():
-    """Such as those that are in units of gravity."""
     with pytest.raises(ValueError, match=r"^accel: shows no gravity, its mean is 1 m/s²"):
         filtering.level_state(CONFIG, np.zeros((50, 3)), np.tile([0, 0, 1.0], (50, 1)))
 

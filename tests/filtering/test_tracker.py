@@ -56,7 +56,6 @@ def predict(windows):
 
 @functools.cache
 def recording():
-    """Movement, from sample 200 on rest."""
     rng = np.random.default_rng(0)
     t = np.arange(N * INTERVALS) * DT
     gyro = np.sin(t[:, None] * rng.uniform(2, 5, 3) + rng.uniform(0, 6, 3))
@@ -102,7 +101,6 @@ def scan(state, gyro, accel, valid, config=CONFIG):
 
 @pytest.fixture
 def built(monkeypatch):
-    """Trackers take their programs from `compiled`."""
     ready = compiled()._advance, compiled()._look_ahead
     monkeypatch.setattr(online, "compile_programs", lambda *_: ready)
 

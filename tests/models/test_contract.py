@@ -11,8 +11,7 @@ import pytest
 from gnio_jax import models
 from gnio_jax.config import ModelConfig
 from gnio_jax.errors import InputError
-from gnio_jax.models import layers, registry, resnet
-from gnio_jax.models.motion_bank import MotionBank
+from gnio_jax.models import registry, resnet
 from tests.support.compiling import quick
 from tests.support.networks import SMALL, count, drawn, shapes
 from tests.support.tiny_network import Tiny
@@ -143,11 +142,3 @@ def test_a_network_of_ones_own_is_created_by_its_name(monkeypatch):
     assert "own" in models.names() and models.create("own", width=5) == Tiny(width=5)
     with pytest.raises(InputError, match="model 'gnio': is a network of gnio-jax"):
         models.register("gnio", Tiny)
-
-
-def test_wrong_shapes_are_told_at_the_door():
-    with pytest.raises(AssertionError, match="shape"):
-        layers.checked_windows(jnp.zeros((2, 64, 5), jnp.float32))
-    bank = MotionBank(size=3, width=16)
-    with pytest.raises(AssertionError, match="shape"):
-        jax.eval_shape(bank.init, jax.random.key(0), jnp.zeros((2, 24), jnp.float32))

@@ -103,13 +103,6 @@ def test_devices_that_share_a_batch_have_the_same_gradients():
     jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, 1e-5, 1e-6), *both)
 
 
-def test_no_derivative_in_forward_mode_is_promised_and_no_windows_make_none():
-    x, kernel = map(jnp.asarray, drawn(4))
-    with pytest.raises(TypeError, match="forward-mode"):
-        jax.jvp(convolve_three, (x, kernel), (x, kernel))
-    assert jax.eval_shape(convolve_three, x[:0], kernel).shape == (0, 4, 2)
-
-
 @pytest.fixture
 def calls(monkeypatch):
     """What Winograd's convolution is called with."""

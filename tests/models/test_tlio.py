@@ -1,5 +1,4 @@
-"""RoNIN's network, which has TLIO's encoder and head: its output against the recorded one of TLIO,
-and how the head trains."""
+"""RoNIN's network, which has TLIO's encoder and head, against the recorded output of TLIO's."""
 
 from pathlib import Path
 

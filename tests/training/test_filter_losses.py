@@ -16,7 +16,6 @@ K, W = 40, 5
 CONFIG = FilterConfig(0.05, 4, W, history="core")
 """Five clones a second: horizons of 5 and 25 intervals fit into 8 s."""
 
-# One program in place of one for every operation.
 relative_displacement = quick(filter_losses.relative_displacement, static_argnums=2)
 relative_yaw = quick(filter_losses.relative_yaw, static_argnums=2)
 window_error = quick(jax.value_and_grad(filter_losses.window_error, (0, 1)), static_argnums=3)

@@ -3,10 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.errors import InputError
 from gnio_jax.filtering import InitialStd
 from gnio_jax.training import segments
 from gnio_jax.types import Sequence
@@ -78,11 +76,6 @@ def test_a_turned_segment_is_the_same_walk_in_a_turned_world():
     for name in ("velocity", "position"):
         expected = np.asarray(getattr(segment.truth, name)) @ turn.T
         np.testing.assert_allclose(getattr(found.truth, name), expected, atol=1e-12)
-
-
-def test_no_segment_at_all_is_a_mistake():
-    with pytest.raises(InputError, match=r"no segment of 20 samples .*piece_seconds"):
-        segments.segment_source([sequence(SAMPLES)], SAMPLES)
 
 
 def test_a_start_is_off_the_truth_by_the_priors_deviations():

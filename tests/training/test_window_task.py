@@ -1,5 +1,4 @@
-"""The step on windows, the statistics of batch normalisation, and the constants of the
-uncertainty."""
+"""The step on windows, statistics of batch normalisation, constants of the uncertainty."""
 
 import dataclasses
 import functools
