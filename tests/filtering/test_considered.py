@@ -1,4 +1,4 @@
-"""Errors that are considered and not estimated: their sensitivity against filters that have them."""
+"""Errors that are considered and not estimated: their sensitivity against filters with them."""
 
 import functools
 
