@@ -236,39 +236,8 @@ def test_settings_of_a_program_may_be_numbers_of_numpy():
         configuration.validate(TrainConfig(filter=changed(noise={"gyro_density": np.float32(0)})))
 
 
-OLD = """
-dataset: oxiod
-data_root: null
-workdir: runs/oxiod
-init_from: null
-seed: 3
-data: {rate: 100.0, window_seconds: 1.0, context_seconds: 0.0, stride_seconds: 0.1,
-  train_stride_seconds: 0.1, window_rotation: per_sample, train_split: train, val_split: val,
-  folds: 1, left_out: 0, residency: device}
-augment: {gyro_bias: 0.05, accel_bias: 0.2, tilt_degrees: 5.0, yaw: true, gyro_noise: 0.001,
-  accel_noise: 0.01, shift_samples: 0}
-model: {name: gnio, width: 16, bank_size: null, bank_heads: null, bank_std: null, head: null,
-  gate: null, scale: null, uncertainty: null, output_dim: null, dropout: null, equivariance: none,
-  dtype: float32}
-loss: {name: weighted_sum, mse_weight: 100.0, mae_weight: 0.0, nll_weight: 0.0001,
-  nll_from_epoch: 0.0, log_std_from_epoch: 0.0, log_std_floor: null}
-optim: {schedule: cosine, epochs: 24, batch_size: 64, accumulate: 1, learning_rate: 0.002,
-  start_learning_rate: 0.0001, end_learning_rate: 1.0e-06, warmup_epochs: 1.0, clip_norm: null,
-  weight_decay: 0.0, plateau_epochs: 10, plateau_factor: 0.1, best_by: loss,
-  statistics_windows: 16384, ema_decay: 0.0}
-filter: {gyro_density: 0.02, accel_density: 0.03, gyro_bias_walk: 1.021e-06,
-  accel_bias_walk: 0.0104, tilt_std_degrees: 2.0, yaw_std_degrees: 0.1, velocity_std: 0.7,
-  position_std: 0.001, gyro_bias_std: 0.0002, accel_bias_std: 0.02, measurement_scale: 1.073,
-  std_factor_x: 0.9455, std_factor_y: 0.8488, std_factor_z: 0.8295, window_error_share: 0.8971,
-  window_error_seconds: 3.281, scale_error_std: 0.0, heading_error_std_degrees: 0.0,
-  walk_error_seconds: 40.0, considered_gyro_bias_std: 0.003941, considered_scale_std: 0.1742,
-  considered_heading_std_degrees: 4.273, considered_slope_std: 0.03128,
-  mahalanobis_fail_scale: 2.0, window_rotation: tlio}
-through_filter: {learn: [], piece_seconds: 60.0, truncate_seconds: 10.0, start_spread: 1.0,
-  gate_softness: 2.0, filter_learning_rate: 0.03, skip_above: 1000.0, displacement_weight: 100.0,
-  yaw_weight: 1000.0, innovation_weight: 0.1, state_weight: 0.1, window_weight: 100.0}
-checkpoint_every_seconds: 600.0
-"""
+RECORDED = Path(__file__).parents[1] / "recorded" / "config" / "earlier_version.yaml"
+OLD = RECORDED.read_text(encoding="utf-8")
 
 
 def test_the_config_of_an_old_run_is_the_same_experiment():

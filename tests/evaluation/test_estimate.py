@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import evaluation
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.evaluation import infer, metrics
-from gnio_jax.evaluation.estimate import PERFECT_STD, _batches, mean_over_windows
-from gnio_jax.filtering import CorrelatedError
+from gnio_jax.evaluation.estimate import PERFECT_STD, _batches, mean_over_windows, perfect
+from gnio_jax.filtering import ConsideredStd, CorrelatedError, filter_setup
 from tests.support.estimators import (
     CONFIG,
     NETWORK,
@@ -118,6 +118,9 @@ def test_true_displacements_lack_nothing_that_was_calibrated(walks):
         np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
         std = found.displacements.std[-1]
         np.testing.assert_allclose(std, PERFECT_STD, rtol=1e-12)
+    considered = changed(calibrated, considered={"gyro_bias": 1e-3, "scale": 0.1})
+    left = perfect(filter_setup(CONFIG, considered)).considered
+    assert left == ConsideredStd(gyro_bias=1e-3)
 
 
 def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks):
