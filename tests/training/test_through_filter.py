@@ -310,10 +310,9 @@ def test_gradient_against_differences(training, start):
         assert progress.sums["skipped"] == 0
         return state, float(progress.sums["loss"])
 
-    moments = {
-        name_of(path).partition("/mu/")[2]: np.asarray(leaf).flat[0]
-        for path, leaf in jax.tree_util.tree_leaves_with_path(taken()[0].opt_state)
-    }
+    first = taken()[0]
+    before, after, moments = map(firsts, (begin.variables, first.variables, first.opt_state))
+    moments = {name.partition("/mu/")[2]: value for name, value in moments.items()}
     names = [f"filter/{name}" for name in begin.variables["filter"]]
     assert len(names) == 15
     for name in [*names, "params/head/bias"]:
@@ -321,10 +320,17 @@ def test_gradient_against_differences(training, start):
         expected = (taken(name, step)[1] - taken(name, -step)[1]) / (2 * step)
         assert expected != 0, name
         np.testing.assert_allclose(10 * moments[name], expected, 1e-3, 1e-6, err_msg=name)
+        assert (after[name] - before[name]) * expected < 0, name  # the step goes downhill
 
 
 def name_of(path):
     return jax.tree_util.keystr(path, simple=True, separator="/")
+
+
+def firsts(tree):
+    """The first number of each leaf, by its name."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {name_of(path): np.asarray(leaf).flat[0] for path, leaf in leaves}
 
 
 def test_parts_are_modules_and_options_by_name():
