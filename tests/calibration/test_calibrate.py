@@ -81,7 +81,6 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     assert splits_read == ["val"]
     before, after = (checkpoint.load_run(folder) for folder in (run, out))
     assert after.config.model.equivariance == "four_headings"
-    assert after.model == models.from_config(after.config.model)
     same = {name: getattr(before.config, name) for name in ("workdir", "filter", "model")}
     assert dataclasses.replace(after.config, **same) == before.config
     jax.tree.map(np.testing.assert_array_equal, after.variables, before.variables)
@@ -97,8 +96,11 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     assert about["split"] == "val" and about["filter"] == plain(found)
 
 
-def test_a_network_that_cannot_be_averaged(run):
+def test_a_network_is_averaged_over_four_headings_or_told_that_it_cannot_be(run):
     loaded = checkpoint.load_run(run)
+    averaged = checkpoint.averaged_over_headings(loaded, "the run")
+    assert averaged.config.model.equivariance == "four_headings"
+    assert averaged.model == models.from_config(averaged.config.model) != loaded.model
     model = dataclasses.replace(loaded.config.model, equivariance="canonical_frame")
     augment = dataclasses.replace(loaded.config.augment, yaw=False)
     for change, problem in (
