@@ -2,13 +2,7 @@
 
 import ast
 import importlib
-import os
 import re
-import shlex
-import shutil
-import subprocess
-import tomllib
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -71,7 +65,6 @@ def run(page, code, names=None):
 
 
 def code_of(page):
-    """The blocks of a page that run, one after another."""
     return "\n".join(block.code for block in RUN if block.page == page)
 
 
@@ -88,7 +81,6 @@ def test_the_example_of_the_readme(one_walk, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_the_loop_of_ones_own(one_walk, capsys):
-    """A quarter of its piece and of its steps."""
     run("docs/differentiable_filter.md", code_of("docs/differentiable_filter.md"))
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     losses = [float(loss) for _, loss in lines[:5]]
@@ -123,7 +115,6 @@ def test_a_head_of_ones_own(monkeypatch):
 
 
 def test_a_dataset_of_two_csv_files(walks, tmp_path):
-    """A walk in the layout of the example is read back."""
     walk = data.resample(walks[0], 100.0)
     (tmp_path / "anna_1").mkdir()
     (tmp_path / "test.txt").write_text("anna_1\n", encoding="utf-8")
@@ -174,7 +165,6 @@ def test_code_names_what_there_is(place):
 
 
 def member(module, name):
-    """What `from module import name` gives."""
     try:
         return importlib.import_module(f"{module}.{name}")
     except ModuleNotFoundError:
@@ -216,78 +206,6 @@ def test_a_command_line_is_understood(line, monkeypatch):
 def test_a_command_line_of_yesterday_is_not():
     with pytest.raises(InputError, match="unknown option"):
         understood(["track", "walk.zip", "--wieghts", "mine"])
-
-
-def test_what_else_the_shell_is_told_is_there():
-    """Targets of make, extras of pip, modules and scripts of Python."""
-    makefile = (pages.ROOT / "Makefile").read_text(encoding="utf-8")
-    targets = set(re.findall(r"^([a-z]+):", makefile, re.M))
-    project = tomllib.loads((pages.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    for page, line in pages.shell_lines():
-        for target in re.findall(r"^(?:\w+=\S+ )?make ([a-z]+)", line):
-            assert target in targets, f"{page}: make {target}"
-        for extra in re.findall(r"pip install .*(?:gnio-jax|\.)\[(\w+)\]", line):
-            assert extra in project["optional-dependencies"], f"{page}: {extra}"
-        for script in re.findall(r"^python ([\w/]+\.py)", line):
-            assert (pages.ROOT / script).is_file(), f"{page}: {script}"
-        for module in re.findall(r"^python -m ((?:gnio_jax|benchmarks)[\w.]*)", line):
-            path = pages.ROOT / module.replace(".", "/")
-            assert path.is_dir() or path.with_suffix(".py").is_file(), f"{page}: {module}"
-
-
-def commands_of(shell):
-    """The words of each call of gnio."""
-    lines = [shlex.split(line) for line in shell.replace("\\\n", " ").splitlines()]
-    return [words for words in lines if words and Path(words[0]).name == "gnio"]
-
-
-@pytest.mark.skipif(not shutil.which("make"), reason="no make here")
-def test_the_recipe_of_the_shipped_network_is_what_make_runs():
-    text = configuration.find("pedestrian").read_text(encoding="utf-8")
-    told = commands_of("\n".join(re.findall(r"^#   +(.*)$", text, re.M)))
-    command = ["make", "--dry-run", "pedestrian", "RUNS=runs"]
-    said = subprocess.run(command, cwd=pages.ROOT, capture_output=True, text=True, check=True)
-    made = commands_of(said.stdout)
-    assert [sorted(words[1:]) for words in made] == [sorted(words[1:]) for words in told]
-    # Each step reads what an earlier one has left.
-    left = set()
-    for _, command, *words in made:
-        asked = understood([command, *words])
-        if command == "train":
-            poses = [each.partition("=")[2] for each in asked.set]
-            assert set(poses) <= left
-            left.add(asked.workdir)
-        else:
-            assert asked.workdir in left
-            left.add(f"{asked.workdir}_calibrated")
-
-
-@pytest.mark.skipif(not shutil.which("make"), reason="no make here")
-@pytest.mark.parametrize(
-    ("words", "installed"),
-    [
-        ("test", ".[test]"),
-        ("test EXTRAS=test,reference", ".[test,reference]"),
-        ("lint", ".[test,dev]"),
-        ("docs", ".[docs]"),
-        ("demo", "."),
-        ("pedestrian", "."),
-    ],
-)
-def test_make_installs_what_it_needs(words, installed, tmp_path):
-    """Into an environment of its own, before anything else runs there. The commands are known."""
-    command = ["make", "--dry-run", f"VENV={tmp_path / 'none'}", *words.split()]
-    alone = {"PATH": os.environ["PATH"]}  # without what the make of these tests was told
-    said = subprocess.run(
-        command, cwd=pages.ROOT, env=alone, capture_output=True, text=True, check=True
-    )
-    steps = [line for line in said.stdout.splitlines() if "/none/bin/" in line]
-    installs = [line for line in steps if "pip install" in line]
-    assert steps[: len(installs)] == installs
-    assert re.search(r"pip install .*-e '?([^' ]+)'?$", installs[-1])[1] == installed
-    assert len(steps) > 1
-    for _, *asked in commands_of(said.stdout):
-        understood(asked)
 
 
 def test_the_reference_has_every_room():
@@ -335,6 +253,5 @@ def test_a_link_within_the_repository_leads_somewhere(page):
 
 
 def headings(page):
-    """The anchors of a page, as MkDocs and GitHub name them."""
     found = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title).lower().replace(" ", "-") for title in found}

@@ -21,18 +21,6 @@ from gnio_jax import calibration, data, filtering, models
 from gnio_jax.calibration import evidence
 from gnio_jax.calibration import fit as fitting
 from gnio_jax.calibration import run as calibrating
-from gnio_jax.calibration.fit import (
-    CONSIDERED,
-    GROUPS,
-    Positions,
-    filtered_positions,
-    fit_considered,
-    fit_innovations,
-    innovation_config,
-    start_of_fit,
-    std_factors,
-    unphysical,
-)
 from gnio_jax.commands import app
 from gnio_jax.config import (
     CalibrateConfig,
@@ -108,54 +96,34 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     assert about["split"] == "val" and about["filter"] == plain(found)
 
 
-def test_the_network_is_averaged_over_four_headings(run):
-    averaged = evidence.load_run(run, CalibrateConfig(str(run), average_headings=True))
-    assert averaged.config.model.equivariance == "four_headings"
-    assert averaged.model == models.from_config(averaged.config.model)
-
-
-@pytest.mark.parametrize(
-    ("model", "augment", "problem"),
-    [
-        ({"equivariance": "canonical_frame"}, {}, "has a canonical frame"),
-        ({}, {"yaw": False}, "four_headings without augment.yaw"),
-    ],
-)
-def test_a_network_that_cannot_be_averaged(run, model, augment, problem):
+def test_a_network_is_averaged_over_four_headings_or_told_that_it_cannot_be(run):
     loaded = checkpoint.load_run(run)
-    model = dataclasses.replace(loaded.config.model, **model)
-    augment = dataclasses.replace(loaded.config.augment, **augment)
-    config = dataclasses.replace(loaded.config, model=model, augment=augment)
-    with pytest.raises(InputError, match=f"the run.*{problem}"):
-        checkpoint.averaged_over_headings(loaded._replace(config=config), "the run")
+    averaged = checkpoint.averaged_over_headings(loaded, "the run")
+    assert averaged.config.model.equivariance == "four_headings"
+    assert averaged.model == models.from_config(averaged.config.model) != loaded.model
+    model = dataclasses.replace(loaded.config.model, equivariance="canonical_frame")
+    augment = dataclasses.replace(loaded.config.augment, yaw=False)
+    for change, problem in (
+        ({"model": model}, "has a canonical frame"),
+        ({"augment": augment}, "four_headings without augment.yaw"),
+    ):
+        config = dataclasses.replace(loaded.config, **change)
+        with pytest.raises(InputError, match=f"the run.*{problem}"):
+            checkpoint.averaged_over_headings(loaded._replace(config=config), "the run")
 
 
-@pytest.mark.parametrize(
-    ("options", "problem"),
-    [
+def test_what_is_refused(run, splits_read, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    (tmp_path / "run" / "calibration.json").write_text("{}")
+    for options, problem in (
         ({"split": "test"}, "neither the validation nor the training split"),
         ({"out": "."}, "is there already"),
         ({"fit": ()}, "--fit: names nothing; name some of measurement, noise"),
-    ],
-)
-def test_what_is_refused(run, splits_read, options, problem):
-    with pytest.raises(InputError, match=problem):
-        calibration.calibrate(CalibrateConfig(workdir=str(run), **options))
+        ({"workdir": str(tmp_path / "run")}, "is a calibrated run; calibrate the run that it was"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            calibration.calibrate(CalibrateConfig(**{"workdir": str(run)} | options))
     assert splits_read == []
-
-
-def test_a_calibrated_run_is_not_calibrated_again(run, tmp_path):
-    shutil.copytree(run, tmp_path / "run")
-    (tmp_path / "run" / "calibration.json").write_text("{}")
-    with pytest.raises(InputError, match="is a calibrated run; calibrate the run that it was"):
-        calibration.calibrate(CalibrateConfig(workdir=str(tmp_path / "run")))
-
-
-@pytest.mark.parametrize(("asked", "split"), [(None, "val"), ("val", "val"), ("train", "train")])
-def test_the_split_is_that_of_validation_or_of_training(run, asked, split):
-    loaded = checkpoint.load_run(run)
-    found, ((source, fold),) = evidence.sources(loaded, CalibrateConfig(str(run), split=asked))
-    assert found == split and source is loaded and fold is None
 
 
 def estimate(error, std):
@@ -176,11 +144,11 @@ def test_the_factors_are_those_of_the_errors():
     error = std * np.array([1.5, 0.5, 3.0]) * rng.choice([-1.0, 1.0], (400, 3))
     truth = np.ones((400, 3))
     truth[:50, 1] = np.nan
-    found = std_factors([estimate(error, std)], [truth])
+    found = fitting.std_factors([estimate(error, std)], [truth])
     np.testing.assert_allclose(found, [1.5, 0.5, 3.0], rtol=1e-12)
     with pytest.raises(ValueError, match="10 windows have a reference"):
         truth[:390] = np.nan
-        std_factors([estimate(error, std)], [truth])
+        fitting.std_factors([estimate(error, std)], [truth])
 
 
 @pytest.fixture(scope="module")
@@ -214,25 +182,17 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(
         assert recording.name == name and tiny_run.same(variables, network.variables)
 
 
-@pytest.mark.parametrize(
-    ("folders", "split", "problem"),
-    [
-        ([0], None, "--out-of-fold: were trained on the splits train-0of2; train one run for each"),
-        ([0, 0], None, "were trained on the splits train-0of2, train-0of2"),
-        ([0, 1], "train", "--split train: is of no use with --out-of-fold"),
-    ],
-)
-def test_folds_that_do_not_make_a_whole_are_refused(
-    run, splits_read, fold_runs, folders, split, problem
-):
-    chosen = tuple(fold_runs[fold] for fold in folders)
-    with pytest.raises(InputError, match=problem):
-        calibration.calibrate(CalibrateConfig(workdir=str(run), out_of_fold=chosen, split=split))
-    assert splits_read == []
-
-
-def test_folds_of_another_experiment_are_refused(run, fold_runs):
+def test_folds_that_do_not_make_a_whole_are_refused(run, splits_read, fold_runs):
     config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
+    first, _ = fold_runs
+    for changes, problem in (
+        ({"out_of_fold": (first,)}, "were trained on the splits train-0of2; train one run for ea"),
+        ({"out_of_fold": (first, first)}, "were trained on the splits train-0of2, train-0of2"),
+        ({"split": "train"}, "--split train: is of no use with --out-of-fold"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            calibration.calibrate(dataclasses.replace(config, **changes))
+    assert splits_read == []
     loaded = checkpoint.load_run(run)
     other = dataclasses.replace(loaded.config.model, width=5)
     changed = loaded._replace(config=dataclasses.replace(loaded.config, model=other))
@@ -240,10 +200,7 @@ def test_folds_of_another_experiment_are_refused(run, fold_runs):
         evidence.sources(changed, config)
 
 
-# What is fitted
-# ------------------------------------------------------------------------------------------------
-
-PATHS = (*GROUPS["measurement"], *GROUPS["noise"], *GROUPS["window"])
+PATHS = (*fitting.GROUPS["measurement"], *fitting.GROUPS["noise"], *fitting.GROUPS["window"])
 ERRORS = CorrelatedError(0.8, 0.5)
 TRUE = changed(
     noise={
@@ -273,7 +230,7 @@ def walks_and_truth():
 
 
 def fit(walks, settings, **options):
-    return fit_innovations(walks, DATA, settings, PATHS, lambda calls: None, **options)
+    return fitting.fit_innovations(walks, DATA, settings, PATHS, lambda calls: None, **options)
 
 
 def test_the_noises_and_errors_of_simulated_walks_are_found():
@@ -290,9 +247,8 @@ def test_the_noises_and_errors_of_simulated_walks_are_found():
 
 
 def test_the_gradient_is_that_of_the_likelihood():
-    """Along two directions, in which all of the numbers change."""
     free = free_parameters(TRUE, PATHS)
-    fixed = {"names": tuple(free), "config": innovation_config(DATA, TRUE)}
+    fixed = {"names": tuple(free), "config": fitting.innovation_config(DATA, TRUE)}
     free, rng = np.array(list(free.values())), np.random.default_rng(0)
 
     def at(vector):
@@ -309,11 +265,10 @@ def test_the_gradient_is_that_of_the_likelihood():
 
 @pytest.mark.parametrize(("raw", "expected"), [(True, 0.05), (False, 1e-3)])
 def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(raw, expected):
-    """Every other walk starts as the settings say, whatever it was prepared with."""
     settings = dataclasses.replace(TRUE, raw_gyro_bias=0.05)
     walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
     walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
-    _, state, _ = fitting._repeated(walk, settings, innovation_config(DATA, settings))
+    _, state, _ = fitting._repeated(walk, settings, fitting.innovation_config(DATA, settings))
     up, covariance = np.asarray(state.rotation)[2], state.core_covariance[GYRO_BIAS, GYRO_BIAS]
     level = np.cross(up, [1.0, 0.0, 0.0])
     spreads = np.sqrt([each @ covariance @ each for each in (level / np.linalg.norm(level), up)])
@@ -321,7 +276,6 @@ def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(raw, ex
 
 
 def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told(monkeypatch):
-    """Of other walks, with other factors of the axes and another start."""
     given, _ = walks_and_truth()
     monkeypatch.setitem(fitting.PHYSICAL, "noise.measurement_scale", (1e8, 1e9))
     warning, outside = fit(given, TRUE, most_steps=1).warnings
@@ -336,17 +290,7 @@ def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told
     assert programs > 0 and fitting._value_and_gradient._cache_size() == programs
 
 
-def test_a_search_along_a_wrong_gradient_is_told_of(monkeypatch):
-    def value_and_gradient(free, *_, **fixed):
-        return (free @ free, free @ free), -2 * free
-
-    monkeypatch.setattr(fitting, "_value_and_gradient", value_and_gradient)
-    found = fit(walks_and_truth()[0], TRUE)
-    assert found.steps == 0 and any("no step along the gradient" in told for told in found.warnings)
-
-
 def test_a_search_begins_anew_until_that_gains_nothing(monkeypatch):
-    """Where one ended too early, e.g. after a trial step to where the gradient explodes."""
     begun = []
 
     def minimize(function, at, options, **_):
@@ -381,6 +325,8 @@ def test_searches_that_ended_too_early_are_told_of(monkeypatch, searches, proble
         value, steps, success = next(ends)
         return OptimizeResult(x=at, fun=value, nit=steps, success=success)
 
+    value = lambda free, *_, **__: ((free @ free, free @ free), 2 * free)  # noqa: E731
+    monkeypatch.setattr(fitting, "_value_and_gradient", value)
     monkeypatch.setattr(fitting, "minimize", minimize)
     warnings = fit(walks_and_truth()[0], TRUE, most_steps=40).warnings
     assert next(ends, None) is None
@@ -390,7 +336,7 @@ def test_searches_that_ended_too_early_are_told_of(monkeypatch, searches, proble
 def test_values_outside_what_is_physical_are_named():
     noise = {"accel_bias_walk": 2.656, "correlation": CorrelatedError(0.9999, 5.9e4)}
     names = ("noise.gyro_density", "noise.accel_bias_walk", "noise.correlation.share")
-    told = unphysical(changed(TRUE, noise=noise), (*names, "noise.correlation.seconds"))
+    told = fitting.unphysical(changed(TRUE, noise=noise), (*names, "noise.correlation.seconds"))
     assert [line.split(" came out as ")[0] for line in told] == [
         "filter.noise.accel_bias_walk",
         "filter.noise.correlation.share",
@@ -401,12 +347,12 @@ def test_values_outside_what_is_physical_are_named():
 
 def test_what_is_switched_off_and_has_no_start_cannot_be_fitted():
     off = changed(TRUE, start={"gyro_bias": 0.0})
-    begun = start_of_fit(off, (*GROUPS["noise"], *GROUPS["window"]))
+    begun = fitting.start_of_fit(off, (*fitting.GROUPS["noise"], *fitting.GROUPS["window"]))
     assert begun.noise.correlation == CorrelatedError(0.8, 0.5)
     own = changed(TRUE, noise={"correlation": CorrelatedError(0.3, 0.7)})
-    assert start_of_fit(own, GROUPS["window"]) == own
+    assert fitting.start_of_fit(own, fitting.GROUPS["window"]) == own
     with pytest.raises(InputError, match=r"filter.start.gyro_bias: is 0 .*leave its group out"):
-        start_of_fit(off, GROUPS["start"])
+        fitting.start_of_fit(off, fitting.GROUPS["start"])
 
 
 def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
@@ -449,9 +395,9 @@ def test_what_the_errors_were_drawn_with_is_found():
     wanted = np.array([2e-3, 2e-3, 2e-3, 0.1, np.deg2rad(8.0), 0.01])
     drawn = np.einsum("kij,kj->ki", root, rng.standard_normal((rows, 3)))
     error = drawn + np.einsum("kic,kc->ki", sensitivity, wanted * rng.standard_normal((rows, 6)))
-    positions = Positions(error, covariance, sensitivity)
+    positions = fitting.Positions(error, covariance, sensitivity)
     options = changed(considered={"scale": 0.7})  # of an earlier calibration
-    found = fit_considered(positions, 0.1, options)
+    found = fitting.fit_considered(positions, 0.1, options)
     assert found.before > 2 and found.after == pytest.approx(1, abs=0.05)
     np.testing.assert_allclose(
         found.settings.considered, [2e-3, 0.1, np.deg2rad(8.0), 0.01], rtol=0.1
@@ -466,16 +412,18 @@ def test_the_prior_counts_as_many_independent_errors_as_there_are():
     error[:, 0] = 0.3 * np.where(np.arange(rows) % 2, 1.0, -1.0)
     covariance, sensitivity = np.tile(1e-4 * np.eye(3), (rows, 1, 1)), np.zeros((rows, 3, 6))
     sensitivity[:, 0, 5] = 1.0  # the slope alone, in metres for a unit
-    found = fit_considered(Positions(error, covariance, sensitivity), stride, FilterSettings())
+    found = fitting.fit_considered(
+        fitting.Positions(error, covariance, sensitivity), stride, FilterSettings()
+    )
     for name in ("gyro_bias", "scale", "heading"):
         assert getattr(found.settings.considered, name) == pytest.approx(
-            getattr(CONSIDERED, name), rel=1e-3
+            getattr(fitting.CONSIDERED, name), rel=1e-3
         )
 
     def negative_log_posterior(log_std):
         variance = 1e-4 + np.exp(2 * log_std)
         likelihood = 4 * 0.5 * (0.3**2 / variance + np.log(variance))
-        return likelihood + 0.5 * ((log_std - np.log(CONSIDERED.slope)) / 2.0) ** 2
+        return likelihood + 0.5 * ((log_std - np.log(fitting.CONSIDERED.slope)) / 2.0) ** 2
 
     grid = np.linspace(np.log(0.05), np.log(0.5), 20001)
     wanted = np.exp(grid[np.argmin(negative_log_posterior(grid))])
@@ -484,7 +432,6 @@ def test_the_prior_counts_as_many_independent_errors_as_there_are():
 
 
 def nees(found):
-    """Mean over all positions of eᵀ P⁻¹ e / 3."""
     inverse = np.linalg.inv(found.covariance)
     return np.einsum("ki,kij,kj->k", found.error, inverse, found.error).mean() / 3
 
@@ -497,25 +444,25 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     truth = truth.copy()
     options = changed(TRUE, noise={"measurement_scale": 9.0})  # σ is three times what is said
     truth[0, 300:] = np.nan
-    found = filtered_positions(walks, truth, DATA, options)
+    found = fitting.filtered_positions(walks, truth, DATA, options)
     assert len(found.error) == np.isfinite(truth).all(2).sum()
     assert nees(found) == pytest.approx(1, abs=0.5)
-    off = filtered_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
+    off = fitting.filtered_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
     assert nees(off) > 3 * nees(found)
 
     accel, raw = walks.accel.copy(), np.arange(WALKS) == 0
     accel[1, 100:] += 1e4
     marked = walks._replace(start=walks.start._replace(raw_gyro=raw), accel=accel)
-    some = filtered_positions(marked, truth, DATA, options)
+    some = fitting.filtered_positions(marked, truth, DATA, options)
     assert 0 < len(some.error) < 50 and np.abs(some.error).max() < 50
     marked = walks._replace(start=walks.start._replace(raw_gyro=raw | True))
-    assert len(filtered_positions(marked, truth, DATA, options).error) == len(found.error)
+    assert len(fitting.filtered_positions(marked, truth, DATA, options).error) == len(found.error)
 
 
 def test_no_positions_and_no_likelihood_are_named():
-    none = Positions(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 6)))
+    none = fitting.Positions(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 6)))
     with pytest.raises(InputError, match="not healthy where these recordings have a reference"):
-        fit_considered(none, 0.1, FilterSettings())
-    lost = Positions(np.ones((9, 3)), np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)))
+        fitting.fit_considered(none, 0.1, FilterSettings())
+    lost = fitting.Positions(np.ones((9, 3)), np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)))
     with pytest.raises(InputError, match="no positive definite covariance"):
-        fit_considered(lost, 0.1, FilterSettings())
+        fitting.fit_considered(lost, 0.1, FilterSettings())

@@ -31,7 +31,6 @@ def read(text):
 
 
 def refused(text):
-    """Place, problem and remedy of the mistake in a file."""
     with pytest.raises(InputError) as mistake:
         read(text)
     assert "\n" not in str(mistake.value) and len(str(mistake.value)) < 400
@@ -42,14 +41,10 @@ def refused(text):
     "text",
     [
         "seed: 1\nseed: 2",
-        "optim: {epochs: 3}\noptim: {batch_size: 8}",
         "optim: {epochs: 3, epochs: 4}",
         "seed: !!timestamp 2020-13-45",
-        "seed: !!timestamp today",
         "seed: !!int 0b_",
-        "seed: !!int ''",
         "seed: !!map [1, 2]",
-        "seed: !!set [1]",
         "data: {rate: !!float ''}",
         "augment: {yaw: !!bool maybe}",
         "seed: " + "9" * 5000,
@@ -65,10 +60,10 @@ def test_what_is_no_yaml_is_one_line_that_names_the_file(text):
     assert source == "f.yaml" and problem.startswith("is not YAML (")
 
 
-@pytest.mark.parametrize("text", ["", "# only a comment", "- 1"])
-def test_a_file_without_fields_is_refused(text):
-    source, problem, _ = refused(text)
-    assert source == "f.yaml" and ("empty" in problem or "[1]" in problem)
+def test_a_file_without_fields_is_refused():
+    for text in ("", "# only a comment", "- 1"):
+        source, problem, _ = refused(text)
+        assert source == "f.yaml" and ("empty" in problem or "[1]" in problem)
 
 
 @pytest.mark.parametrize(
@@ -97,31 +92,16 @@ def test_a_file_without_fields_is_refused(text):
         "augment.yaw": ["augment: {yaw: 1}", "augment: {yaw: yes}"],
         "augment.low_pass_hertz": ["augment: {low_pass_hertz: [25, 4]}"],
         "data.rate": [
-            *("data: {rate: .inf}", "data: {rate: !!float .inf}", "data: {rate: 1e999}"),
-            "data: {rate: " + "9" * 400 + "}",
+            *("data: {rate: .inf}", "data: {rate: 1e999}", "data: {rate: " + "9" * 400 + "}"),
         ],
-        "data.window_seconds": [
-            "data: {window_seconds: .inf}",
-            "data: {rate: 1e308, window_seconds: 1e308}",
-        ],
-        "data.stride_seconds": ["data: {stride_seconds: 1e-9}"],
+        "data.window_seconds": ["data: {rate: 1e308, window_seconds: 1e308}"],
         "data.train_stride_seconds": ["data: {train_stride_seconds: 1e-9}"],
-        "loss.mse_weight": [
-            *("loss: {mse_weight: .nan}", "loss: {mse_weight: !!float .nan}"),
-            "loss: {mse_weight: -5}",
-        ],
-        "loss.log_std_floor": ["loss: {log_std_floor: !!float -.inf}"],
+        "loss.mse_weight": ["loss: {mse_weight: !!float .nan}", "loss: {mse_weight: -5}"],
         "optim.epochs": ["optim: {epochs: '3'}", "optim: {epochs: 99999999999}"],
-        "optim.learning_rate": ["optim: {learning_rate: 1e999}"],
-        "optim.start_learning_rate": ["optim: {start_learning_rate: -1.0}"],
         "filter.measurement_scale": ["filter: {measurement_scale: 1}"],
-        "filter.noise.gyro_density": ["filter: {noise: {gyro_density: 1e999}}"],
         "filter.noise.gyro_densty": ["filter: {noise: {gyro_densty: 1}}"],
         "filter.noise.measurement_scale": ["filter: {noise: {measurement_scale: 0}}"],
-        "filter.noise.std_factor": [
-            "filter: {noise: {std_factor: [1, 2]}}",
-            "filter: {noise: {std_factor: [1, 2, 0]}}",
-        ],
+        "filter.noise.std_factor": ["filter: {noise: {std_factor: [1, 2]}}"],
         "filter.noise.correlation.share": ["filter: {noise: {correlation: {share: 1}}}"],
     }.items(),
 )
@@ -148,10 +128,10 @@ def test_numbers_are_those_of_yaml_1_2():
     assert (found.optim.learning_rate, found.loss.mse_weight, found.data.rate) == (1e-3, 3.0, 200.0)
 
 
-@pytest.mark.parametrize("name", ["1e-3", "010", "yes", "null", "2020-01-01", "~", "a: b", "1:30"])
-def test_text_that_looks_like_something_else_survives_its_file(name):
-    config = TrainConfig(workdir=name, filter=changed(noise={"correlation": CorrelatedError()}))
-    assert read(configuration.text(config)) == config
+def test_text_that_looks_like_something_else_survives_its_file():
+    for name in ("1e-3", "010", "yes", "null", "2020-01-01", "~", "a: b", "1:30"):
+        config = TrainConfig(workdir=name, filter=changed(noise={"correlation": CorrelatedError()}))
+        assert read(configuration.text(config)) == config
 
 
 def experiment_of(*words):
@@ -205,9 +185,8 @@ def test_settings_are_assigned_by_name():
     assert off.filter.noise == noise._replace(correlation=None)
 
 
-@pytest.mark.parametrize(
-    ("assignment", "problem"),
-    [
+def test_an_assignment_that_makes_no_sense_is_named():
+    for assignment, problem in (
         ("optim.epochs", "is not a setting; write section.field=value"),
         ("=3", "is not a setting"),
         ("optim.epohcs=3", "unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"),
@@ -215,17 +194,14 @@ def test_settings_are_assigned_by_name():
         ("optim.epochs.x=3", "field 'optim.epochs' must be a whole number"),
         ("optim.epochs=3.5", "field 'optim.epochs' must be a whole number, found 3.5"),
         ("seed=[", "is not YAML"),
-    ],
-)
-def test_an_assignment_that_makes_no_sense_is_named(assignment, problem):
-    with pytest.raises(InputError) as refused:
-        configuration.assign(TrainConfig(), [assignment])
-    assert assignment in str(refused.value) and problem in str(refused.value)
+    ):
+        with pytest.raises(InputError) as refused:
+            configuration.assign(TrainConfig(), [assignment])
+        assert assignment in str(refused.value) and problem in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("hint", "words", "value"),
-    [
+def test_words_of_a_command_line_are_values():
+    for hint, words, value in (
         (int, ["3"], 3),
         (float, ["1e-3"], 1e-3),
         (float | None, ["null"], None),
@@ -238,73 +214,30 @@ def test_an_assignment_that_makes_no_sense_is_named(assignment, problem):
         (str | tuple[str, ...], ["one"], "one"),
         (str | tuple[str, ...], ["one", "two"], ("one", "two")),
         (Path, ["010"], Path("010")),
-    ],
-)
-def test_words_of_a_command_line_are_values(hint, words, value):
-    found = configuration.value_from_words(hint, words, "--x")
-    assert found == value and type(found) is type(value)
-
-
-@pytest.mark.parametrize(
-    ("hint", "words", "problem"),
-    [
+    ):
+        found = configuration.value_from_words(hint, words, "--x")
+        assert found == value and type(found) is type(value)
+    for hint, words, problem in (
         (int, ["3.5"], "--x: must be a whole number, found 3.5"),
         (str | tuple[int, ...], ["1", "x"], "--x: must be a whole number, found 'x'"),
         (int, ["0x10"], "--x: must be a whole number, found '0x10'"),
         (float, [".inf"], "--x: must be a number, found '.inf'"),
         (tuple[int, ...], ["1", "a"], "--x: must be a whole number, found 'a'"),
-    ],
-)
-def test_words_that_are_no_values_are_named(hint, words, problem):
-    with pytest.raises(InputError) as refused:
-        configuration.value_from_words(hint, words, "--x")
-    assert str(refused.value) == problem
+    ):
+        with pytest.raises(InputError) as refused:
+            configuration.value_from_words(hint, words, "--x")
+        assert str(refused.value) == problem
 
 
 def test_settings_of_a_program_may_be_numbers_of_numpy():
-    """They are what a calibration gives; their bounds hold for them too."""
     config = TrainConfig(filter=changed(noise={"gyro_density": np.float32(1e-3)}))
     assert configuration.validate(config) is config
     with pytest.raises(InputError, match=r"config: field 'filter\.noise\.gyro_density'"):
         configuration.validate(TrainConfig(filter=changed(noise={"gyro_density": np.float32(0)})))
 
 
-# Files of earlier versions
-# ------------------------------------------------------------------------------------------------
-
-OLD = """
-dataset: oxiod
-data_root: null
-workdir: runs/oxiod
-init_from: null
-seed: 3
-data: {rate: 100.0, window_seconds: 1.0, context_seconds: 0.0, stride_seconds: 0.1,
-  train_stride_seconds: 0.1, window_rotation: per_sample, train_split: train, val_split: val,
-  folds: 1, left_out: 0, residency: device}
-augment: {gyro_bias: 0.05, accel_bias: 0.2, tilt_degrees: 5.0, yaw: true, gyro_noise: 0.001,
-  accel_noise: 0.01, shift_samples: 0}
-model: {name: gnio, width: 16, bank_size: null, bank_heads: null, bank_std: null, head: null,
-  gate: null, scale: null, uncertainty: null, output_dim: null, dropout: null, equivariance: none,
-  dtype: float32}
-loss: {name: weighted_sum, mse_weight: 100.0, mae_weight: 0.0, nll_weight: 0.0001,
-  nll_from_epoch: 0.0, log_std_from_epoch: 0.0, log_std_floor: null}
-optim: {schedule: cosine, epochs: 24, batch_size: 64, accumulate: 1, learning_rate: 0.002,
-  start_learning_rate: 0.0001, end_learning_rate: 1.0e-06, warmup_epochs: 1.0, clip_norm: null,
-  weight_decay: 0.0, plateau_epochs: 10, plateau_factor: 0.1, best_by: loss,
-  statistics_windows: 16384, ema_decay: 0.0}
-filter: {gyro_density: 0.02, accel_density: 0.03, gyro_bias_walk: 1.021e-06,
-  accel_bias_walk: 0.0104, tilt_std_degrees: 2.0, yaw_std_degrees: 0.1, velocity_std: 0.7,
-  position_std: 0.001, gyro_bias_std: 0.0002, accel_bias_std: 0.02, measurement_scale: 1.073,
-  std_factor_x: 0.9455, std_factor_y: 0.8488, std_factor_z: 0.8295, window_error_share: 0.8971,
-  window_error_seconds: 3.281, scale_error_std: 0.0, heading_error_std_degrees: 0.0,
-  walk_error_seconds: 40.0, considered_gyro_bias_std: 0.003941, considered_scale_std: 0.1742,
-  considered_heading_std_degrees: 4.273, considered_slope_std: 0.03128,
-  mahalanobis_fail_scale: 2.0, window_rotation: tlio}
-through_filter: {learn: [], piece_seconds: 60.0, truncate_seconds: 10.0, start_spread: 1.0,
-  gate_softness: 2.0, filter_learning_rate: 0.03, skip_above: 1000.0, displacement_weight: 100.0,
-  yaw_weight: 1000.0, innovation_weight: 0.1, state_weight: 0.1, window_weight: 100.0}
-checkpoint_every_seconds: 600.0
-"""
+RECORDED = Path(__file__).parents[1] / "recorded" / "config" / "earlier_version.yaml"
+OLD = RECORDED.read_text(encoding="utf-8")
 
 
 def test_the_config_of_an_old_run_is_the_same_experiment():
@@ -334,18 +267,15 @@ def test_the_config_of_an_old_run_is_the_same_experiment():
     assert read(folded).data.train_split == "train-1of4"
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "problem"),
-    [
+def test_an_old_file_that_asks_for_what_is_gone_is_refused():
+    for before, after, problem in (
         ("scale_error_std: 0.0", "scale_error_std: 0.1", "'filter.scale_error_std' is 0.1, and"),
         ("ema_decay: 0.0", "ema_decay: 0.99", "field 'optim.ema_decay' is 0.99, and there is no"),
         ("tilt_std_degrees: 2.0", "tilt_std_degrees: a", "'filter.tilt_std_degrees' must be a num"),
         ("gyro_density: 0.02", "gyro_density: -1.0", "'filter.noise.gyro_density' must be posit"),
         ("yaw_std_degrees: 0.1", f"yaw_std_degrees: 1{'0' * 400}", "is larger than any number"),
         (OLD, "checkpoint_every_seconds: 600.0", "unknown field 'checkpoint_every_seconds'"),
-    ],
-)
-def test_an_old_file_that_asks_for_what_is_gone_is_refused(before, after, problem):
-    with pytest.raises(InputError) as refused:
-        read(OLD.replace(before, after))
-    assert problem in str(refused.value)
+    ):
+        with pytest.raises(InputError) as refused:
+            read(OLD.replace(before, after))
+        assert problem in str(refused.value)

@@ -32,7 +32,6 @@ def test_windows_are_cut_with_the_given_attitude(walks, reading, context):
 
 
 def test_the_first_gyro_bias_is_taken_off_the_windows_and_the_attitude(clean):
-    """A gyro with a bias that is known from the start is as good as one without."""
     bias = np.array([0.1, -0.05, 0.02])
     biased = clean._replace(gyro=clean.gyro + bias)
     (plain,), (found,) = (

@@ -43,7 +43,6 @@ def look(run, **options):
 
 
 def test_what_is_there_is_taken(run, monkeypatch):
-    """With the checkpoint that it is of."""
     folder = evaluation(run)
     found = look(run)
     assert (found.folder, found.problem) == (folder, "")
@@ -97,7 +96,6 @@ def test_recordings_of_another_folder_are_never_taken(run, tmp_path):
 
 
 def test_a_run_whose_filter_was_trained_is_restored_once(run, monkeypatch):
-    """Its settings are in the checkpoint, and so is what an evaluation needs."""
     config = configuration.load(run / "config.yaml")
     through = dataclasses.replace(config.through_filter, learn=("noise",))
     configuration.save(

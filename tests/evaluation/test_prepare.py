@@ -36,7 +36,6 @@ def swaying(clean):
 
 
 def resting(walk, gyro, rows=120, noise=0.0):
-    """At rest over the first rows, with a gyro and an accelerometer that make noise."""
     random, walk = np.random.default_rng(0), walk._replace(gyro=walk.gyro.copy())
     walk = walk._replace(accel=walk.accel.copy())
     walk.gyro[:rows] = gyro + random.normal(0, 0.1 * noise, (rows, 3))
@@ -76,7 +75,6 @@ def test_gyro_bias_from_reference_and_from_rest(walks, swaying):
 
 
 def test_short_sequences_are_left_out_by_name(walks):
-    """Also what was hardly measured."""
     short = walks[0]._replace(
         name="short", valid=np.arange(len(walks[0].time)) > len(walks[0].time) - 52
     )
@@ -132,7 +130,6 @@ def test_a_line_across_a_gap_is_no_rest(clean):
 
 
 def test_a_rest_that_lacks_some_samples_is_a_rest(swaying):
-    """What was measured of it counts, and the line does not."""
     second = round(RATE)
     holed = with_hole(resting(swaying, BIAS, second), slice(5, 5 + second // 3))
     holed.gyro[10:15] += 1.0
@@ -142,7 +139,6 @@ def test_a_rest_that_lacks_some_samples_is_a_rest(swaying):
 
 
 def test_a_static_start_is_as_far_off_level_as_the_accelerometer_may_be(clean):
-    """By the standard deviation of its bias that the filter has, not by another."""
     tilts = []
     for bias in (0.02, 0.2):
         (recording,) = ready([clean], std=TLIO_STD._replace(accel_bias=bias), init="static")

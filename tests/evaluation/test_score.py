@@ -15,8 +15,6 @@ SPIN = Rotation.from_euler("z", 0.7)
 
 @pytest.fixture
 def files(tmp_path):
-    """Writes a reference and an estimate."""
-
     def write(reference, estimate):
         for name, path in (("truth", reference), ("odometry", estimate)):
             write_tum(tmp_path / f"{name}.txt", path)
@@ -34,7 +32,6 @@ def thinned(path, every, shift=0.0, seed=0):
 
 @pytest.mark.parametrize("of_truth, of_estimate", [(1, 5), (5, 1), (2, 3)])
 def test_poses_are_matched_as_evo_matches_them(files, of_truth, of_estimate):
-    """Whichever file has more of them; a hole of the reference counts nowhere."""
     pytest.importorskip("evo.core.sync")
     from evo.core import metrics, sync
     from evo.tools.file_interface import read_tum_trajectory_file
@@ -79,15 +76,6 @@ def test_no_pose_is_lost_where_stamps_are_uneven(files):
     assert f"{len(time):,} poses" in found.settings["split"]
 
 
-def test_the_path_is_whole_where_every_third_stamp_has_no_partner(files):
-    truth = walk()
-    kept = np.arange(len(truth.time)) % 3 > 0
-    estimate = Trajectory(*(part[kept] for part in truth))
-    found = score_files(*files(truth, estimate)).scores["odometry"].values
-    whole = score_files(*files(truth, truth)).scores["odometry"].values
-    assert found["path_length"] == pytest.approx(whole["path_length"], rel=0.01)
-
-
 def test_what_is_over_time_keeps_its_time(files):
     """A second has as many rows as the stamps say, also where poses are missing: a heading that is
     wrong throughout costs displacements nothing."""
@@ -113,7 +101,6 @@ def test_the_table_is_that_of_an_evaluation(files, capsys):
     "rows, shift, words",
     [
         (slice(None), 1e4, "fewer than two stamps are the same to 0.01 s"),
-        (slice(None), 0.05, "fewer than two stamps"),
         (slice(0, 1), 0.0, "single pose"),
         ([0, 1, 2, 899], 0.0, "only 4 stamps in 90 s, unevenly spaced"),
     ],

@@ -30,7 +30,6 @@ def test_origin_undoes_a_yaw_and_a_shift():
 
 
 def test_a_covariance_is_turned_with_its_trajectory():
-    """That of points around each position, which the alignment moves alike."""
     truth = walk(tilt=0.3)
     estimate = moved_by(truth, Rotation.from_euler("z", -2.0), [5.0, -3.0, 1.0])
     spread = np.random.default_rng(0).normal(size=(len(truth.time), 20, 3))
@@ -47,7 +46,6 @@ def test_a_covariance_is_turned_with_its_trajectory():
 
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_se3_against_scipy(mirrored):
-    """It never mirrors."""
     truth = walk(tilt=0.3)
     estimate = moved_by(perturbed(truth), Rotation.from_rotvec([0.4, -0.9, 1.7]), [5.0, -3.0, 1.0])
     if mirrored:

@@ -1,5 +1,4 @@
-"""Many sequences shared out among devices: the same numbers as one after the other, whatever their
-number."""
+"""Many sequences shared out among devices: the same numbers as one after the other."""
 
 import os
 import subprocess

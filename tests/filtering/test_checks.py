@@ -36,7 +36,6 @@ def wrong():
     yield "gyro: 1 of 300 rows", {"gyro": put(GYRO, (7, 1), NAN)}
     yield "gyro: the samples must be a multiple", {"gyro": GYRO[:-1]}
     yield "gyro", {"gyro": GYRO[:0]}
-    yield "gyro", {"gyro": GYRO[:, 0]}
     yield "gyro", {"gyro": np.zeros((SAMPLES, 4))}
     yield "gyro: the filter runs in float64", {"gyro": GYRO.astype(np.float32)}
     yield "gyro", {"gyro": GYRO.astype(int)}
@@ -47,16 +46,13 @@ def wrong():
     only_this = np.arange(SAMPLES) == 7  # what is missing may be anything
     yield "gyro: 1 of 300 rows are beyond", {"gyro": fast, "imu_valid": only_this}
     yield "accel: the shape", {"accel": ACCEL[N:]}
-    yield "accel: the shape", {"accel": np.stack([ACCEL, ACCEL])}
     yield "displacement: the shape", {"displacement": DISPLACEMENT[1:]}
-    yield "displacement", {"displacement": DISPLACEMENT.astype(np.float32)}
     yield "covariance: the shape", {"covariance": COVARIANCE[:, 0]}
     yield "covariance: 1 of 60 rows", {"covariance": put(COVARIANCE, 10, -np.eye(3))}
     yield "covariance: 1 of 60 rows", {"covariance": put(COVARIANCE, (10, 0, 1), 1.0)}
     yield "imu_valid: must be booleans", {"imu_valid": np.ones(SAMPLES, int)}
     yield "imu_valid: the shape", {"imu_valid": np.ones(3, bool)}
     yield "noise.accel_density", {"noise": NOISE._replace(accel_density=-1.0)}
-    yield "noise.gyro_bias_walk", {"noise": NOISE._replace(gyro_bias_walk=NAN)}
     yield "noise.gyro_density", {"noise": NOISE._replace(gyro_density=np.zeros(3))}
     yield "noise.measurement_scale", {"noise": NOISE._replace(measurement_scale=0.0)}
     yield "noise.std_factor", {"noise": NOISE._replace(std_factor=(1.0, 0.0, 1.0))}
@@ -93,9 +89,8 @@ def test_arguments_that_cannot_be_are_refused_by_name():
             filtering.smooth(**arguments(**spoilt))
 
 
-@pytest.mark.parametrize(
-    "field, value",
-    [
+def test_an_impossible_start_is_refused_by_name():
+    for field, value in (
         ("rotation", 2 * np.eye(3)),
         ("rotation", np.eye(4)),
         ("velocity", np.full(3, NAN)),
@@ -104,14 +99,12 @@ def test_arguments_that_cannot_be_are_refused_by_name():
         ("accel_bias", np.zeros((3, 1))),
         ("std.tilt", -1.0),
         ("std.yaw", np.zeros(3)),
-    ],
-)
-def test_an_impossible_start_is_refused_by_name(field, value):
-    given = dict(zip(("rotation", "velocity", "position"), POSE, strict=True))
-    name, _, part = field.partition(".")
-    given[name] = filtering.InitialStd(**{part: value}) if part else value
-    with pytest.raises(ValueError, match=f"^{field}:"):
-        filtering.initial_state(CONFIG, **given)
+    ):
+        given = dict(zip(("rotation", "velocity", "position"), POSE, strict=True))
+        name, _, part = field.partition(".")
+        given[name] = filtering.InitialStd(**{part: value}) if part else value
+        with pytest.raises(ValueError, match=f"^{field}:"):
+            filtering.initial_state(CONFIG, **given)
 
 
 def test_settings_that_make_no_sense_are_refused_by_name():
@@ -132,8 +125,6 @@ def test_settings_that_make_no_sense_are_refused_by_name():
 
 
 def test_the_precision_is_asked_for():
-    """float32 only where the settings allow it; without x64 the message says how to switch it
-    on."""
     single = [part.astype(np.float32) for part in POSE]
     with pytest.raises(ValueError, match=r"^rotation: .*float64, found float32.*allow_float32"):
         filtering.initial_state(CONFIG, *single)

@@ -1,6 +1,5 @@
 """Is the filter as certain as it may be? Monte Carlo with noises as it assumes them, correlated
-errors among them, and with a network in the loop that answers in its own frame; and the Jacobian of
-that frame by autodiff."""
+errors among them; and by autodiff the Jacobian of a measurement in its own frame."""
 
 import functools
 
@@ -16,9 +15,8 @@ from gnio_jax.filtering.displacement import Displacement, linearise_displacement
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.state import CLONE
 from gnio_jax.filtering.update import Step
-from gnio_jax.types import Prediction
 from gnio_jax.windows import cut_window
-from tests.support.compiling import lightly_optimised, optimised, quick
+from tests.support.compiling import optimised, quick
 from tests.support.walks import errors, simulate, with_correlated_errors
 from tests.support.whole_covariance import covariance
 
@@ -120,7 +118,6 @@ def correlated():
 
 
 def test_it_is_as_certain_as_it_may_be_with_correlated_errors():
-    """Taken for white they make the filter too certain, and worse."""
     runs, position = correlated(), PARTS["position"]
     error, spread, nis, _ = monte_carlo(runs, CORRELATED_SIGMA, ERRORS.share)
     assert 0.9 < nis[:, 100:].mean() / 3 < 1.1
@@ -151,67 +148,6 @@ def test_the_smoother_is_consistent_with_correlated_errors():
         low, high = bounds(len(index) * 16, 0.999)
         found = nees_of(error, smoothed.covariance, index)[100:-100].mean()
         assert low < found < high, index
-
-
-# The network in the loop --------------------------------------------------------------------------
-
-
-TIGHT_RUNS, TIGHT_INTERVALS = 32, 150
-
-
-@functools.cache
-def tight():
-    """(tables, start, gyro, accel) -> history of `run_odometry`, batched over runs, with a network
-    that knows the truth, but for its noise, and tells it in the frame of its window, which it finds
-    out from the window alone."""
-    length = N * CLONES
-
-    @lightly_optimised
-    @jax.vmap
-    def run(world, norms, displacement, noise, rotation, velocity, position, gyro, accel):
-        def predict(windows):
-            seen = windows[0, :, :3].astype(jnp.float64)
-            size = jnp.linalg.norm(seen, axis=1)  # no rotation changes it: which window is this?
-            k = jnp.argmin(jnp.sum((size[None] - norms) ** 2, axis=1))
-            truth = jax.lax.dynamic_slice(world, (k * N, 0), (length, 3))
-            seen, truth = seen - seen.mean(0)[None], truth - truth.mean(0)[None]
-            # seen = turn · truth, and the part of the turn about z is the frame's
-            turn = jnp.linalg.solve(truth.T @ truth, truth.T @ seen).T
-            angle = jnp.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-            said = geometry.rotation_z(angle) @ displacement[k] + noise[k]
-            return Prediction(said[None], jnp.full((1, 3), np.log(SIGMA)))
-
-        state = filtering.initial_state(CONFIG, rotation, velocity, position)
-        return filtering.run_odometry(predict, state, gyro, accel, CONFIG, NOISE)[1]
-
-    return run
-
-
-@pytest.mark.parametrize("pitch", [0.0, 70.0, 90.0])
-def test_attitude_is_consistent_whatever_the_pitch(pitch):
-    """NEES(θ)/3 in the 99 % bounds of the average over runs at one time, level or on the nose."""
-    given = TIGHT_RUNS, TIGHT_INTERVALS, N, CLONES, DT, NOISE, filtering.InitialStd(), SIGMA
-    runs = simulate(7, *given, np.radians(pitch))
-    # window k ends with interval k + CLONES; its first sample is the first after interval k
-    turns = Rotation.from_rotvec((runs.rate * DT).reshape(-1, 3)).as_matrix()
-    turns = turns.reshape(*runs.rate.shape, 3)
-    attitude, world = runs.attitude0, np.empty_like(runs.accel)
-    for j in range(runs.accel.shape[1]):
-        world[:, j] = np.einsum("rij,rj->ri", attitude, runs.accel[:, j])
-        attitude = attitude @ turns[:, j]
-    np.testing.assert_allclose(attitude, runs.rotation[:, -1], atol=1e-9)
-    size = np.linalg.norm(runs.accel[:, N:], axis=2)
-    windows = range(TIGHT_INTERVALS - CLONES)
-    norms = np.stack([size[:, N * k : N * (k + CLONES)] for k in windows], 1)
-    moved = runs.position[:, CLONES:] - runs.position[:, :-CLONES]
-    noise = SIGMA * np.random.default_rng(8).normal(size=moved.shape)
-    history = tight()(world[:, N:], norms, moved, noise, *runs[:5])
-    assert (np.asarray(history.healthy) == 1).all()
-    assert (np.asarray(history.accepted)[:, CLONES:] == 1).all()
-    error, spread = errors(runs, history), np.asarray(history.covariance)
-    low, high = bounds(3 * TIGHT_RUNS, 0.99)
-    assert low < nees_of(error, spread, [0, 1, 2])[20:].mean() < high
-    assert np.degrees(np.sqrt((error[:, 20:, :2] ** 2).sum(-1).mean())) < 0.25
 
 
 OWN = filtering.FilterConfig(0.02, 4, 3)

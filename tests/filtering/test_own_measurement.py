@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import filtering, geometry
-from gnio_jax.filtering.update import since_oldest
+from gnio_jax import filtering
 from tests.support.compiling import quick
 from tests.support.random_walk import random_walk
 from tests.support.whole_covariance import covariance
@@ -21,7 +20,6 @@ NOISE = filtering.NoiseModel(2e-3, 2e-2, measurement_scale=1.0)
 START, GYRO, ACCEL, DISPLACEMENT, SPREAD = random_walk(
     5, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, nan_rows=[9, 17]
 )
-NONE = np.full_like(DISPLACEMENT, np.nan)
 
 
 class Height(NamedTuple):
@@ -38,33 +36,6 @@ class Height(NamedTuple):
         return filtering.measure(state, linear, step, threshold=10.8)
 
 
-class Between(NamedTuple):
-    """The displacement again, as TLIO has it, written from the outside."""
-
-    displacement: jax.Array
-    covariance: jax.Array
-
-    def update(self, state, step):
-        rotation = state.clone_rotation[step.oldest]
-        to_yaw = geometry.yaw_rotation(rotation).T
-        moved = to_yaw @ since_oldest(state, step.oldest)
-
-        def yaw_of(theta):
-            turned = geometry.exp(theta) @ rotation
-            return jnp.arctan2(turned[1, 0], turned[0, 0])
-
-        by_yaw = jnp.stack([moved[1], -moved[0], 0.0 * moved[2]])
-        residual = jnp.where(state.step > CLONES, self.displacement - moved, jnp.nan)
-        linear = filtering.linearise(
-            state,
-            residual,
-            self.covariance,
-            since_oldest=to_yaw,
-            oldest_rotation=by_yaw[:, None] * jax.grad(yaw_of)(jnp.zeros(3))[None],
-        )
-        return filtering.measure(state, linear, step)
-
-
 def start():
     return filtering.initial_state(CONFIG, *START)
 
@@ -73,26 +44,6 @@ def start():
 def run(state, gyro, accel, displacement, covariance, config, measurements):
     given = state, gyro, accel, displacement, covariance, config, NOISE
     return filtering.run_filter(*given, measurements=measurements)
-
-
-def test_a_displacement_from_the_outside_is_the_one_from_the_inside():
-    """Over both anchors of the ring, with the rows that have no measurement."""
-    (state, wanted), (own, found) = (
-        run(start(), GYRO, ACCEL, inside, SPREAD, CONFIG, (Between(outside, SPREAD),))
-        for inside, outside in ((DISPLACEMENT, NONE), (NONE, DISPLACEMENT))
-    )
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11),
-        state._replace(gate=None),
-        own._replace(gate=None),
-    )
-    (outcome,) = found.others
-    np.testing.assert_array_equal(outcome.present, np.isfinite(wanted.nis))
-    np.testing.assert_allclose(outcome.nis[outcome.present], wanted.nis[outcome.present])
-    for name in ("rotation", "velocity", "position", "gyro_bias", "accel_bias", "covariance"):
-        np.testing.assert_allclose(
-            getattr(found, name), getattr(wanted, name), rtol=1e-8, atol=1e-11, err_msg=name
-        )
 
 
 def test_a_height_is_the_textbooks_update():
@@ -134,7 +85,6 @@ def test_rows_that_are_missing_are_refused_by_name():
 
 
 def test_known_displacements_are_those_of_the_filter():
-    """Between the poses at the ends of intervals, in the yaw frame of the earlier one."""
     rng = np.random.default_rng(0)
     (rotation, _, _), turn = START, rng.normal(size=3)
     angles = np.arange(INTERVALS + 1)[:, None] * 0.1 * turn

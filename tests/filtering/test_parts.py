@@ -1,5 +1,4 @@
-"""Propagation and update against central differences of an independent mean; the doors; safe
-branches."""
+"""Propagation and update against central differences of an independent mean; safe branches."""
 
 import functools
 
@@ -16,7 +15,6 @@ from gnio_jax.filtering.propagation import integrate as integrate_samples
 from gnio_jax.filtering.update import Step
 from tests.support.compiling import quick
 from tests.support.manifold import differences, integrate, minus, plus
-from tests.support.whole_covariance import covariance
 
 CONFIG = filtering.FilterConfig(0.01, 6, 2)
 POSE = (
@@ -84,7 +82,6 @@ def update_gradient(state, displacement, covariance, frame):
     ids=["gimbal lock", "almost", "close by", "own frame, never locked", "coincident clones"],
 )
 def test_update_has_finite_derivatives_everywhere(frame, pitch, apart, accepted):
-    """Of clones and a measurement at a point where a careless branch has none."""
     rotation = Rotation.from_euler("y", pitch).as_matrix()
     state = filtering.initial_state(CONFIG, rotation, np.zeros(3), np.zeros(3))._replace(
         clone_rotation=np.tile(rotation, (3, 1, 1)),
@@ -99,15 +96,3 @@ def test_update_has_finite_derivatives_everywhere(frame, pitch, apart, accepted)
     assert len(floats) == 17 and all(np.isfinite(leaf).all() for leaf in floats)
     assert bool(outcome.accepted) == accepted and outcome.present
     assert (new.clone_offset != state.clone_offset).any() == accepted
-
-
-def test_initial_state():
-    std = filtering.InitialStd(*np.arange(1.0, 7.0))
-    state = filtering.initial_state(CONFIG, *POSE, std=std)
-    core = np.asarray(covariance(state))[:15, :15]
-    wanted = np.repeat(np.arange(1.0, 7.0), [2, 1, 3, 3, 3, 3]) ** 2
-    np.testing.assert_array_equal(core, np.diag(wanted))
-    for found, wanted in zip((*state[:2], state.position, *state[3:5]), POSE, strict=True):
-        np.testing.assert_array_equal(found, wanted)
-    state = filtering.initial_state(CONFIG, *POSE[:3], gyro_bias=0.5)
-    np.testing.assert_array_equal(state.gyro_bias, np.full(3, 0.5))

@@ -1,5 +1,4 @@
-"""The low-pass of a stream against pure tones and a slow resampler of SciPy's parts. The tracker
-behind it is in `test_tracker`."""
+"""The low-pass of a stream against pure tones and a slow resampler of SciPy's parts."""
 
 import itertools
 
@@ -58,13 +57,7 @@ def amplitudes(columns):
 
 @pytest.mark.parametrize(
     "rate, dt, jitter, highest",
-    [
-        (400, 0.005, 0, 80),
-        (416, 0.005, 0, 80),
-        (1000, 0.005, 0, 80),
-        (250, 0.005, 0, 55),
-        (400, 0.01, 0.2, 40),
-    ],
+    [(416, 0.005, 0, 80), (1000, 0.005, 0, 80), (250, 0.005, 0, 55), (400, 0.01, 0.2, 40)],
 )
 def test_pure_tones(rate, dt, jitter, highest):
     """The pass band within 1 %, without delay against the stamps; the stop band 40 dB down."""
@@ -122,8 +115,7 @@ def slow(stamps, values, rate, factor, half):
 
 
 @pytest.mark.parametrize(
-    "kind",
-    ["multiple", "no multiple", "jitter", "holes", "missing", "missing at first", "short runs"],
+    "kind", ["multiple", "no multiple", "jitter", "holes", "missing", "short runs"]
 )
 def test_against_a_slow_resampler(kind):
     """Holes, ends and starts of runs, grid samples that are missing, and when each is known."""
@@ -138,11 +130,10 @@ def test_against_a_slow_resampler(kind):
     elif kind == "short runs":
         for first in range(100, 500, 20):
             keep[first : first + 19 - (first // 20) % 8] = False  # runs of one to eight samples
-    elif kind.startswith("missing"):
+    elif kind == "missing":
         values[300:340, 1] = np.nan
         values[random.integers(0, len(stamps), 20), 4] = np.inf
-        if kind == "missing at first":
-            values[:31] = np.nan
+        values[:31] = np.nan
     stamps, values = stamps[keep], values[keep]
     rows, known = through(stamps, values, rate)
     wanted = slow(stamps, values, rate, factor, half)
@@ -177,9 +168,7 @@ def interpolated(stamps, values, dt, hole):
     return np.array(grid)
 
 
-@pytest.mark.parametrize(
-    "kind", ["jitter", "fast", "slow", "holes", "missing", "missing from the start", "uniform"]
-)
+@pytest.mark.parametrize("kind", ["fast", "slow", "holes", "missing", "uniform"])
 def test_clock_without_a_low_pass(kind):
     rng = np.random.default_rng(len(kind))
     spacing = {"fast": 0.004, "slow": 0.027}.get(kind, 0.01)
@@ -192,19 +181,18 @@ def test_clock_without_a_low_pass(kind):
         stamps[300:] += 0.9
     elif kind == "uniform":
         stamps = 100.0 + np.arange(400) * 0.01
-    elif kind.startswith("missing"):
+    elif kind == "missing":
         values[rng.integers(0, 400, 60), rng.integers(0, 6, 60)] = np.nan
         values[200:240] = np.inf
-        if kind.endswith("start"):
-            values[:30, 2] = np.nan
+        values[:30, 2] = np.nan
     if kind == "fast":  # so fast an IMU is refused after a second
         stamps, values = stamps[:240], values[:240]
     assert create_grid(0.01, hole).delay == 0
     rows, known = through(stamps, values, None, 0.01, hole)
     wanted = interpolated(stamps, values, 0.01, hole)
     np.testing.assert_allclose(rows, wanted, atol=1e-9)
-    assert (wanted[:, 6] == 0).any() == (kind.startswith("missing") or kind == "holes")
-    if not kind.startswith("missing"):
+    assert (wanted[:, 6] == 0).any() == (kind in ("missing", "holes"))
+    if kind != "missing":
         # at most one sample late: all of the grid that the stamps have reached is there
         points = stamps[0] + 0.01 * np.arange(len(rows)) - 1e-8
         np.testing.assert_array_equal(known, stamps[np.searchsorted(stamps, points)])
@@ -219,20 +207,16 @@ def test_two_stamps_almost_alike_do_no_harm():
     assert len(rows) == 178 and np.abs(rows[:, :6]).max() < 4
 
 
-@pytest.mark.parametrize("share, most", [(0.01, 0.13), (0.03, 0.22)])
-def test_a_lost_sample_of_a_slower_imu_is_no_hole(share, most):
+def test_a_lost_sample_of_a_slower_imu_is_no_hole():
     """250 Hz: 8 ms between two samples, and a hole is 7.5 ms. What is missing holds the last row.
-
-    A sample of a vibration that is lost cannot be known: 0.06 and 0.10 rms remain of 140 Hz where
-    zero is put in its place, which takes it for granted that the signal is nothing but vibration.
-    """
+    Of 140 Hz, which nobody can know where a sample is lost, 0.10 rms remain at best."""
 
     def both(time):
         """140 Hz and 10 Hz, each in three phases."""
         return np.concatenate([tones(140.0, time)[:, ::2], tones(10.0, time)[:, ::2]], axis=1)
 
     stamps = stamps_of(250, 3.0)
-    lost = np.random.default_rng(0).uniform(size=len(stamps)) < share
+    lost = np.random.default_rng(0).uniform(size=len(stamps)) < 0.03
     lost[[0, -1]] = False
     alone = lost & ~np.roll(lost, 1) & ~np.roll(lost, -1)
     rows, _ = through(stamps[~lost], both(stamps - stamps[0])[~lost], 250)
@@ -241,4 +225,4 @@ def test_a_lost_sample_of_a_slower_imu_is_no_hole(share, most):
     wanted = both(np.arange(len(rows)) * DT) * [0, 0, 0, 1, 1, 1]
     squares = (rows[last, :6] - wanted)[60:].reshape(-1, 2, 3) ** 2
     vibration, gait = np.sqrt(squares.mean(axis=(0, 2)))
-    assert vibration < most and gait < 0.02
+    assert vibration < 0.22 and gait < 0.02

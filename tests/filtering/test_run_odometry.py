@@ -62,7 +62,6 @@ turned by its own rate or by that of the one before."""
 
 
 def by_hand(config, cut, gyro, accel):
-    """The filter in NumPy, its windows cut sample by sample."""
     (lead, corrected, own), context = cut, config.context_samples
 
     def measure(k, clone_rotation, gyro_bias, accel_bias):
@@ -119,12 +118,8 @@ def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     """With `history.given`, which takes the factors of the axes off again. The network's log
     standard deviation is raised to a floor."""
     gyro, accel = recording(1)
-    valid = np.ones(len(gyro), bool)
-    valid[5 * N : 5 * N + 2] = False
-    network = functools.partial(predict, base=BASE, slope=SLOPE)
-    arguments = start(CONFIG), gyro, accel, CONFIG, NOISE, valid
-    final, history = jax.jit(lambda: filtering.run_odometry(network, *arguments))()
-    fixed = CONFIG, NOISE, valid, CONFIG.displacement_frame
+    final, history = program(CONFIG)(start(CONFIG), gyro, accel, BASE, SLOPE)
+    fixed = CONFIG, NOISE, None, CONFIG.displacement_frame
     given = start(CONFIG), gyro, accel, *history.given(NOISE)
     again_final, again = filtering.run_filter(*given, *fixed)
     assert again.diagnostics == {}
@@ -141,9 +136,8 @@ def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     np.testing.assert_allclose(history.measurement_std[-1], ROOT_SCALE * floor, rtol=1e-12)
 
 
-def test_vmap_keeps_the_branch_and_equals_single():
-    signals = [np.stack(column) for column in zip(recording(0), recording(1), strict=True)]
-    calls = []
+def test_under_a_vmap_the_network_is_asked_no_earlier_and_says_the_same():
+    signals, calls = [np.stack([each, each]) for each in recording(0)], []
 
     def counting(windows):
         jax.debug.callback(lambda: calls.append(1))
@@ -154,14 +148,10 @@ def test_vmap_keeps_the_branch_and_equals_single():
 
     many = jax.device_get(jax.jit(jax.vmap(run))(*signals))
     jax.effects_barrier()
-    # once a step (or once a sequence), never before there is a window
+    # Once a step, or once a sequence, and never before there is a window.
     assert len(calls) in (INTERVALS - FIRST, 2 * (INTERVALS - FIRST))
-    for index in range(2):
-        given = (signal[index] for signal in signals)
-        one = program(CONFIG)(start(CONFIG), *given, BASE, SLOPE)
-        jax.tree.map(
-            lambda a, b, index=index: np.testing.assert_allclose(a[index], b, atol=3e-6), many, one
-        )
+    one = program(CONFIG)(start(CONFIG), *recording(0), BASE, SLOPE)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a[1], b, atol=3e-6), many, one)
 
 
 def test_predict_is_asked_for_what_it_must_return():

@@ -26,7 +26,6 @@ PRIOR = np.repeat(
 
 
 def displaced(past, now):
-    """In the yaw frame of `past`."""
     return np.einsum("...ji,...j->...i", yaw_matrix(past[0]), now[2] - past[2])
 
 
@@ -164,7 +163,6 @@ def drawn_fixes(truth):
 
 
 def laid(fixes):
-    """As the filter takes them."""
     rows, position, covariance, before = (np.stack(column) for column in zip(*fixes, strict=True))
     time = (rows + 1) * GATED.clone_seconds - before
     return (filtering.fixes_on_intervals(time, position, covariance, INTERVALS, GATED),)

@@ -3,7 +3,7 @@ with a faster IMU against the batch path."""
 
 import dataclasses
 import functools
-import importlib.util
+import runpy
 import sys
 from pathlib import Path
 
@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering, geometry
 from gnio_jax.apps import packages
-from gnio_jax.commands import console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.simulated import walks as simulated
@@ -57,7 +56,6 @@ def predict(windows):
 
 @functools.cache
 def recording():
-    """Movement, from sample 200 on rest."""
     rng = np.random.default_rng(0)
     t = np.arange(N * INTERVALS) * DT
     gyro = np.sin(t[:, None] * rng.uniform(2, 5, 3) + rng.uniform(0, 6, 3))
@@ -103,7 +101,6 @@ def scan(state, gyro, accel, valid, config=CONFIG):
 
 @pytest.fixture
 def built(monkeypatch):
-    """Trackers take their programs from `compiled`."""
     ready = compiled()._advance, compiled()._look_ahead
     monkeypatch.setattr(online, "compile_programs", lambda *_: ready)
 
@@ -120,12 +117,8 @@ def feed(tracker, gyro, accel, time):
 
 @pytest.mark.parametrize(
     "config, missing",
-    [
-        (CONFIG, ()),
-        (CONFIG, (*range(50, 52), *range(100, 105), *range(130, 170), 277)),
-        (AS_TLIO, range(100, 104)),
-    ],
-    ids=["complete", "gaps", "as TLIO cuts"],
+    [(CONFIG, (50, 51, *range(100, 105), *range(130, 170), 277)), (AS_TLIO, range(100, 104))],
+    ids=["ours", "as TLIO cuts"],
 )
 def test_equals_the_scan(config, missing):
     gyro, accel = recording()
@@ -138,10 +131,8 @@ def test_equals_the_scan(config, missing):
     time = 1.7e9 + np.arange(len(gyro)) * DT  # as a phone stamps them
     broken = np.where(valid[:, None], gyro, np.nan)
     pushed = [tracker.push(*row) for row in zip(time, broken, accel, strict=True)]
-    made = [k for k, pose in enumerate(pushed) if pose is not None]
-    found = [pushed[k] for k in made]
-    # a missing sample is known as such one sample later, or with the next that is there
-    assert len(made) == INTERVALS and (missing or all(k % N == N - 1 for k in made))
+    found = [pose for pose in pushed if pose is not None]
+    assert len(found) == INTERVALS
     ends = time[0] + np.arange(1, INTERVALS + 1) * N * DT
     np.testing.assert_allclose([p.time for p in found], ends, atol=1e-6)
     for name in (*Mean._fields, "covariance", "accepted", "nis"):
@@ -150,7 +141,7 @@ def test_equals_the_scan(config, missing):
     assert all(pose.healthy for pose in found)
     assert (wanted.gate_passed == 0).any() and (wanted.gate_passed == 1).sum() > 20
     assert (np.asarray(wanted.at_rest) == 1).any() == (config is CONFIG)
-    assert np.isnan(np.asarray(wanted.nis)[config.first_measured :]).any() == bool(missing)
+    assert np.isnan(np.asarray(wanted.nis)[config.first_measured :]).any()
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9),
         tracker.filter_state(),
@@ -172,8 +163,7 @@ def test_windows_with_a_long_hole_are_no_measurements(config, last):
 
 
 def test_unhealthy_once_is_unhealthy_for_good(tracker):
-    """A knock to some 140 m/s and back: the filter comes back, so nothing but memory can tell. What
-    begins with its state is unhealthy, too."""
+    """A knock to some 140 m/s and back: the filter comes back, so nothing but memory can tell."""
     gyro, accel = (signal.copy() for signal in recording())
     accel[98:106] += [900.0, 0, 0]
     accel[106:114] -= [900.0, 0, 0]
@@ -187,8 +177,6 @@ def test_unhealthy_once_is_unhealthy_for_good(tracker):
     assert not final.healthy and not tracker.filter_state().healthy
     tracker._start(tracker.filter_state())
     assert tracker.pose().healthy is False
-    _, again = scan(final, *recording(), np.ones(len(gyro), bool))
-    assert (np.asarray(again.healthy) == 0).all()
 
 
 def test_a_stop_of_the_stream_is_caught_up_in_one_push(tracker):
@@ -227,6 +215,7 @@ def test_between_clones_it_integrates_the_imu(tracker):
         mean = [made.rotation, made.velocity, made.position] if (k - 1) % N == 0 else mean
         mean = scekf_numpy.step_mean(*mean, made.gyro_bias, made.accel_bias, gyro[k], accel[k], DT)
         after = tracker.push(k * DT, gyro[k], accel[k])
+        assert (after is not None) == (k % N == 0)
         if after is not None:
             made = after
             jax.tree.map(np.testing.assert_array_equal, tracker.pose(), made)
@@ -257,37 +246,34 @@ def test_between_clones_it_coasts_through_a_gap(tracker):
     assert pose.time == pytest.approx((N + 3) * DT)
 
 
-@pytest.mark.parametrize(
-    "arguments, words",
-    [
-        ((1.0, np.zeros(3), np.zeros(3)), r"^time: must increase, found 1\.0 after 1\.0"),
-        ((float("nan"), np.zeros(3), np.zeros(3)), r"^time: must be a finite number"),
-        (("soon", np.zeros(3), np.zeros(3)), r"^time: must be a finite number"),
-        ((1020.0, np.zeros(3), np.zeros(3)), r"^time: .* more than 60 s; stamps must be"),
-        ((1.1, np.zeros(4), np.zeros(3)), r"^gyro: must be three numbers"),
-        ((1.1, np.zeros(3), "up"), r"^accel: must be three numbers"),
-        ((1.1, np.full(3, 1e6), np.zeros(3)), r"^gyro: no IMU measures more than 100 rad/s"),
-    ],
-)
-def test_mistakes_change_nothing(tracker, arguments, words):
+def test_mistakes_change_nothing(tracker):
     """Neither now nor for the samples that come after them."""
-    time, (gyro, accel) = 0.9 + np.arange(20) * DT, recording()
+    time, (gyro, accel), zeros = 0.9 + np.arange(20) * DT, recording(), np.zeros(3)
     other = Tracker(predict, CONFIG, NOISE, start())
     for each in (tracker, other):
         feed(each, gyro[:6], accel[:6], time[:6])
-    with pytest.raises(ValueError, match=words):
-        tracker.push(*arguments)
+    for arguments, words in (
+        ((1.0, zeros, zeros), r"^time: must increase, found 1\.0 after 1\.0"),
+        ((float("nan"), zeros, zeros), r"^time: must be a finite number"),
+        (("soon", zeros, zeros), r"^time: must be a finite number"),
+        ((1020.0, zeros, zeros), r"^time: .* more than 60 s; stamps must be"),
+        ((1.1, np.zeros(4), zeros), r"^gyro: must be three numbers"),
+        ((1.1, zeros, "up"), r"^accel: must be three numbers"),
+        ((1.1, np.full(3, 1e6), zeros), r"^gyro: no IMU measures more than 100 rad/s"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            tracker.push(*arguments)
     jax.tree.map(np.testing.assert_array_equal, tracker.pose(), other.pose())
     after = [feed(each, gyro[6:20], accel[6:20], time[6:]) for each in (tracker, other)]
     assert len(after[0]) == 4
     jax.tree.map(np.testing.assert_array_equal, *after)
 
 
-@pytest.mark.parametrize("leap", [1.5, 59.0])
-def test_a_stamp_that_leaps_is_believed_once_a_second_one_agrees(tracker, leap):
-    """One stamp in the future costs its sample, and a stop of the stream none."""
+def test_a_stamp_that_leaps_is_believed_once_a_second_one_agrees(tracker):
+    """One stamp in the future costs its sample, a stop of the stream none, and of stamps that leap
+    apart none is believed: the old clock goes on."""
     gyro, accel = recording()
-    wrong, time = 100, np.arange(len(gyro)) * DT
+    wrong, keep, leap, time = 100, 120, 59.0, np.arange(len(gyro)) * DT
     alone = np.where(np.arange(len(gyro)) == wrong, time + leap, time)
     found = feed(tracker, gyro, accel, alone)
     _, wanted = scan(start(), gyro, accel, np.arange(len(gyro)) != wrong)
@@ -295,30 +281,20 @@ def test_a_stamp_that_leaps_is_believed_once_a_second_one_agrees(tracker, leap):
     np.testing.assert_allclose([p.position for p in found], wanted.position, atol=1e-9)
 
     stopped = Tracker(predict, CONFIG, NOISE, start())
-    keep, gap = 120, round(leap / DT)  # the samples before the stop, and those that it costs
     feed(stopped, gyro[:keep], accel[:keep], time[:keep])
+    for apart in (20.0, 40.0, 5.0, 30.0):
+        assert stopped.push(apart, gyro[keep], accel[keep]) is None
     assert stopped.push(time[keep] + leap, gyro[keep], accel[keep]) is None
     assert stopped.pose().time == pytest.approx(keep * DT)
     made = stopped.push(time[keep + 1] + leap, gyro[keep + 1], accel[keep + 1])
-    samples = keep + gap + 2
+    samples = keep + round(leap / DT) + 2
     assert made.time == pytest.approx(samples // N * N * DT)
     assert stopped.pose().time == pytest.approx(samples * DT)
 
 
-def test_stamps_that_leap_apart_are_not_believed(tracker):
-    """Each of them waits for one that agrees, and the old clock goes on."""
-    gyro, accel = recording()
-    feed(tracker, gyro[:8], accel[:8], np.arange(8) * DT)
-    for time in (20.0, 40.0, 5.0, 30.0):
-        assert tracker.push(time, gyro[8], accel[8]) is None
-    assert tracker.pose().time == pytest.approx(8 * DT)
-    tracker.push(8 * DT, gyro[8], accel[8])
-    assert tracker.pose().time == pytest.approx(9 * DT)
-
-
-@pytest.mark.parametrize(
-    "change, words",
-    [
+def test_mistakes_at_the_start():
+    given = {"predict": predict, "config": CONFIG, "noise": NOISE, "state": start()}
+    for change, words in (
         (dict(hole=0.001), r"hole: must be a number of at least"),
         (dict(imu_rate=0.0), r"imu_rate: must be a number"),
         (dict(imu_rate=float("nan")), r"imu_rate: must be a number"),
@@ -327,12 +303,9 @@ def test_stamps_that_leap_apart_are_not_believed(tracker):
         (dict(config=dataclasses.replace(CONFIG, clones_per_window=5)), r"state"),
         (dict(state=None, rest_seconds=0.01), r"rest_seconds: "),
         (dict(state=None, std=filtering.InitialStd(tilt=-1.0)), r"std\.tilt"),
-    ],
-)
-def test_mistakes_at_the_start(change, words):
-    given = {"predict": predict, "config": CONFIG, "noise": NOISE, "state": start()}
-    with pytest.raises(ValueError, match=f"^{words}"):
-        Tracker(**given | change)
+    ):
+        with pytest.raises(ValueError, match=f"^{words}"):
+            Tracker(**given | change)
 
 
 def resting():
@@ -381,10 +354,6 @@ def test_a_rest_without_gravity_is_told_once_and_another_starts(built):
     assert len(found) == (len(time) - 50) // N - 50 // N + 1 and found[0].healthy
     with pytest.raises(ValueError, match=r"^time: must increase"):
         tracker.push(time[-1], gyro[0], accel[0])
-
-
-# A faster IMU
-# ------------------------------------------------------------------------------------------------
 
 
 @functools.cache
@@ -473,93 +442,31 @@ def test_the_rate_is_measured_as_long_as_the_stream_lasts(tracker, kind):
     assert kind != "a change"
 
 
-# The example
-# ------------------------------------------------------------------------------------------------
-
-ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def workdir(tmp_path_factory):
+@pytest.mark.slow
+def test_the_example_replays_a_recording(tmp_path, monkeypatch, capsys):
+    """examples/replay_csv.py, through the low-pass of a faster IMU, with an empty row and a hole;
+    with the network of gnio-jax, else the newest run, as by every command."""
+    examples, asked, load = Path(__file__).parents[2] / "examples", [], packages.load_pretrained
     with tiny_run.known():
         config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig("tiny"))
-        yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", config)
-
-
-@pytest.fixture
-def replay(monkeypatch, tmp_path):
-    """examples/replay_csv.py's own main: (arguments) -> None, in an empty folder."""
-    spec = importlib.util.spec_from_file_location("replay_csv", ROOT / "examples" / "replay_csv.py")
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "replay_csv", module)
-    spec.loader.exec_module(module)
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["replay_csv.py", *map(str, arguments)])
-        console.run(module.main)
-
-    return call
-
-
-def write_walk(path, seconds=6.0, rate=120):
-    """Two seconds of rest, then a walk, on irregular stamps with an empty row and a hole."""
-    rng = np.random.default_rng(0)
-    count = np.arange(int(seconds * rate))
-    time = 1.7e9 + count / rate + rng.uniform(-0.1, 0.1, len(count)) / rate
-    swing = (count > 2 * rate) * np.sin(12 * (time - time[0]))
-    imu = rng.normal([0, 0, 0, 0, 0, 9.81], [0.01] * 3 + [0.05] * 3, (len(time), 6))
-    imu += swing[:, None] * [0.3, 0.1, 0.2, 1.0, 1.0, 2.0]
-    rows = ["time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"]
-    for k, (t, row) in enumerate(zip(time, imu, strict=True)):
-        values = [""] * 6 if k == 150 else [f"{value:.6f}" for value in row]
-        rows += [] if 170 <= k < 173 else [",".join([f"{t:.6f}", *values])]
-    path.write_text("\n".join(rows) + "\n")
-    return time
-
-
-@pytest.mark.slow
-def test_a_recording_is_replayed(workdir, replay, tmp_path, monkeypatch, capsys):
-    """Through the low-pass of a faster IMU; with the network of gnio-jax, else the newest run, as
-    by every command."""
-    asked, load = [], packages.load_pretrained
-    answer = lambda which: asked.append(which) or load(workdir)  # noqa: E731
-    monkeypatch.setattr(packages, "load_pretrained", answer)
-    time = write_walk(tmp_path / "walk.csv")
-    replay("--csv", "walk.csv", "--out", tmp_path / "out" / "found.txt")
+        run = tiny_run.save(tmp_path / "run", config)
+        answer = lambda which: asked.append(which) or load(run)  # noqa: E731
+        monkeypatch.setattr(packages, "load_pretrained", answer)
+        lines = (examples / "walk.csv").read_text().splitlines()[:601]
+        lines[150] = f"{lines[150].partition(',')[0]},,,,,,"
+        (tmp_path / "walk.csv").write_text("\n".join(lines[:170] + lines[173:]) + "\n")
+        words = ["replay_csv.py", "--csv", "walk.csv", "--out", str(tmp_path / "out" / "found.txt")]
+        monkeypatch.setattr(sys, "argv", words)
+        monkeypatch.chdir(tmp_path)
+        runpy.run_path(str(examples / "replay_csv.py"), run_name="__main__")
     out, err = capsys.readouterr()
-    assert asked == [None] and err == "" and "Hz to 50 Hz: poses come 433 ms later" in out
+    assert asked == [None] and err == "" and "Hz to 50 Hz: poses come 4" in out
     assert out.count("p99") == 2 and "DIVERGED" not in out
     found = np.loadtxt(tmp_path / "out" / "found.txt")
     # A pose every 0.1 s, but of the steps of the rest and of those with the hole the last ones;
     # they are behind by the low-pass.
     assert found.shape[1] == 8 and 44 <= len(found) <= 48
-    assert found[0, 0] - time[0] == pytest.approx(1.0, abs=1e-3)
-    assert 0.4 < time[-1] - found[-1, 0] < 0.56
+    assert found[0, 0] == pytest.approx(1.0, abs=1e-3) and 5.4 < found[-1, 0] < 5.6
     np.testing.assert_allclose(np.linalg.norm(found[:, 4:], axis=1), 1, atol=1e-6)
     assert (tmp_path / "out" / "found.png").read_bytes()[:4] == b"\x89PNG"
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["found.png", "found.txt"]
-
-
-@pytest.mark.parametrize(
-    "arguments, words",
-    [
-        (["--csv", "backward.csv"], "backward.csv: field 'time' does not increase"),
-        (["--csv", "short.csv"], "short.csv: ends before the device was still for 1 s"),
-        (["--csv", "walk.csv", "--rest-seconds", "0"], "--rest-seconds: rest_seconds: must be a n"),
-    ],
-)
-def test_mistakes_of_a_replay_are_one_line(
-    workdir, replay, tmp_path, monkeypatch, capsys, arguments, words
-):
-    monkeypatch.setattr(online, "compile_programs", lambda *_: (None, None))  # no pose is made
-    write_walk(tmp_path / "walk.csv")
-    lines = (tmp_path / "walk.csv").read_text().splitlines()
-    (tmp_path / "short.csv").write_text("\n".join(lines[:30]))
-    (tmp_path / "backward.csv").write_text("\n".join([lines[0], *lines[:0:-1]]))
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(SystemExit) as left:
-        replay(*arguments, "--weights", workdir)
-    out, err = capsys.readouterr()
-    assert left.value.code == 2 and out == "" and len(err.splitlines()) == 1 and words in err
-    assert sorted(tmp_path.rglob("*")) == before

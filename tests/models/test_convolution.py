@@ -7,7 +7,7 @@ import pytest
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from gnio_jax import models
-from gnio_jax.models import convolution, layers, resnet
+from gnio_jax.models import convolution, resnet
 from gnio_jax.models.convolution import (
     convolve,
     convolve_depthwise,
@@ -103,38 +103,12 @@ def test_devices_that_share_a_batch_have_the_same_gradients():
     jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, 1e-5, 1e-6), *both)
 
 
-def test_no_derivative_in_forward_mode_is_promised_and_no_windows_make_none():
-    x, kernel = map(jnp.asarray, drawn(4))
-    with pytest.raises(TypeError, match="forward-mode"):
-        jax.jvp(convolve_three, (x, kernel), (x, kernel))
-    assert jax.eval_shape(convolve_three, x[:0], kernel).shape == (0, 4, 2)
-
-
 @pytest.fixture
 def calls(monkeypatch):
     """What Winograd's convolution is called with."""
     found = []
     monkeypatch.setattr(convolution, "convolve_three", lambda *x: found.append(x) or x[0])
     return found
-
-
-def test_training_uses_it_where_it_is_quicker(calls):
-    for used, given in (
-        (True, {}),
-        (True, {"length": 3}),
-        (False, {"length": 2}),
-        (False, {"channels": 32}),
-        (False, {"stride": 2}),
-        (False, {"train": False}),
-        (False, {"winograd": False}),
-    ):
-        of = {"channels": 64, "length": 8, "stride": 1, "train": True, "winograd": True} | given
-        channels, length = of["channels"], of["length"]
-        layer = layers.conv(channels, 3, of["stride"], of["train"], "c", winograd=of["winograd"])
-        x = jnp.zeros((1, length, channels), jnp.float32)
-        calls.clear()
-        jax.eval_shape(layer.init, jax.random.key(0), x)
-        assert bool(calls) == used, given
 
 
 @pytest.mark.parametrize("name", ["gnio", "tlio", "ronin_resnet"])
@@ -152,13 +126,3 @@ def test_it_is_chosen_when_the_network_is_made(monkeypatch, calls, name):
     windows = jnp.zeros((1, 64, 6), jnp.float32)
     jax.eval_shape(lambda key: made.init(key, windows, train=True), jax.random.key(0))
     assert calls
-
-
-@pytest.mark.parametrize("length", [50, 13])
-def test_max_pool_against_torch_convention(length):
-    """Of negative numbers: a zero padding would show."""
-    x = -1 - np.random.default_rng(0).random((2, length, 3)).astype(np.float32)
-    rows = range(0, length + 2 - 3 + 1, 2)
-    padded = np.pad(x, ((0, 0), (1, 1), (0, 0)), constant_values=-np.inf)
-    wanted = np.stack([padded[:, r : r + 3].max(axis=1) for r in rows], axis=1)
-    np.testing.assert_array_equal(quick(convolution.max_pool)(jnp.asarray(x)), wanted)

@@ -21,7 +21,6 @@ WINDOWS = np.random.default_rng(0).normal([0, 0, 9.8, 0, 0, 0], 2.0, (3, SAMPLES
 
 
 def about_z(angles):
-    """Rotation matrices by angles, rad."""
     return Rotation.from_rotvec(angles[:, None] * [[0.0, 0.0, 1.0]]).as_matrix()
 
 
@@ -36,7 +35,6 @@ def turned(windows, turns):
 
 
 def turned_variance(log_std, turns):
-    """Diagonals of turned covariances."""
     covariance = turns @ (np.exp(2 * log_std)[..., None] * np.eye(3)) @ turns.swapaxes(-1, -2)
     return np.diagonal(covariance, axis1=-2, axis2=-1)
 
@@ -133,7 +131,6 @@ def test_four_headings_are_the_mean_of_the_network_turned_back():
 
 
 def test_the_network_sees_the_window_in_its_frame():
-    """Frame network, network and rotations one after the other."""
     own = {part: dict(tree) for part, tree in variables("canonical_frame").items()}
     of_frame = {part: tree.pop("frame") for part, tree in own.items()}
     find = quick(equivariance.FrameNetwork().apply, static_argnums=2)
@@ -170,7 +167,6 @@ def test_frozen_it_gives_the_same_numbers_by_its_constants(kind):
 
 
 def test_training_applies_the_network_once():
-    """The same numbers as without, dropout included."""
     given = variables("four_headings")
 
     def train(kind):

@@ -8,14 +8,18 @@ import jax
 quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 """Without the compiler's optimisation: half the time, and what runs once is as quick."""
 
+literal = functools.partial(
+    jax.jit,
+    compiler_options={
+        "xla_backend_optimization_level": 0,
+        "xla_disable_hlo_passes": "algsimp",
+    },
+)
+"""Without the simplifications either, which would make 0 of 0 · NaN."""
+
 optimised = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})
 """With the compiler's optimisation: for what runs longer than it takes to compile."""
 
-lightly_optimised = functools.partial(
-    jax.jit, compiler_options={"xla_backend_optimization_level": 1}
-)
-"""With the first level of optimisation, two thirds of the time to compile a training step: for what
-runs some hundred steps."""
 
 _DEFAULTS = {"xla_backend_optimization_level": 3}
 if version("jax").startswith("0.10."):

@@ -31,9 +31,6 @@ class Runs(NamedTuple):
     position: np.ndarray
     gyro_bias: np.ndarray
     accel_bias: np.ndarray
-    attitude0: np.ndarray
-    """The truth at the start, (r, 3, 3), and its rates (r, K·n, 3) in the body."""
-    rate: np.ndarray
 
 
 def yaw_matrix(rotation):
@@ -41,12 +38,9 @@ def yaw_matrix(rotation):
     return Rotation.from_euler("z", yaw.reshape(-1, 1)).as_matrix().reshape(rotation.shape)
 
 
-def simulate(seed, runs, intervals, n, clones, dt, noise, std, measurement_std, pitch=None):
+def simulate(seed, runs, intervals, n, clones, dt, noise, std, measurement_std):
     """Truth from smooth random rates and accelerations; sensors, biases, start and displacements
-    disturbed as `noise` and `std` say.
-
-    pitch, rad: the body's x axis points so far below the horizon at the start, and the device
-    wobbles about that by a few degrees."""
+    disturbed as `noise` and `std` say."""
     rng = np.random.default_rng(seed)
     samples = intervals * n
     t = np.arange(samples) * dt
@@ -62,12 +56,9 @@ def simulate(seed, runs, intervals, n, clones, dt, noise, std, measurement_std, 
 
     rate, force = smooth(0.4, 0.05, 1.0), smooth(1.5, 0.2, 1.5)
     angles = rng.uniform(-1, 1, (runs, 3)) * [3.0, 0.3, 0.5]
-    if pitch is not None:
-        rate = 0.1 * smooth(1.0, 0.5, 1.5)
-        angles = np.stack([rng.uniform(-3, 3, runs), np.full(runs, pitch), np.zeros(runs)], 1)
     turns = Rotation.from_rotvec((rate * dt).reshape(-1, 3)).as_matrix()
     turns = turns.reshape(runs, samples, 3, 3)
-    attitude0 = rotation = Rotation.from_euler("ZYX", angles).as_matrix()
+    rotation = Rotation.from_euler("ZYX", angles).as_matrix()
     velocity, position = np.tile([1.0, 0.5, 0.0], (runs, 1)), rng.normal(size=(runs, 3))
     start = rng.normal(size=(runs, 9)) * np.repeat(
         [std.tilt, std.yaw, std.velocity, std.position], [2, 1, 3, 3]
@@ -104,7 +95,7 @@ def simulate(seed, runs, intervals, n, clones, dt, noise, std, measurement_std, 
     displacement = np.full((runs, intervals, 3), np.nan)
     displacement[:, clones:] = np.einsum("rkji,rkj->rki", yaw_matrix(truth[0][:, :-clones]), moved)
     displacement += measurement_std * rng.normal(size=displacement.shape)
-    return Runs(*first, gyro, accel, displacement, *truth, attitude0, rate)
+    return Runs(*first, gyro, accel, displacement, *truth)
 
 
 def with_correlated_errors(runs, clones, sigma, correlation, interval):

@@ -11,7 +11,6 @@ import yaml
 from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.calibration import evidence
-from gnio_jax.commands import options, train
 from gnio_jax.config import CalibrateConfig, DataConfig, EvaluateConfig, TrainConfig
 from gnio_jax.data import windows
 from gnio_jax.data.readers import DATASETS
@@ -122,16 +121,6 @@ def test_segments_are_visited_by_weight_too_each_in_its_share():
     inside = (order >= source.earliest[:, None]) & (order <= source.latest[:, None])
     assert list(inside.sum(axis=1)) == [1] * counts[0] + [2] * counts[1]
     np.testing.assert_array_equal(source.position[600:], walks[1].position)
-
-
-def test_names_stand_behind_the_option_and_one_is_as_before():
-    def parsed(*words):
-        return options.read(train.train, options.Call("gnio train", words))
-
-    assert parsed("--dataset", "tlio", "other", "--seed", "1").dataset == BOTH
-    assert parsed("--dataset", "tlio").dataset == "tlio"
-    unnamed = dataclasses.replace(both(""), workdir=None)
-    assert configuration.default_workdir(unnamed).name == "tlio_other_tiny"
 
 
 def test_an_evaluation_says_of_which_dataset(run):

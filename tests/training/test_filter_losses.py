@@ -16,7 +16,6 @@ K, W = 40, 5
 CONFIG = FilterConfig(0.05, 4, W, history="core")
 """Five clones a second: horizons of 5 and 25 intervals fit into 8 s."""
 
-# One program in place of one for every operation.
 relative_displacement = quick(filter_losses.relative_displacement, static_argnums=2)
 relative_yaw = quick(filter_losses.relative_yaw, static_argnums=2)
 window_error = quick(jax.value_and_grad(filter_losses.window_error, (0, 1)), static_argnums=3)
@@ -128,13 +127,9 @@ def test_the_sum_has_the_weights_and_the_horizons_that_fit():
         nis=np.where(np.arange(K) < 5, np.nan, 6.0),
         healthy=np.ones(K),
     )
-    weights = ThroughFilter(
-        displacement_weight=2.0,
-        yaw_weight=3.0,
-        innovation_weight=5.0,
-        state_weight=7.0,
-        window_weight=11.0,
-    )
+    names = ("displacement", "yaw", "innovation", "state", "window")
+    of_each = dict(zip(names, (2.0, 3.0, 5.0, 7.0, 11.0), strict=True))
+    weights = ThroughFilter(**{f"{name}_weight": value for name, value in of_each.items()})
     losses = quick(filter_losses.filter_losses, static_argnums=(3, 4))
     signal, nowhere = np.zeros((4 * K, 3)), np.full((4 * K, 2), np.nan)
     segment = Segment(signal, signal, truth, nowhere, jnp.bool_(False))
@@ -151,13 +146,7 @@ def test_the_sum_has_the_weights_and_the_horizons_that_fit():
     np.testing.assert_allclose(found.state, np.mean(nll), rtol=1e-9)
     np.testing.assert_allclose(found.innovation, -history.log_likelihood.mean(), rtol=1e-12)
     np.testing.assert_allclose(found.window, 0.03, rtol=1e-12)
-    total = (
-        2 * found.displacement.mean()
-        + 3 * found.yaw.mean()
-        + 5 * found.innovation
-        + 7 * found.state
-        + 11 * found.window
-    )
+    total = sum(np.mean(getattr(found, name)) * value for name, value in of_each.items())
     np.testing.assert_allclose(found.total, total, rtol=1e-12)
     squares = [
         e[3:] @ np.linalg.solve(p[6:9, 6:9], e[3:])

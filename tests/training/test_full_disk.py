@@ -19,7 +19,6 @@ from gnio_jax.training.task import TrainState
 
 
 def state(step):
-    """Random numbers, which do not compress."""
     rng = np.random.default_rng(step)
     draw = lambda: {"weights": jnp.asarray(rng.normal(size=9000).astype(np.float32))}  # noqa: E731
     return TrainState(jnp.int32(step), {"params": draw(), "batch_stats": {}}, draw())

@@ -15,7 +15,6 @@ from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.reporting import Silence
 from gnio_jax.training import checkpoint, loop, optimizer, run_folder, task, window_task
 from gnio_jax.training.losses import Losses
 from gnio_jax.training.recordings import Recordings
@@ -33,16 +32,6 @@ from tests.support.tiny_run import (
     same,
     stopped_at,
 )
-
-
-class Told(Silence):
-    """What a run says."""
-
-    def __init__(self):
-        self.lines = []
-
-    def line(self, text):
-        self.lines.append(text)
 
 
 def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished):
@@ -68,14 +57,9 @@ def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished)
 
 
 def test_validation_is_the_plain_mean_over_every_window(recording, finished):
-    """With the parameters that evaluation loads."""
     (walk,) = data.load("tlio", recording, "val")
     found = mean_square_error(checkpoint.load_run(finished[0], "latest"), walk)
     assert rows(finished[0])[-1]["val_mse"] == pytest.approx(found, rel=1e-4)
-
-
-# Resuming
-# ------------------------------------------------------------------------------------------------
 
 
 def test_stopped_and_killed_and_resumed_gives_the_same_bits(
@@ -111,7 +95,9 @@ def test_stopped_and_killed_and_resumed_gives_the_same_bits(
     assert_same_runs(tmp_path / "run", finished[0])
 
 
-def test_seeds_are_ordinary_runs_that_share_recordings_and_programs(recording, finished, tmp_path):
+def test_seeds_are_ordinary_runs_that_share_recordings_and_programs(
+    recording, finished, tmp_path, capsys
+):
     """And a signal stops the one that it meets, in whose place the command goes on."""
     jitted = task.train_steps, window_task.validate
     programs = [each._cache_size() for each in jitted]
@@ -123,10 +109,11 @@ def test_seeds_are_ordinary_runs_that_share_recordings_and_programs(recording, f
     with stopped_at(3 * STEPS):  # the first is complete, and a seed is missing
         outcomes = loop.train_all(both, resume=True)
     assert [each.stopped_by for each in outcomes] == [signal.SIGTERM]
-    told = Told()
-    outcomes = loop.train_all(both, resume=True, reporter=told)
+    capsys.readouterr()
+    outcomes = loop.train_all(both, resume=True)
     assert [(each.workdir, each.stopped_by) for each in outcomes] == [(w, None) for w in workdirs]
-    assert sum(line.startswith("reading") for line in told.lines) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert sum(line.startswith("reading") for line in told) == 1
     assert [each._cache_size() for each in jitted] == programs
     assert configuration.load(workdirs[1]) == both[1]
     assert_same_runs(workdirs[1], finished[0])
@@ -157,25 +144,20 @@ def test_a_run_is_not_resumed_with_other_recordings(recording, finished, tmp_pat
         loop.train(run, resume=True)
 
 
-@pytest.mark.parametrize(
-    "folder, resume, changes, problem",
-    [
+def test_refused_before_anything_is_written(recording, finished, tmp_path):
+    (tmp_path / "run").mkdir()
+    shutil.copy(finished[0] / "config.yaml", tmp_path / "run")
+    for folder, resume, changes, problem in (
         ("run", False, {}, "run: already holds a run; continue it with --resume"),
         ("run", True, {"seed": 5}, r"config\.yaml: 'seed' was 0 and is now 5"),
         ("run", True, {"epochs": 9}, r"config\.yaml: 'optim\.epochs' was 3 and is now 9"),
         ("none", True, {}, "none: holds no run to resume"),
         ("none", False, {"batch_size": 999}, r"optim\.batch_size: is 999, but there are only 220"),
-    ],
-)
-def test_refused_before_anything_is_written(
-    recording, finished, tmp_path, folder, resume, changes, problem
-):
-    (tmp_path / "run").mkdir()
-    shutil.copy(finished[0] / "config.yaml", tmp_path / "run")
-    given = config(recording, tmp_path / folder, **changes)
-    with pytest.raises(InputError, match=problem):
-        loop.train(given, resume=resume)
-    assert [path.name for path in tmp_path.rglob("*")] == ["run", "config.yaml"]
+    ):
+        given = config(recording, tmp_path / folder, **changes)
+        with pytest.raises(InputError, match=problem):
+            loop.train(given, resume=resume)
+        assert [path.name for path in tmp_path.rglob("*")] == ["run", "config.yaml"]
 
 
 def test_two_trainings_in_one_folder(recording, tmp_path):
@@ -198,10 +180,6 @@ def test_two_trainings_in_one_folder(recording, tmp_path):
     with pytest.raises(InputError, match="run: already holds a run"):
         begin(1)
     assert (tmp_path / "run" / "config.yaml").read_bytes() == written
-
-
-# Loading
-# ------------------------------------------------------------------------------------------------
 
 
 def test_runs_that_cannot_be_loaded(recording, finished, tmp_path):
@@ -228,15 +206,10 @@ def test_runs_that_cannot_be_loaded(recording, finished, tmp_path):
 
 
 def test_a_run_of_an_earlier_version_is_evaluated_and_not_resumed(recording, finished, tmp_path):
-    """Its weights are read; the optimizer's state was another."""
     age(shutil.copytree(finished[0], tmp_path / "run"))
     assert same(arrays(tmp_path / "run", "best"), arrays(finished[0], "best"))
     with pytest.raises(InputError, match=r"is of an earlier version of .*; begin .* --init-from"):
         loop.train(config(recording, tmp_path / "run"), resume=True)
-
-
-# Networks that go astray
-# ------------------------------------------------------------------------------------------------
 
 
 def test_a_head_that_no_gradient_reaches_is_told_of(recording, finished):
@@ -303,10 +276,6 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
     assert {leaf.dtype for leaf in jax.tree.leaves(trained)} == {np.dtype("float32")}
 
 
-# What validation decides
-# ------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def counted(recording, tmp_path, monkeypatch):
     """A function that trains with these figures (loss, squared error) of validation, while only the
@@ -367,7 +336,6 @@ def test_nan_on_validation_is_never_the_best(counted, tmp_path):
 
 
 def test_a_rate_that_has_fallen_stays_fallen_in_a_resumed_run(counted, tmp_path, monkeypatch):
-    """The plateau's factor, best value and idle epochs are kept with the checkpoint."""
     monkeypatch.setattr(optimizer, "PLATEAU_EPOCHS", 1)
     figures = [(1.0, 1.0), *[(2.0, 2.0)] * 5]  # the rate falls after epochs 2 and 4
     _, factors = counted(figures, "alone")

@@ -159,11 +159,10 @@ def test_ctin_with_two_axes_is_not_blamed_for_the_vertical():
 
 def test_a_prediction_of_another_shape_is_refused():
     """(b, 1) would be broadcast in silence."""
-    for shape in ((2, 1), (1, 3)):
-        prediction = Prediction(jnp.zeros((2, 3)), jnp.zeros(shape))
-        stage = losses.loss_stage(LossConfig(), 0, 1)
-        with pytest.raises(AssertionError, match="shape"):
-            losses.losses(prediction, target([[0.0, 0, 0]] * 2), LossConfig(), stage)
+    prediction = Prediction(jnp.zeros((2, 3)), jnp.zeros((2, 1)))
+    stage = losses.loss_stage(LossConfig(), 0, 1)
+    with pytest.raises(AssertionError, match="shape"):
+        losses.losses(prediction, target([[0.0, 0, 0]] * 2), LossConfig(), stage)
 
 
 def by_formula(step, steps_per_epoch, warmup, epochs):
@@ -175,7 +174,6 @@ def by_formula(step, steps_per_epoch, warmup, epochs):
 
 @pytest.mark.parametrize("epochs, warmup", [(200, 5), (4, 2)])
 def test_schedule_of_the_paper(epochs, warmup):
-    """Short runs (4 epochs for a warm-up of 5) warm up for their first half."""
     rate = optimizer.schedule(OptimConfig(epochs=epochs), 7)
     steps = np.arange(7 * epochs + 1)
     expected = [by_formula(step, 7, warmup, epochs) for step in steps]
@@ -211,8 +209,6 @@ def test_no_decay_after_the_warm_up_and_no_rise_below_the_end_of_the_cosine():
 @pytest.mark.parametrize(
     "clip, decay, loss",
     [
-        (None, 0.0, LossConfig()),
-        (0.5, 0.0, LossConfig()),
         (0.5, 0.03, LossConfig()),
         (None, 0.0, LossConfig(log_std_from_epoch=2.0)),
         (0.5, 0.03, LossConfig(nll_from_epoch=2.0)),
@@ -248,8 +244,6 @@ def test_adam_against_numpy(clip, decay, loss):
 
 @functools.partial(jax.jit, static_argnames="config")
 def value_and_slopes(log_std, error, config):
-    """The likelihood of one window, and its derivatives."""
-
     def likelihood(log_std, error):
         prediction = Prediction(jnp.zeros((1, 3)), jnp.array([[log_std, 0, 0]]), {})
         return found_losses(prediction, target([[error, 0, 0]]), config).nll
@@ -257,20 +251,21 @@ def value_and_slopes(log_std, error, config):
     return jax.value_and_grad(likelihood, (0, 1))(log_std, error)
 
 
-@pytest.mark.parametrize("error", [0.0, 0.5, 0.999, 1.0, 1.001, 30.0])
 @pytest.mark.parametrize("sigmas", [None, 10.0])
-def test_the_likelihood_and_its_bound_for_outliers(error, sigmas):
+def test_the_likelihood_and_its_bound_for_outliers(sigmas):
     """σ = 0.1 m: ½ e²/σ² + log σ, and its slopes 1 − e²/σ² and e/σ²; without a bound as the paper
     has it, also at 300 σ, with one up to 1 m, where value and slope are steady."""
-    log_std, squared = np.log(0.1), (error / 0.1) ** 2
-    value, (slope, by_error) = value_and_slopes(log_std, error, LossConfig(outlier_sigmas=sigmas))
-    outlier = bool(sigmas) and squared > 100
-    counted = 100 * (1 + np.log(squared / 100)) if outlier else squared
-    np.testing.assert_allclose(value, 0.5 * counted + log_std, rtol=1e-5)
-    np.testing.assert_allclose(slope, 1 - (100 if outlier else squared), rtol=1e-4, atol=1e-4)
-    assert np.isfinite(by_error)
-    if not outlier:
-        np.testing.assert_allclose(by_error, 100 * error, rtol=1e-5)
+    log_std, config = np.log(0.1), LossConfig(outlier_sigmas=sigmas)
+    for error in (0.0, 0.5, 0.999, 1.0, 1.001, 30.0):
+        squared = (error / 0.1) ** 2
+        value, (slope, by_error) = value_and_slopes(log_std, error, config)
+        outlier = bool(sigmas) and squared > 100
+        counted = 100 * (1 + np.log(squared / 100)) if outlier else squared
+        np.testing.assert_allclose(value, 0.5 * counted + log_std, rtol=1e-5)
+        np.testing.assert_allclose(slope, 1 - (100 if outlier else squared), 1e-4, 1e-4)
+        assert np.isfinite(by_error)
+        if not outlier:
+            np.testing.assert_allclose(by_error, 100 * error, rtol=1e-5)
     floor = float(np.log(0.2))
     raised, _ = value_and_slopes(log_std, 0.1, LossConfig(log_std_floor=floor))
     np.testing.assert_allclose(raised, 0.5 * 0.25 + floor, rtol=1e-5)
