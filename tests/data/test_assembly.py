@@ -201,7 +201,7 @@ def test_every_piece_with_a_window_is_kept_and_named():
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_recording_without_a_long_gap_stays_one():
+def test_a_recording_without_a_long_gap_stays_one_and_without_a_window_is_refused():
     """In a hole of the IMU nothing is valid, although the tracker has poses there."""
     time = stamps((0, 5), (5.9, 9))
     (sequence,) = assemble(level(time, stamps((0, 9))), 100.0, divide=True)
@@ -209,20 +209,9 @@ def test_a_recording_without_a_long_gap_stays_one():
     inside = (sequence.time > 5.001) & (sequence.time < 5.899)
     np.testing.assert_array_equal(sequence.imu_valid, ~inside)
     np.testing.assert_array_equal(sequence.valid, ~inside)
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_recording_of_which_nothing_is_left_is_refused():
-    time = stamps((0, 0.9), (2.5, 3.3), (5, 5.5))
-    with pytest.raises(Refusal, match=r"^walk\.csv: .*\(2, up to 1\.7 s\), and no piece"):
+    # What nothing bridges, 0.9 s here, parts a window as a long gap does.
+    time = stamps((0, 0.6), (1.5, 2.1), (5, 5.5))
+    with pytest.raises(Refusal, match=r"^walk\.csv: .*\(1, up to 2\.9 s\), and no piece"):
         assemble(level(time, time), 100.0, divide=True)
     with pytest.raises(Refusal, match=r"^walk\.csv: no 1 s of it have an IMU and a reference"):
         assemble(level(stamps((0, 0.9))), 100.0)
-
-
-def test_a_piece_whose_valid_runs_are_cut_by_short_gaps_holds_no_window():
-    """What nothing bridges, 0.9 s here, parts a window as a long gap does."""
-    time = stamps((0, 0.6), (1.5, 2.1), (5, 9))
-    with pytest.warns(UserWarning, match=r"kept: 4\.0 of 9\.0 s, 1 of 2 pieces"):
-        (piece,) = assemble(level(time, time), 100.0, divide=True)
-    assert piece.name == "walk" and len(piece.time) == 401

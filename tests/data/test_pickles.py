@@ -49,7 +49,6 @@ def of_yaml(bomb):
     [
         ("tlio", ".npy", pickle.dumps),
         ("tlio", ".npy", of_numpy),
-        ("kitti npz", ".npz", pickle.dumps),
         ("kitti npz", ".npz", of_numpy_zip),
         ("euroc", "imu0/sensor.yaml", of_yaml),
     ],

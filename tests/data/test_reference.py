@@ -38,7 +38,7 @@ def compare(found, metres, degrees, speed, edge=20):
     assert np.sqrt((off**2).sum(axis=1).mean()) < speed
 
 
-@pytest.mark.parametrize("rate", [200.0, 60.0, 30.0])
+@pytest.mark.parametrize("rate", [200.0, 30.0])
 @pytest.mark.parametrize("kind", ["with a velocity", "smooth", "noisy"])
 def test_poses_of_every_kind_and_rate_come_to_the_imus_place(kind, rate):
     stamps = np.arange(0.0, 30.0, 1.0 / rate) + 0.003

@@ -53,19 +53,18 @@ def test_self_check_removes_one_constant_gyro_bias_and_judges_by_the_median_wind
     ("spoil", "reason"),
     [
         (lambda s: s._replace(accel=s.accel * 1.1), "mean of R·accel"),
-        (lambda s: s._replace(accel=s.accel[:, [1, 2, 0]]), "mean of R·accel"),
-        (lambda s: s._replace(accel=-s.accel), "mean of R·accel"),
         (lambda s: s._replace(gyro=s.gyro[:, [2, 0, 1]] * np.sin(s.time)[:, None]), "gyro"),
         (lambda s: s._replace(position=s.position * [-1, 1, 1]), "correlates"),
         (lambda s: s._replace(velocity=s.velocity * 4), "too fast for a pedestrian"),
         (lambda s: s._replace(valid=np.zeros_like(s.valid)), "no sample has a valid reference"),
         (lambda s: s._replace(valid=(np.arange(len(s.time)) % 700) < 100), "no window"),
     ],
-    ids=["scale", "axes", "sign", "gyro", "mirrored", "speed", "nothing-valid", "no-window"],
+    ids=["scale", "gyro", "mirrored", "speed", "nothing-valid", "no-window"],
 )
 def test_self_check_says_what_is_implausible(spoil, reason):
-    failures = self_check(spoil(circle())).failures
-    assert any(reason in failure for failure in failures)
+    spoilt = spoil(circle())._replace(attributes={"accel_clipped": 0.21})
+    (failure, *_) = (each for each in self_check(spoilt).failures if reason in each)
+    assert ("clips in 21% of the samples" in failure) == (reason == "mean of R·accel")
 
 
 @pytest.mark.parametrize(("turn", "passes"), [(0.1, False), (2.0, True)])
@@ -78,13 +77,6 @@ def test_a_gyro_may_be_off_by_a_percent_of_what_it_turns(turn, passes):
     assert 7.0 < check.gyro_consistency_degrees < 9.0
     said = [failure for failure in check.failures if "in which it turns 57°" in failure]
     assert (check.failures == ()) == passes and len(said) == (not passes)
-
-
-def test_a_clipped_accelerometer_is_named_as_the_reason():
-    sequence = circle()
-    sequence = sequence._replace(accel=0.9 * sequence.accel, attributes={"accel_clipped": 0.21})
-    (failure,) = self_check(sequence).failures
-    assert "mean of R·accel" in failure and "clips in 21% of the samples" in failure
 
 
 def test_self_check_spares_those_who_stand():
@@ -144,20 +136,17 @@ def test_who_ends_faster_than_he_began_is_not_tilted():
     check = self_check(tilted, pedestrian=False)
     np.testing.assert_allclose(check.gravity_mean, [1.5, 0, 9.81], atol=1e-9)
     assert "mean of R·accel is (1.50, 0.00, 9.81)" in check.failures[0]
-
-
-def test_the_gain_in_speed_is_that_of_the_valid_stretches():
-    sequence = speeding(seconds=12.0, push=0.5)
-    time = sequence.time
     # A stop and start in the middle that nobody has seen: speeds before and after say nothing of
     # each other.
-    velocity = np.where(time[:, None] >= 6.0, sequence.velocity - [4.0, 0, 0], sequence.velocity)
-    sequence = sequence._replace(velocity=velocity, valid=(time < 5.0) | (time >= 7.0))
-    check = self_check(sequence, pedestrian=False)
+    sequence = speeding(seconds=12.0, push=0.5)
+    late = sequence.time[:, None] >= 6.0
+    seen = (sequence.time < 5.0) | (sequence.time >= 7.0)
+    velocity = np.where(late, sequence.velocity - [4.0, 0, 0], sequence.velocity)
+    check = self_check(sequence._replace(velocity=velocity, valid=seen), pedestrian=False)
     np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=1e-9)
 
 
-@pytest.mark.parametrize(("seconds", "judged"), [(4.0, False), (19.9, False), (20.1, True)])
+@pytest.mark.parametrize(("seconds", "judged"), [(19.9, False), (20.1, True)])
 def test_one_window_says_nothing_of_the_gyro_since_a_bias_explains_it(seconds, judged):
     sequence = circle(seconds=seconds)
     wrong = sequence._replace(gyro=sequence.gyro[:, [1, 2, 0]] * np.sin(sequence.time)[:, None])

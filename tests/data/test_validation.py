@@ -12,7 +12,6 @@ GOOD = circle(seconds=2.0)
 BAD = [
     (GOOD._replace(gyro=GOOD.gyro[:-1]), "'gyro'", "shape"),
     (GOOD._replace(velocity=GOOD.velocity[:, :2]), "'velocity'", "shape"),
-    (GOOD._replace(device_orientation=GOOD.orientation[1:]), "'device_orientation'", "shape"),
     (GOOD._replace(time=GOOD.time[:1]), "'time'", "two stamps"),
     (GOOD._replace(valid=GOOD.valid.astype(float)), "'valid'", "booleans"),
     (GOOD._replace(imu_valid=GOOD.valid[1:]), "'imu_valid'", "booleans"),
@@ -25,10 +24,8 @@ BAD = [
     (GOOD._replace(accel=GOOD.accel * 1e3), "'accel'", "not in m/s²"),
     (GOOD._replace(gyro=GOOD.gyro * 180 / np.pi), "'gyro'", "looks like deg/s"),
     (changed(GOOD, "orientation", 5, [0.9, 0, 0, 0]), "'orientation'", "row 6"),
-    (changed(GOOD, "orientation", 5, 0.0), "'orientation'", "row 6"),
     (changed(GOOD, "orientation", 5, np.nan), "'orientation'", "row 6"),
     (changed(GOOD, "position", 5, np.nan), "'position'", "mark these rows invalid"),
-    (changed(GOOD, "velocity", 5, np.inf), "'velocity'", "row 6"),
     (changed(GOOD, "velocity", 5, 400.0), "'velocity'", "in 1 rows, first 0.050 s after"),
     (changed(GOOD, "position", 5, 1e9), "'position'", "in 1 rows, first 0.050 s after"),
     (changed(GOOD, "position", 5, 12.0), "'position'", "jumps in 2 rows, first 0.050 s after"),

@@ -75,7 +75,7 @@ def tensors():
     return torch, {key: torch.from_numpy(np.array(value)) for key, value in WEIGHTS.items()}
 
 
-@pytest.mark.parametrize("form", ["checkpoint", "bare", "old format", "parallel", "half precision"])
+@pytest.mark.parametrize("form", ["checkpoint", "old format", "parallel", "half precision"])
 def test_a_checkpoint_of_pytorch(tmp_path, loaded, form):
     torch, state = tensors()
     if form == "checkpoint":
@@ -150,19 +150,10 @@ NOT_FINITE = "'output_block1.fc3.bias' holds values that are not finite numb"
     [
         ({}, "'output_block1.fc1.weight' is missing"),
         ({"model_state_dict": 3}, "its model_state_dict is not a mapping"),
-        (
-            changed(residual_groups__1__0__bn1__bias=None),
-            "'residual_groups.1.0.bn1.bias' is missing;",
-        ),
-        (changed(output_block3__fc1=ZEROS(3)), "'output_block3.fc1' is unexpected;"),
         (changed(yyy=ZEROS(3), zzz=ZEROS(3)), "'yyy' is unexpected (and 1 more);"),
         (
             changed(input_block__0__weight=ZEROS((64, 9, 7))),
             "'input_block.0.weight' must have shape (64, 6, 7), found (64, 9, 7);",
-        ),
-        (
-            changed(output_block2__fc1__weight=ZEROS((512, 512))),
-            "'output_block2.fc1.weight' must have shape (512, 896), found (512, 512);",
         ),
         (
             changed(output_block1__fc1__weight=ZEROS((512, 900))),
@@ -178,15 +169,12 @@ def test_weights_that_do_not_fit(given, problem):
 
 
 def test_files_that_are_none(tmp_path):
-    with pytest.raises(InputError, match=r"none\.npz: no such file; give"):
-        interop.load_tlio_state_dict(tmp_path / "none.npz")
     (tmp_path / "damaged.npz").write_bytes(b"PK\x03\x04 and no more")
     np.savez(tmp_path / "objects.npz", **{"output_block1.fc1.weight": np.array([{}], object)})
-    np.savez(tmp_path / "other.npz", weights=np.zeros(3))
     for name, problem in [
+        ("none", "no such file; give"),
         ("damaged", "cannot be read"),
         ("objects", "cannot be read"),
-        ("other", "'output_block1.fc1.weight' is missing"),
     ]:
         with pytest.raises(InputError, match=f"{name}.npz: {problem}") as told:
             interop.load_tlio_state_dict(tmp_path / f"{name}.npz")
@@ -242,7 +230,6 @@ def test_a_run_appears_whole_or_not_at_all(file, tmp_path, monkeypatch):
     [
         (["--rate", "100"], "is for windows of 193 to 224 samples, not 100; give the --rate and"),
         (["--stride-seconds", "0.3"], "data.stride_seconds"),
-        (["--rates", "100"], "rate"),
     ],
 )
 def test_options_that_do_not_fit_leave_nothing_behind(

@@ -77,7 +77,7 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
     ):
         assert (root / "out" / f"{name}.png").read_bytes()[:4] == b"\x89PNG", name
     page = (root / "out" / "trajectories_test_integrate.html").read_text(encoding="utf-8")
-    assert 'class="swatch"' in page and "</span>gnio</h2>" in page
+    assert "</span>gnio</h2>" in page
     with pytest.raises(InputError, match="no sequence 'x' in split 'test'; there are: b, c"):
         gnio("tables", "trajectories", *arguments, "--sequences", "x")
     changed = yaml.safe_load((root / "base.yaml").read_text())
@@ -139,9 +139,7 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
 @pytest.mark.parametrize(
     "more, words",
     [
-        (["--seeds", "0"], "--seeds: must be at least 1"),
         (["--methods", "gnio,nosuch"], "no network 'nosuch'; known: ctin"),
-        (["--methods", " , "], "names no network"),
         (["--base", "nosuch.yaml"], "no such config file"),
         (["--base", "configs/baselines/tlio.yaml"], "is of the network 'tlio'"),
     ],

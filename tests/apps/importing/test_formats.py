@@ -50,7 +50,6 @@ def test_no_reference_and_no_column(tmp_path):
 def test_what_is_no_recording(tmp_path):
     with h5py.File(tmp_path / "walk.h5", "w"):
         pass
-    (tmp_path / "noise.csv").write_bytes(bytes(range(128, 256)) * 9)
     (tmp_path / "empty.csv").write_text("")
     (tmp_path / "empty").mkdir()
     (tmp_path / "bag").mkdir()
@@ -64,7 +63,6 @@ def test_what_is_no_recording(tmp_path):
         "b.db3": "b.db3: is cut short",
         "c.db3": "c.db3: cannot be read as a ROS 2 bag",
         "walk.h5": "walk.h5: is HDF5 already; check it with gnio data check",
-        "noise.csv": "noise.csv: is no text",
         "empty.csv": "empty.csv: holds no row",
         "empty": "empty: has the layout of no known recording .found: no CSV file.; known: CSV",
         "bag": "bag: cannot be read as a ROS 2 bag",
@@ -102,7 +100,7 @@ def damaged(data, seed):
 def test_a_damaged_file(tmp_path, whole, kind, capfd):
     data, path = whole[kind].read_bytes(), tmp_path / whole[kind].name
     messages = []
-    for seed in range(9):
+    for seed in range(6):
         path.write_bytes(damaged(data, seed))
         try:
             import_recording(path)

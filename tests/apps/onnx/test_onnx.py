@@ -118,7 +118,6 @@ def test_a_conversion_that_is_off_is_refused():
     [
         (["untrained", "--out", "taken"], "taken: is there already"),
         (["untrained"], "untrained/checkpoints/best: holds no checkpoint"),
-        (["untrained", "--to", "torch"], "--to: unknown option"),
     ],
 )
 def test_mistakes(run, tmp_path, monkeypatch, capsys, arguments, words):

@@ -15,8 +15,7 @@ from tests.support.blackbird_files import FLIP, START, write
 from tests.support.tlio_files import spoil
 
 
-@pytest.mark.parametrize("text", [11, 8, 0])
-@pytest.mark.parametrize("down", [False, True])
+@pytest.mark.parametrize(("down", "text"), [(False, 11), (True, 8), (True, 0)])
 def test_a_flight_comes_back_in_a_world_whose_z_points_up(tmp_path, down, text):
     (sequence,) = blackbird.read(write(tmp_path / "flight", down, text))
     time = sequence.time

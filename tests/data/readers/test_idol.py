@@ -32,9 +32,7 @@ def compare(sequence):
     return time
 
 
-@pytest.mark.parametrize(
-    ("lag", "degrees"), [(0.0, 6.0), (0.19, 8.4), (-0.05, 0.0)], ids=lambda value: f"{value:g}"
-)
+@pytest.mark.parametrize(("lag", "degrees"), [(0.19, 8.4), (-0.05, 0.0)])
 def test_a_walk_comes_back_level_in_the_phones_frame_and_on_its_clock(tmp_path, lag, degrees):
     tilt = Rotation.from_rotvec(np.radians(degrees) * np.array([0.8, -0.6, 0.0]))
     (sequence,) = idol.read(write(tmp_path, frame(lag=lag, tilt=tilt)))
@@ -61,14 +59,10 @@ def wild(table):
     return pd.concat([table.iloc[:1].assign(timestamp=0.0), table], ignore_index=True)
 
 
-def unoriented(value):
-    """Core Motion's attitude is optional: a row that lacks it is no reason to refuse a walk."""
-
-    def change(table):
-        table.loc[100:102, CORE_MOTION] = value
-        return table
-
-    return change
+def unoriented(table):
+    """Core Motion's attitude is optional: rows that lack it are no reason to refuse a walk."""
+    table.loc[100:102, CORE_MOTION], table.loc[200:202, CORE_MOTION] = np.nan, 0.0
+    return table
 
 
 def thrown(row):
@@ -81,7 +75,7 @@ def thrown(row):
     return change
 
 
-TRAPS = [disordered, wild, unoriented(np.nan), unoriented(0.0), thrown(0), thrown(-1)]
+TRAPS = [disordered, wild, unoriented, thrown(0), thrown(-1)]
 
 
 @pytest.mark.parametrize("trap", TRAPS)
@@ -136,16 +130,14 @@ def test_rows_without_a_pose_are_marked(tmp_path):
 def test_smoothed_positions_or_no_core_motion_leave_no_walk_out(tmp_path):
     """The authors' positions hold no gait: they do not correlate with the accelerometer, as little
     as a wrong time would."""
-    table = frame()
+    table = frame(seconds=20.0).drop(columns=CORE_MOTION[1])
     time = table["timestamp"] - EPOCH
     for axis, place in zip("XYZ", (0.9 * time, 0.3 * np.sin(time / 4.0), 1.0), strict=True):
         table[f"processedPos{axis}"] = place
-    table[CORE_MOTION] = 0.0
-    for each in (table, table.drop(columns=CORE_MOTION[1])):
-        (sequence,) = idol.read(write(tmp_path, each))
-        check = check_sequence(sequence, idol.DATASET)
-        assert check.failures == () and check.accel_correlation_horizontal < 0.3
-        assert sequence.device_orientation is None and sequence.valid.all()
+    (sequence,) = idol.read(write(tmp_path, table))
+    check = check_sequence(sequence, idol.DATASET)
+    assert check.failures == () and check.accel_correlation_horizontal < 0.3
+    assert sequence.device_orientation is None and sequence.valid.all()
 
 
 def test_without_pyarrow_it_says_what_to_install(tmp_path, monkeypatch):

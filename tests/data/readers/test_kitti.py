@@ -59,29 +59,21 @@ def test_a_drive_in_both_layouts_is_read_once_and_the_slow_export_is_named(tmp_p
     assert "start_time" in sequence.attributes  # of the packets
 
 
-def test_positions_that_jump_are_not_valid(tmp_path):
-    def jump(arrays):
-        arrays["p_gt"][700:] += np.float32([1.5, -1.0, 0.0])
-
-    path = files.write_piece(tmp_path / f"train__{TRAIN}_extract0.npz", jump)
-    (sequence,) = kitti.read_piece(path)
-    assert not sequence.valid[650:750].any()
-    assert sequence.valid[:590].all() and sequence.valid[810:].all()
-
-
-def test_what_lies_in_a_gap_of_a_piece_is_not_valid(tmp_path):
+def test_what_lies_in_a_gap_of_a_piece_or_near_a_jump_is_not_valid(tmp_path):
     """Half a second of rows is missing, which is too short to divide the drive."""
 
-    def lose(arrays):
+    def spoil(arrays):
+        arrays["p_gt"][900:] += np.float32([1.5, -1.0, 0.0])
         for name in [name for name in arrays if arrays[name].ndim]:
-            arrays[name] = np.delete(arrays[name], np.s_[500:550], axis=0)
+            arrays[name] = np.delete(arrays[name], np.s_[300:350], axis=0)
 
-    path = files.write_piece(tmp_path / f"train__{TRAIN}_extract0.npz", lose)
+    path = files.write_piece(tmp_path / f"train__{TRAIN}_extract0.npz", spoil)
     (sequence,) = kitti.read_piece(path)
     inside = np.zeros(1200, dtype=bool)
-    inside[500:550] = True
-    np.testing.assert_array_equal(sequence.valid, ~inside)
+    inside[300:350] = True
     np.testing.assert_array_equal(sequence.imu_valid, ~inside)
+    assert not sequence.valid[inside].any() and not sequence.valid[850:950].any()
+    assert sequence.valid[:790][~inside[:790]].all() and sequence.valid[1010:].all()
 
 
 def test_packets_whose_names_have_no_leading_zeros_come_back(tmp_path):

@@ -33,15 +33,13 @@ ORDER = (
 ).split()
 
 
-@pytest.mark.parametrize("shuffled", [False, True])
-def test_table_comes_back(tmp_path, shuffled):
+def test_table_comes_back(tmp_path):
+    """Its columns in another order, rows late or twice."""
     time = np.arange(int(SECONDS * 202.3)) / 202.3
     rows = np.arange(len(time))
-    if shuffled:  # columns in another order, rows late or twice
-        rows[[100, 101]] = rows[[101, 100]]
-        rows[2000:2010] = rows[2000:2010][::-1]
-        rows = np.insert(rows, 500, [500, 500])
-    write_table(tmp_path, "dan_bag1", time, ORDER if shuffled else None, rows)
+    rows[[100, 101]] = rows[[101, 100]]
+    rows[2000:2010] = rows[2000:2010][::-1]
+    write_table(tmp_path, "dan_bag1", time, ORDER, np.insert(rows, 500, [500, 500]))
     (sequence,) = ridi.read(tmp_path / "dan_bag1")
     assert compare(sequence)[0] == pytest.approx(0.0, abs=0.02)
     assert sequence.valid.all() and sequence.name == "dan_bag1"
