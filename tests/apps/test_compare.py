@@ -216,7 +216,15 @@ def test_refusals(runs):
 # --- the command
 
 
-def test_the_command_shows_and_writes(runs, gnio):
+def test_the_command_shows_and_writes(runs, gnio, mistake, monkeypatch):
+    """A name that cannot be written is told first."""
+    monkeypatch.chdir(runs)
+    (runs / "a_file").touch()
+    (runs / "c.csv").mkdir()
+    before = sorted(runs.iterdir())
+    for wrong in ("results/", "c", "x.md", "a_file/x", "y" * 248):
+        mistake("compare", "plain", "new", "--out", wrong)
+    assert sorted(runs.iterdir()) == before
     out = runs / "results" / "v1.5"
     (runs / "new_s0").rename(runs / "pipe|x")
     words = [f"{runs}/plain", f"{runs}/pipe|x", "--metrics", "ate", "rpe_1s", "--out", str(out)]
@@ -231,13 +239,3 @@ def test_the_command_shows_and_writes(runs, gnio):
     text = (out.parent / "v1.5.md").read_text("utf-8")
     assert "| ATE (m) | plain | 3.33 ± 0.94 |" in text and r"|  | pipe\|x | 2.33 |" in text
     assert (out.parent / "v1.5.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("out", ["results/", "c", "x.md", "a_file/x", "y" * 248])
-def test_a_name_that_cannot_be_written_is_told_first(runs, out, monkeypatch, mistake):
-    monkeypatch.chdir(runs)
-    (runs / "c.csv").mkdir()
-    (runs / "a_file").touch()
-    before = sorted(runs.iterdir())
-    mistake("compare", "plain", "new", "--out", out)
-    assert sorted(runs.iterdir()) == before

@@ -18,7 +18,6 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import read_tum
 from gnio_jax.filtering import ConsideredStd, Pose, Tracker
 from gnio_jax.filtering import tracker as trackers
-from gnio_jax.types import Sequence
 from tests.support import known_walk, tiny_run
 from tests.support.filter_settings import changed
 from tests.support.rerun_files import columns_of
@@ -200,18 +199,6 @@ def test_gaps_are_told_and_a_stamp_in_the_future_costs_its_sample_alone(follow, 
     assert follow(as_lines((recorded[0], gyro, accel)), *units) == whole
 
 
-@pytest.mark.parametrize("ends, length", [(3.5, 0.54), (5.0, 2.0)])  # or never
-def test_gaps_of_a_recording_are_told(recorded, ends, length):
-    time, gyro, accel = recorded
-    nothing, level = np.full_like(gyro, np.nan), np.full((len(time), 4), np.nan)
-    walk = Sequence("walk", time, gyro, accel, level, nothing, nothing, np.zeros(len(time), bool))
-    walk = walk._replace(imu_valid=(time < 3.0) | (time > ends))
-    found = live.Followed(0.1, pose_at(0.0, [0, 0, 0]))
-    live.follow(lambda *_: None, live.from_recording(walk, speed=0.0), found, print)
-    assert [gap for _, gap in found.gaps] == pytest.approx([length], abs=0.021)
-    assert found.samples == len(time)
-
-
 def rate_of(lines, imu_rate=None, name="udp:5"):
     """What is measured of a stream, whose samples all come through."""
     rates = []
@@ -287,6 +274,7 @@ def test_a_recording_played_gives_the_track_of_it(
     followed, tracked = read_tum(tmp_path / "live.txt"), read_tum(tmp_path / "track/trajectory.txt")
     assert told.startswith(f"following {walk} with run") and "walked" in told
     assert "lacks samples 1 times" in told and "in the quietest second" in told
+    assert "warning: gaps: 1, the longest of 0.52 s" in told
     rows = np.searchsorted(tracked.time, followed.time - 1e-4)
     assert rows[0] == round(1.0 / 0.1) and (np.diff(rows[:-1]) == 1).all()
     both = rows < len(tracked.time)  # a track ends with the stamp of its last sample
@@ -354,15 +342,13 @@ def test_what_a_diverged_filter_says_is_not_kept(follow, recorded, monkeypatch, 
     np.testing.assert_allclose(read_tum(tmp_path / "live.txt").position[:, 0], np.arange(1, 6))
 
 
-@pytest.mark.parametrize("target", ["live.rrd", "viewer"])
-def test_a_diverged_filter_is_not_shown(tmp_path, monkeypatch, target):
-    """Of the others all are drawn, the last ones too."""
+def test_a_diverged_filter_is_not_shown(tmp_path, monkeypatch):
+    """Of the others all are drawn, the last ones too. What the viewer is sent goes into a file."""
     sdk = pytest.importorskip("rerun", reason="needs rerun-sdk")
     path = tmp_path / "live.rrd"
-    if target == "viewer":  # what it is sent goes into the file
-        monkeypatch.setattr(sdk.RecordingStream, "spawn", lambda recording: recording.save(path))
+    monkeypatch.setattr(sdk.RecordingStream, "spawn", lambda recording: recording.save(path))
     tracker = Diverging()
-    with rerun.streaming(target if target == "viewer" else str(path)) as stream:
+    with rerun.streaming("viewer") as stream:
         for _ in range(9):
             stream.add(tracker.push(None, None, None))
     found = columns_of(path)

@@ -150,11 +150,16 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_
     assert f"warning: {rate}" in gnio("track", tmp_path / "fast.h5", "--out", tmp_path / "fast")
 
 
-def test_what_is_refused(mistake, runs, tmp_path):
+def test_what_is_refused(mistake, runs, tmp_path, monkeypatch):
+    """Also what cannot be written, stamps that ROS cannot hold among it: before the work."""
+    monkeypatch.setattr("gnio_jax.apps.track.prepare", lambda *_, **__: pytest.fail("too late"))
     weights = ("--weights", runs / "walker")
-    for samples, words in ((50, "were recorded for 0.49 s"), (104, "too short for a window and a")):
-        short = csv(tmp_path / "short.csv", np.arange(samples) / 100)
-        assert words in mistake("track", short, *weights)
+    time = np.arange(300) / 100
+    for start, words in ((-5.0, "stamps begin at -5 s"), (3e9, "ROS counts seconds in 32 bits")):
+        odd = csv(tmp_path / "odd.csv", time, start=start)
+        assert words in mistake("track", odd, *weights, "--format", "mcap", "--time-unit", "s")
+    short = csv(tmp_path / "short.csv", np.arange(50) / 100)
+    assert "were recorded for 0.49 s" in mistake("track", short, *weights)
     members = logger_files.sensor_logger()
     walk = logger_files.zipped(tmp_path / "walk.zip", members)
     given = ("track", walk, *weights)
@@ -165,6 +170,7 @@ def test_what_is_refused(mistake, runs, tmp_path):
     assert "is not an earlier track" in mistake(*given, "--out", thesis.parent)
     assert "is not an earlier track" in mistake(*given, "--out", thesis)
     assert thesis.read_text() == "mine"
+    assert f"{walk}: " in mistake(*given, "--out", walk / "track")
     assert "no such weights" in mistake("track", walk, "--weights", "walkr2")
     del members["TotalAcceleration.csv"], members["Accelerometer.csv"]
     del members["AccelerometerUncalibrated.csv"], members["Gravity.csv"]
@@ -249,28 +255,12 @@ def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, m
     assert shown[0].about["reference"].startswith("known for 24% of the time")
 
 
-def test_what_cannot_be_written_is_found_before_the_work(mistake, runs, tmp_path, monkeypatch):
-    """Also stamps that ROS cannot hold."""
-    monkeypatch.setattr("gnio_jax.apps.track.prepare", lambda *_, **__: pytest.fail("too late"))
-    walk = logger_files.zipped(tmp_path / "walk.zip", logger_files.sensor_logger())
-    weights = ("--weights", runs / "walker")
-    assert f"{tmp_path / 'walk.zip'}: " in mistake("track", walk, *weights, "--out", walk / "track")
-    time = np.arange(300) / 100
-    for start, words in ((-5.0, "stamps begin at -5 s"), (3e9, "ROS counts seconds in 32 bits")):
-        odd = csv(tmp_path / "odd.csv", time, start=start)
-        assert words in mistake("track", odd, *weights, "--format", "mcap", "--time-unit", "s")
-
-
-class Reached(Exception):
-    """The stage that a test looks at."""
-
-
 def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monkeypatch):
     given = {}
 
     def prepare(_, windows, std, **how):
         given.update(how, std=std)
-        raise Reached
+        raise InterruptedError
 
     monkeypatch.setattr("gnio_jax.apps.track.prepare", prepare)
     weights = packages.choose(runs / "walker")
@@ -278,7 +268,7 @@ def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monk
     config = dataclasses.replace(weights.run.config, filter=own)
     weights = weights._replace(run=weights.run._replace(config=config))
     walk = Imported(without_poses("walk", np.arange(620) / 100), (), ())
-    with pytest.raises(Reached):
+    with pytest.raises(InterruptedError):
         track(walk, weights, tmp_path / "t")
     assert given["std"].velocity == 0.7 and given["raw_gyro_bias"] == 0.02
 

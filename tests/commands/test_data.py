@@ -84,18 +84,19 @@ def test_list_tells_everything_and_reads_nothing(root, monkeypatch, capsys):
     monkeypatch.setenv("GNIO_DATA", str(root.parent))
     (root.parent / "kitti").mkdir()
     run("data", "list")
-    out = capsys.readouterr().out
-    text = " ".join(out.split())
+    text = " ".join(capsys.readouterr().out.split())
     for name in data.names():
         dataset = data.get(name)
         about = f"{dataset.rate:g} Hz; splits {', '.join(dataset.splits)}; {dataset.licence}"
         assert f"{name} {about} here " in text and f" source {dataset.source} " in text
         assert not dataset.needs_root or f" layout {dataset.layout} " in text
-    assert "/tlio: 5 recordings (train 3, val 1, test 1)" in text.replace(" /tlio", "/tlio")
-    assert "computed: 34 recordings (train 24, val 4, test 6)" in text
-    assert f"{data.get('ronin').licence} here not found source" in text
-    assert "no recording (" in text and "split 'all' of dataset 'kitti' holds no recording" in text
-    assert f"looked in {root.parent} and data" in out
+    for words in (
+        "/tlio: 5 recordings (train 3, val 1, test 1)",
+        "computed: 34 recordings (train 24, val 4, test 6)",
+        f"{data.get('ronin').licence} here not found source",
+        "split 'all' of dataset 'kitti' holds no recording",
+    ):
+        assert words in text.replace(" /tlio", "/tlio")
 
 
 # --- check
@@ -142,18 +143,18 @@ def test_check_shows_every_recording_with_its_figures_and_reasons(root, capsys):
 
 def test_check_of_recordings_without_poses_draws_them_all_the_same(place, capsys):
     """With waypoints, gravity and speed are asked for."""
-    path = indoor_location_files.write(place / "mall")
+    text = indoor_location_files.lines(seconds=19.0)
+    path = indoor_location_files.write(place / "mall", text)
     run("data", "check", "indoor_location", "--data-root", "mall", "--plots", "pictures")
     name = f"site1_F4_{path.stem}"
     cells = row(capsys.readouterr().out, name)
     assert cells[1] == "test" and cells[3] == "50.0" and cells[4].startswith("0.00 0.00 9.")
-    assert (cells[5], *cells[7:]) == ("–", "–", "–", "used") and float(cells[2]) > 30.0
+    assert (cells[5], *cells[7:]) == ("–", "–", "–", "used") and float(cells[2]) > 15.0
     write_phone(place / "own" / "bare.csv", names=csv.GYRO + csv.ACCEL)
     run("data", "check", "csv", "--data-root", "own", "--plots", "pictures")
-    cells = row(capsys.readouterr().out, "bare")
-    assert cells[4:] == ["–", "–", "–", "–", "0.0%", "used"]
-    assert {path.stem for path in (place / "pictures").iterdir()} == {name, "bare"}
-    assert image.imread(place / "pictures" / "bare.png")[..., :3].std() > 0.03
+    assert row(capsys.readouterr().out, "bare")[4:] == ["–", "–", "–", "–", "0.0%", "used"]
+    for each in (name, "bare"):
+        assert image.imread(place / "pictures" / f"{each}.png")[..., :3].std() > 0.03
 
 
 # --- convert
@@ -189,18 +190,13 @@ def test_convert_keeps_every_figure_and_the_splits(root, capsys):
         assert ours.name == name
     with pytest.raises(InputError, match=r"val\.txt: the list cannot be read"):
         data.load("csv", converted, "val")
-    (converted / "unseen.txt").write_text("also\n")  # a split of another name
-    assert [sequence.name for sequence in data.load("csv", converted, "unseen")] == ["also"]
-    known = r"known splits: train, val, test, or that of a list seen\.txt there"
-    with pytest.raises(InputError, match=f"unknown split 'seen'; {known}"):
-        data.load("csv", converted, "seen")
     given = ("--data-root", str(root), "--split", "test", "--rate", "50")
     run("data", "convert", "tlio", "slow", *given)
     (ours,) = data.load("csv", root.parent / "slow", "test")
     assert_same_arrays(ours, data.resample(theirs, 50.0))
 
 
-def test_a_conversion_is_whole_or_not_there(root, reads, monkeypatch, capsys):
+def test_a_conversion_is_whole_or_not_there(root, reads, monkeypatch):
     real, converted = loading.write_hdf5, root.parent / "converted"
 
     def stopped(path, sequence):
@@ -214,10 +210,6 @@ def test_a_conversion_is_whole_or_not_there(root, reads, monkeypatch, capsys):
         app.main(command)
     assert left.value.code == 130 and "also" in reads
     assert sorted(path.name for path in root.parent.iterdir()) == ["heads"]
-    with pytest.raises(SystemExit):
-        app.main(["data", "convert", "--help"])
-    told = "a conversion that was stopped leaves nothing, and the same command begins anew"
-    assert told in " ".join(capsys.readouterr().out.split())
     monkeypatch.setattr(loading, "write_hdf5", real)
     run(*command)
     files = {path.name: path.read_bytes() for path in converted.iterdir()}
@@ -301,8 +293,7 @@ def test_import_of_a_phones_file_returns_the_walk(place, capsys):
     given += ["--accel-sign", "ios", "--gyro-unit", "deg/s"]
     run("data", "import", "ios.csv", "--out", "own/walk.h5", *given)
     out = capsys.readouterr().out
-    for words in ("accel negated (iOS's sign)", "20.0 s at 100 Hz", "it rests 0% of the time"):
-        assert words in out
+    assert "accel negated (iOS's sign)" in out and "20.0 s at 100 Hz" in out
     following = "next: gnio evaluate --dataset csv --data-root own --split test --init static"
     assert out.splitlines()[-1] == following
     (sequence,) = data.load("csv", place / "own", "test")

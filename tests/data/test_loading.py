@@ -9,7 +9,6 @@ import operator
 import os
 import time
 import warnings
-from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 
@@ -306,22 +305,6 @@ def test_a_process_that_grows_is_replaced_without_a_word():
         warnings.simplefilter("always")
         numbers, processes = zip(*in_processes(grow, [(k,) for k in range(8)], 2), strict=True)
     assert numbers == tuple(range(8)) and len(set(processes)) > 2 and not caught
-
-
-class Unpicklable(Exception):
-    def __init__(self, field, problem):
-        super().__init__(f"{field} {problem}")
-
-
-def fail_unpicklably(number):
-    raise Unpicklable("time", "is ruined")
-
-
-@pytest.mark.slow
-def test_an_error_that_does_not_unpickle_is_no_dead_process():
-    with pytest.raises(BrokenProcessPool) as caught:
-        list(in_processes(fail_unpicklably, [(0,), (1,)], 2))
-    assert "Unpicklable" in str(caught.value.__cause__)
 
 
 def test_a_process_that_may_have_no_children_does_the_work_itself(monkeypatch):

@@ -49,15 +49,12 @@ def test_validate_names_file_field_and_problem_in_one_line(sequence, field, prob
     assert text.startswith("walk.csv: ") and field in text and problem in text and "\n" not in text
 
 
-def test_validate_lets_the_reference_be_missing_where_it_is_marked_invalid():
-    sequence = GOOD
+def test_validate_lets_the_reference_be_missing_and_normalizes_rounded_quaternions():
+    """Exact ones are kept bit for bit. What is missing is marked invalid."""
+    sequence = changed(GOOD, "valid", 5, False)
     for field in ("position", "velocity", "orientation"):
         sequence = changed(sequence, field, 5, np.nan)
-    sequence = changed(sequence, "valid", 5, False)
     assert validate(sequence, "walk.csv").valid.sum() == len(GOOD.time) - 1
-
-
-def test_validate_normalizes_rounded_quaternions_and_keeps_exact_ones_bit_for_bit():
     assert validate(GOOD, "walk.csv").orientation is GOOD.orientation
     rounded = validate(GOOD._replace(orientation=np.round(GOOD.orientation, 4)), "walk.csv")
     np.testing.assert_allclose(np.linalg.norm(rounded.orientation, axis=1), 1.0, atol=1e-14)

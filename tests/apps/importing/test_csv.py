@@ -44,7 +44,7 @@ def write_logger(path, unit="ns", gyro=1.0, accel=1.0, separator=",", spoil=None
 
 
 def test_rows_are_those_that_an_editor_shows(tmp_path):
-    """Behind comments, the header and rows of another sensor, whatever is wrong."""
+    """Behind comments, the header, a blank line and rows of another sensor, whatever is wrong."""
     path = write_native(tmp_path / "walk.csv", reference=False)
     header, *rows = path.read_text().splitlines()
     names = header.split(",")
@@ -52,7 +52,8 @@ def test_rows_are_those_that_an_editor_shows(tmp_path):
         cells = rows[41].split(",")
         cells[names.index(column)] = value
         other = ["100.001", *[""] * (len(names) - 1)]
-        lines = ["# mine", header, *rows[:20], ",".join(other), *rows[20:41], ",".join(cells)]
+        lines = ["# mine", "", header, *rows[:20], ",".join(other), "", "# pause"]
+        lines += [*rows[20:41], ",".join(cells)]
         path.write_text("\n".join([*lines, *rows[42:]]))
         refused(path, rf"row {len(lines)}\b")
 
@@ -143,6 +144,16 @@ def test_signs_are_turned_when_stated_or_asked_for(tmp_path):
         compare_imu(detected)
         assert any("assuming that the screen points up" in note for note in notes)
     time = np.arange(2800) / 200
+    # Gravity on -z is a warning unless the sign is stated.
+    found = imported(path, MAPPED)
+    (warning,) = found.warnings
+    assert warning.startswith("sign: gravity reads on -z in ios.csv: ")
+    assert warning.endswith("compare with --accel-sign ios")
+    write_imported(tmp_path / "ios.h5", found)
+    assert read_imported(tmp_path / "ios.h5").warnings == found.warnings
+    assert imported(path, MAPPED, accel_sign="android").warnings == ()
+    assert imported(path, MAPPED, accel_sign="ios").warnings == ()
+    assert imported(write_native(tmp_path / "walk.csv")).warnings == ()
     upright = Rotation.from_euler("y", 90, degrees=True)
     values = imu(time)
     columns = [time, *upright.apply(values[:, :3]).T, *upright.apply(values[:, 3:]).T]
@@ -151,36 +162,7 @@ def test_signs_are_turned_when_stated_or_asked_for(tmp_path):
     refused(path, words, accel_sign="detect")
 
 
-def test_gravity_on_minus_z_is_a_warning_unless_the_sign_is_stated(tmp_path):
-    def negate(columns):
-        for name in AXES[3:]:
-            columns[name] = -columns[name]
-
-    path = write_native(tmp_path / "ios.csv", reference=False, spoil=negate)
-    found = imported(path)
-    np.testing.assert_allclose(
-        found.sequence.accel, -known_walk.force(found.sequence.time), atol=1e-3
-    )
-    (warning,) = found.warnings
-    assert warning.startswith("sign: gravity reads on -z in ios.csv: ")
-    assert warning.endswith("compare with --accel-sign ios")
-    write_imported(tmp_path / "ios.h5", found)
-    assert read_imported(tmp_path / "ios.h5").warnings == found.warnings
-    assert imported(path, accel_sign="android").warnings == ()
-    assert imported(path, accel_sign="ios").warnings == ()
-    assert imported(write_native(tmp_path / "walk.csv")).warnings == ()
-
-
 # --- columns
-
-
-def test_columns_that_are_missing_or_unknown_are_named(tmp_path):
-    path = write_logger(tmp_path / "phone.csv")
-    refused(path, "columns: unknown name 'gyro'; known names: time, accel_time", {"gyro": "wx"})
-    refused(path, "columns: 'time=' names no column; write gyro_x=NAME", {"time": ""})
-    some = {name: column for name, column in MAPPED.items() if name != "accel_x"}
-    words = "column 'accel_x' is missing; found: Timestamp, .*; name them: --columns accel_x=ax$"
-    refused(path, words, some)
 
 
 def test_gravity_and_user_acceleration_apart_are_summed(tmp_path):
@@ -199,6 +181,11 @@ def test_gravity_and_user_acceleration_apart_are_summed(tmp_path):
     sequence, _ = import_recording(path, sums, accel_sign="ios")
     np.testing.assert_allclose(sequence.accel[1:], imu(sequence.time[1:])[:, 3:], atol=1e-3)
     refused(path, "column 'userQ' is missing", sums | {"accel_x": "gravityX+userQ"})
+    refused(path, "columns: unknown name 'gyro'; known names: time, accel_time", {"gyro": "wx"})
+    refused(path, "columns: 'time=' names no column; write gyro_x=NAME", {"time": ""})
+    del sums["accel_x"]
+    words = "column 'accel_x' is missing; found: time, .*; name them: --columns accel_x="
+    refused(path, words, sums)
 
 
 def test_files_without_a_header_are_read_by_the_places_of_their_columns(tmp_path):

@@ -202,7 +202,7 @@ BAD = {
     "oxiod Tango": [("imu1.csv", once("cell", 0.5, 0.5, "9" * 400), "")],
     "ronin": [
         (".hdf5", put("synced/game_rv", 10, 0.0), "'synced/game_rv'", "not a unit quaternion"),
-        (".hdf5", once("type", 0.35, token="S8"), "field 'synced/game_rv' holds"),
+        (".hdf5", once("type", 0.45, token="S8"), "field 'synced/game_rv' holds"),
         (".hdf5", once("value", 0.6, 0.73, 1e9), "field 'gyro' is beyond 100 rad/s in 1 rows"),
         (".json", about(imu_init_gyro_bias=[10**400, 0, 0]), "'imu_init_gyro_bias'"),
         (".json", about(start_calibration=[1, 1, 0, 0]), "'start_calibration' is not a unit"),

@@ -16,16 +16,11 @@ from gnio_jax.numerics import rotations
 class Bounds(NamedTuple):
     """What the self-check may find, and what the attributes say within a margin."""
 
-    correlation: float
-    """Of the horizontal accelerations, at least."""
-    degrees: float
-    """Of the gyro in 10 s, at most."""
-    speed: tuple[float, float]
-    """Of the median, m/s."""
-    gravity: float
-    """m/s² by which the mean of R·accel may be off."""
-    valid: float
-    """Share of the samples, at least."""
+    correlation: float  # of the horizontal accelerations, at least
+    degrees: float  # of the gyro in 10 s, at most
+    speed: tuple[float, float]  # of the median, m/s
+    gravity: float  # m/s² by which the mean of R·accel may be off
+    valid: float  # share of the samples, at least
     seconds: tuple[float, float]
     about: dict[str, tuple[float, float]] = {}
 

@@ -92,12 +92,12 @@ def test_the_source_of_the_orientation(tmp_path, errors, ekf, chosen):
 
 
 def test_a_tilted_reference_fails_the_self_check(tmp_path):
-    def tilt(info):
+    def tilt(_, info):
         calibration = rotations(np.array(info["start_calibration"]))
         tilted = calibration * Rotation.from_euler("x", 6, degrees=True)
         info["start_calibration"] = list(wxyz(tilted))
 
-    (sequence,) = ronin.read(write(tmp_path / "a019_3", seconds=20.0, spoil_info=tilt))
+    (sequence,) = ronin.read(write(tmp_path / "a019_3", seconds=20.0, spoil=tilt))
     assert "mean of R·accel" in check_sequence(sequence, ronin.DATASET).failures[0]
 
 
@@ -105,7 +105,7 @@ def test_the_chest_may_move_as_the_phone_does_not(tmp_path):
     """A phone in a swinging hand accelerates otherwise than the chest: that is no reason to leave
     the walk out."""
 
-    def steady(fields):
+    def steady(fields, _):
         time = fields["synced/time"] - FIRST
         sway = 0.02 * np.sin(2 * np.pi * 1.3 * time)
         fields["pose/tango_pos"] = np.stack([0.9 * time, sway, 0.0 * time], axis=1)

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import data
 from gnio_jax.data.simulated import walks
 from gnio_jax.data.simulated.walker import CARRYING, MANY_PEOPLE, draw_motion
-from gnio_jax.errors import InputError
 
 RATE = 100.0
 
@@ -101,8 +100,6 @@ def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
     ]
     for values in zip(*(map(set, zip(*pairs, strict=True)) for pairs in found), strict=True):
         assert len(set.union(*values)) == sum(map(len, values))  # seeds, then people
-    with pytest.raises(InputError, match="unknown split 'dev'; known splits: train, val, test"):
-        data.load("synthetic", split="dev")
     names = [{each.name for each in walks.RANDOMISED.recordings(None, split)} for split in splits]
     assert sum(map(len, names)) == len(set.union(*names)) == 600 + 40 + 24
 
@@ -118,11 +115,6 @@ KNOWN = {
         [8.268985122117613, -22.153815669098634, 3.3990187167441333],
         [6570.717909661941, 43481.49970855106, 8982.95660633462],
         [2304.07557312174, 2838.0901640423767, 3220.1150007217034],
-    ),
-    200005: (
-        [17.12432209650229, -16.86730792811519, -0.010144025394450723],
-        [6223.273728834688, 14162.67213369514, 17453.21575709797],
-        [530.6952463129243, 1902.1382035068507, 1480.27912035227],
     ),
 }
 
@@ -157,7 +149,8 @@ def surge_and_force(sequence):
 
 @pytest.mark.parametrize("placement", ["handheld", "pocket"])
 def test_forward_is_told_from_backward_by_the_same_rule_for_nearly_all_walkers(placement):
-    found = []
+    """The bounce at one speed differs widely between them."""
+    found, bounces = [], []
     for seed in range(12):
         surge, vertical, speed = surge_and_force(error_free(seed, placement))
         # Runs, which are told by their force, follow the opposite rule.
@@ -166,15 +159,9 @@ def test_forward_is_told_from_backward_by_the_same_rule_for_nearly_all_walkers(p
         walking &= force < 3.0
         if walking.sum() > 500:
             found.append(np.corrcoef(surge[walking], vertical[walking])[0, 1])
+        steady = (speed > 0.9) & (speed < 1.3)
+        if steady.sum() > 200:
+            bounces.append(vertical[steady].std())
     assert len(found) >= 8
     assert np.mean(np.array(found) > 0) >= 0.8 and np.mean(found) > 0.15
-
-
-def test_bounce_at_one_speed_differs_widely_between_walkers():
-    bounces = []
-    for seed in range(12):
-        _, vertical, speed = surge_and_force(error_free(seed, "handheld"))
-        walking = (speed > 0.9) & (speed < 1.3)
-        if walking.sum() > 200:
-            bounces.append(vertical[walking].std())
     assert len(bounces) >= 5 and max(bounces) > 1.6 * min(bounces)
