@@ -103,9 +103,6 @@ def test_means_over_other_recordings_say_so(runs):
         compare(runs / "few", runs / "odd")
 
 
-# --- rows
-
-
 def test_names_without_a_seed_stand_for_all_seeds(tmp_path):
     """Also where the name itself looks like a seed."""
     names = ("net_s0", "net_s10", "net_s2", "net_s0_calibrated", "net_s2_calibrated")
@@ -211,9 +208,6 @@ def test_refusals(runs):
     assert "no metric 'new'; write the runs before" in refused("plain", metrics=("ate", "new"))
     (runs / "plain_s1" / own).rename(runs / "elsewhere")
     assert "exists for 1 of 2 seeds only; missing: " in refused(f"seen/{own}", f"plain/{own}")
-
-
-# --- the command
 
 
 def test_the_command_shows_and_writes(runs, gnio, mistake, monkeypatch):

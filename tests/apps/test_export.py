@@ -1,7 +1,5 @@
 """Trajectories in other programs' formats, read back by other means than they were written."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -21,9 +19,6 @@ def walk(time=TIME, start=START):
     x, y, z, w = known_walk.attitude(time - start).as_quat().T
     wxyz = np.stack([w, x, y, z], axis=1)
     return Trajectory(time, known_walk.position(time - start), wxyz)
-
-
-# --- text
 
 
 def test_csv_and_tum_have_the_poses(tmp_path, monkeypatch, gnio):
@@ -49,9 +44,6 @@ def test_csv_and_tum_have_the_poses(tmp_path, monkeypatch, gnio):
     again = read_tum(tmp_path / "walk.tum")
     for field, own in zip(again, poses, strict=True):
         np.testing.assert_allclose(field, own, atol=1e-9)
-
-
-# --- MCAP
 
 
 def test_the_mcap_is_read_by_rosbags(tmp_path):
@@ -98,9 +90,6 @@ def test_the_mcap_is_read_by_rosbags(tmp_path):
     np.testing.assert_allclose([linear.x, linear.y, linear.z], body, atol=0.05)
     rate = known_walk.rate(when + 0.025)
     np.testing.assert_allclose([angular.x, angular.y, angular.z], rate, atol=0.05)
-
-
-# --- the command
 
 
 LEVEL, WHOLE = "0 0 0 0 0 0 1\n", "0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n"

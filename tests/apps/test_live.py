@@ -227,6 +227,19 @@ def test_the_rate_is_measured_over_the_first_second(rate):
     assert rate_of([f"{k / 100 + 30 * (k > 5)},0,0,0,0,0,9.81" for k in range(100)]) is not None
 
 
+def test_a_stream_slower_than_the_network_is_followed(follow, tmp_path):
+    """Its poses are those of the same walk at the network's own rate, as far as lines can be."""
+    found = {}
+    for each in (25, 50):
+        told = follow(as_lines(walked(each)), "--out", tmp_path / "live.txt")
+        assert f"samples come at {each} Hz" in told
+        assert ("trained at 50 Hz" in told) == (each < 50)
+        found[each] = read_tum(tmp_path / "live.txt")
+    rows = np.searchsorted(found[50].time, found[25].time - 1e-3)
+    error = found[25].position - found[50].position[rows]
+    assert len(rows) > 35 and np.abs(error).max() < 0.3
+
+
 SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 2]
 """Every second lacks three samples."""
 

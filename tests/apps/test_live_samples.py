@@ -44,9 +44,6 @@ def taken_by_a_tracker(rows):
     return found
 
 
-# --- sensors with rows of their own
-
-
 @pytest.mark.parametrize(("start", "rate"), [(0.0, 60), (1.7e9, 10)])
 def test_the_accelerometer_is_interpolated_at_the_stamps_of_the_gyro(start, rate):
     """Two clocks, that of the gyro with 100 Hz; rows as they were taken. Whole rows stay as they
@@ -147,9 +144,6 @@ def test_where_the_gyro_falls_silent_time_passes():
     assert len(list(paired([*rows, *back]))) == pytest.approx(len(found) + 189, abs=3)
 
 
-# --- lines
-
-
 @pytest.mark.parametrize(
     "line",
     [
@@ -196,9 +190,6 @@ def test_no_text_at_all_is_an_error():
     for length in random.integers(0, 20, 3000):
         found = parse_line("".join(random.choice(signs, length)))
         assert found is None or math.isfinite(found.time)
-
-
-# --- the drawing
 
 
 def test_the_drawing_has_one_scale_and_y_up():

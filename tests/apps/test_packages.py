@@ -142,10 +142,8 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run,
     assert "calibrate" not in card and "fitted" not in card
     assert packages._named_run("/home/some body/first run") == "'runs/first run'"
     own = shutil.copytree(run, tmp_path / "walk_calibrated")
-    scores = {
-        name: Measures({"leg_ratio": ratio, "waypoint_rms": 2.0}, {}, False)
-        for name, ratio in (("a", 0.75), ("b", 0.85))
-    }
+    legs = [{"leg_ratio": ratio, "waypoint_rms": 2.0} for ratio in (0.75, 0.85)]
+    scores = {name: Measures(each, {}, False) for name, each in zip("ab", legs, strict=True)}
     figures = report.Report(SETTINGS, scores, {}, {"a": "F1", "b": "F2"}, {}, {})
     write_report(own / "eval" / "mall_test_ekf", figures)
     for calibrated, shown in (("runs/half", "half"), ("walk", "walk"), ("other/run", "run")):
@@ -198,14 +196,12 @@ def test_a_package_of_the_first_version(run, package):
     wanted, card = packages.load_pretrained(package), manifest.pop("card")
     (package / "config.yaml").write_text(configuration.text(wanted.config))
     (package / "README.md").write_text("\n".join(card))
-    about = {name: manifest[name] for name in ("format", "name", "network", "data", "license")}
-    about |= {name: manifest[name] for name in ("epoch", "step", "made_by")} | {"version": 1}
-    contents = {path.name: path.read_bytes() for path in package.iterdir()}
-    about["files"] = {
-        name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-        for name, content in contents.items()
-        if name != "manifest.json"
-    }
+    kept = "format name network data license epoch step made_by".split()
+    about = {name: manifest[name] for name in kept} | {"version": 1, "files": {}}
+    for path in package.iterdir():
+        content = path.read_bytes()
+        digest = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+        about["files"] |= {path.name: digest} if path.name != "manifest.json" else {}
     (package / "manifest.json").write_text(json.dumps(about))
     found = packages.load_pretrained(package)
     assert found.config == wanted.config and found.step == wanted.step
@@ -221,7 +217,7 @@ def test_names_are_found_and_listed(published, run, monkeypatch, tmp_path, gnio)
     assert "no packages" in gnio("weights")
     refused("walk", "known names: none")
     monkeypatch.setenv("GNIO_WEIGHTS", str(published))
-    assert list(packages.packages()) == ["small", "walk"]
+    assert list(packages.packages()) == ["small", "walk"] and packages._named_run("walk") == "walk"
     assert gnio_jax.load_pretrained("small").config.seed == 7
     assert gnio_jax.load_pretrained(run).config == CONFIG
     refused("wolk", "did you mean 'walk'?")

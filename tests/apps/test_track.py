@@ -273,9 +273,8 @@ def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monk
     assert given["std"].velocity == 0.7 and given["raw_gyro_bias"] == 0.02
 
 
-SUMMARY = Summary(
-    "walk", "net", "walks", 0.0, 100.0, 80.0, 1.0, 2.0, 0.0, 0.0, 0.5, 1.0, {}, (), (), ""
-)
+FIGURES = (0.0, 100.0, 80.0, 1.0, 2.0, 0.0, 0.0, 0.5, 1.0)
+SUMMARY = Summary("walk", "net", "walks", *FIGURES, {}, (), (), "")
 
 
 @pytest.mark.parametrize(

@@ -24,12 +24,12 @@ def handlers(monkeypatch):
     signal.signal(signal.SIGTERM, before)
 
 
-def mistaken():
-    raise InputError("file.csv", "has no column x", "add\nit")
-
-
 def interrupted():
     raise KeyboardInterrupt
+
+
+def mistaken():
+    raise InputError("file.csv", "has no column x", "add\nit")
 
 
 @pytest.mark.parametrize(
@@ -43,6 +43,8 @@ def interrupted():
     ],
 )
 def test_run_ends_in_one_line_and_a_status(main, status, line, capsys):
+    with pytest.raises(ZeroDivisionError):  # faults of the program keep their traceback
+        console.run(lambda: 1 / 0)
     if status is None:
         console.run(main)
     else:
@@ -50,11 +52,6 @@ def test_run_ends_in_one_line_and_a_status(main, status, line, capsys):
             console.run(main)
         assert left.value.code == status
     assert capsys.readouterr() == ("", line)
-
-
-def test_faults_of_the_program_keep_their_traceback():
-    with pytest.raises(ZeroDivisionError):
-        console.run(lambda: 1 / 0)
 
 
 def test_names_of_files_are_no_controls_of_the_terminal(capsys):

@@ -1,5 +1,4 @@
-"""`gnio data` as a person types it: what the tables say, what is written, and one
-line with status 2 for each mistake."""
+"""`gnio data`: what the tables say, what is written, and one line for each mistake."""
 
 import dataclasses
 import json
@@ -160,19 +159,6 @@ def test_check_of_recordings_without_poses_draws_them_all_the_same(place, capsys
 # --- convert
 
 
-@pytest.fixture
-def reads(monkeypatch):
-    """Names of the recordings that were read, in their order."""
-    names, real = [], tlio.read
-
-    def read(folder):
-        names.append(folder.name)
-        return real(folder)
-
-    monkeypatch.setattr(tlio, "read", read)
-    return names
-
-
 def test_convert_keeps_every_figure_and_the_splits(root, capsys):
     run("data", "convert", "tlio", "converted", "--data-root", str(root))
     out = capsys.readouterr().out
@@ -196,8 +182,9 @@ def test_convert_keeps_every_figure_and_the_splits(root, capsys):
     assert_same_arrays(ours, data.resample(theirs, 50.0))
 
 
-def test_a_conversion_is_whole_or_not_there(root, reads, monkeypatch):
-    real, converted = loading.write_hdf5, root.parent / "converted"
+def test_a_conversion_is_whole_or_not_there(root, monkeypatch):
+    real, converted, reads, read = loading.write_hdf5, root.parent / "converted", [], tlio.read
+    monkeypatch.setattr(tlio, "read", lambda folder: reads.append(folder.name) or read(folder))
 
     def stopped(path, sequence):
         if sequence.name == "also":

@@ -39,7 +39,6 @@ def test_spellings_and_values_of_options():
         ([], "command: is missing; give one of track, live, train, evaluate, score"),
         (["trian"], "command: unknown 'trian'; did you mean 'train'?"),
         (["train", "--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean '--optim."),
-        (["train", "--epochs", "3"], "--epochs: unknown option; did you mean '--optim.epochs'?"),
         (["train", "--model.head", "foo"], "must be one of gated, linear or null, found 'foo'"),
         (["train", "--optim.epochs"], "--optim.epochs: expected one argument"),
         (["train", "stray"], "'stray': is not an option; options are --name VALUE"),

@@ -1,5 +1,4 @@
-"""The training command as a person types it: one line on stderr and status 2 for every mistake,
-nothing left behind."""
+"""`gnio train`: one line on stderr and status 2 for every mistake, nothing left behind."""
 
 import dataclasses
 import os

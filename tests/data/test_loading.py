@@ -1,7 +1,4 @@
-"""Names, roots and splits; every recording is read one way, and who reads it makes no difference;
-the cache is made anew when, and only when, files or readers change."""
-
-from __future__ import annotations
+"""Recordings are read one way, whoever reads; the cache is anew when files or readers change."""
 
 import dataclasses
 import multiprocessing
@@ -78,13 +75,14 @@ def dataset(*recordings):
     return dataclasses.replace(data.get("tlio"), recordings=lambda root, split: list(recordings))
 
 
-def outcome(about, workers):
+def outcome(about, workers, progress=lambda share: None):
     """(names, warnings, error) of a split."""
     names, error = [], ""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            names = [s.name for s in read_split(about, Path("root"), "test", workers)]
+            read = read_split(about, Path("root"), "test", workers, progress)
+            names = [sequence.name for sequence in read]
         except InputError as mistake:
             error = str(mistake)
     return names, [str(note.message) for note in caught], error
@@ -102,9 +100,9 @@ def six(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("damage", [False, True])
+@pytest.mark.parametrize("damage", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, damage):
-    found = []
+    found, shares = [], []
     for workers in (1, 2):
         folder = tmp_path / f"by {workers}"
         folder.mkdir()
@@ -112,7 +110,8 @@ def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, da
         if damage:
             recordings.insert(4, slow(folder, "g", damage="field 'gyro' is NaN"))
         times = 1 if damage else 2  # cold and cached
-        found += [outcome(dataset(*recordings), workers) for _ in range(times)]
+        about = dataset(*recordings)
+        found += [outcome(about, workers, shares.append) for _ in range(times)]
     names, notes, error = found[0]
     assert found == [found[0]] * len(found)
     told = ["b.csv: a gap was cut off", "d.csv: is short"]
@@ -126,6 +125,7 @@ def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, da
         checked = notes.pop(-2)
         assert checked.startswith("f: left out by the self-check: mean of R·accel")
         assert notes == [*told, refused]
+        np.testing.assert_allclose(shares, [0.2, 0.4, 0.6, 0.8, 1.0])  # what processes read
 
 
 def test_a_sequence_says_whose_it_is_unless_it_was_converted(tmp_path):
@@ -159,24 +159,20 @@ def test_recordings_that_are_left_out_for_one_reason_are_one_line(tmp_path):
     assert error.startswith("root: none of the 2 recordings of split 'test' can be used")
 
 
+def die_in_a_child(name):
+    if multiprocessing.parent_process() is not None:
+        os._exit(3)
+    return walk(name)
+
+
 def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):
-    """A function without a name elsewhere cannot be sent to a process: it was read here."""
+    """A function without a name elsewhere cannot be sent to a process: it was read here. So is what
+    a dead process left."""
     local = Recording("local", lambda: [walk("local")])
-    shares, names = [], ["local", "a", "b"]
-    about = dataset(local, slow(tmp_path, "a"), slow(tmp_path, "b"))
-    sequences = list(read_split(about, tmp_path, "test", 2, shares.append))
-    assert [sequence.name for sequence in sequences] == names and shares == [0.5, 1.0]
-    kept = [
-        Recording(name, lambda: pytest.fail("built"), (tmp_path / f"{name}.csv",), slow=True)
-        for name in "ab"
-    ]
-    again = read_split(dataset(local, *kept), tmp_path, "test", 2, shares.append)
-    assert [sequence.name for sequence in again] == names and shares == [0.5, 1.0]
-
-
-def test_what_a_dead_process_left_is_read_here(tmp_path):
-    about = dataset(*(slow(tmp_path, name, die_in_a_child) for name in "abc"))
-    assert outcome(about, 2) == (["a", "b", "c"], [], "")
+    slowly = [slow(tmp_path, name, die_in_a_child) for name in "ab"]
+    assert outcome(dataset(local, *slowly), 2) == (["local", "a", "b"], [], "")
+    kept = [each._replace(read=lambda: pytest.fail("built")) for each in slowly]
+    assert outcome(dataset(local, *kept), 2) == (["local", "a", "b"], [], "")
 
 
 def test_a_check_tells_what_is_wrong_and_raises_nothing(tmp_path):
@@ -217,9 +213,9 @@ def test_the_recordings_of_all_splits_are_found_once(tmp_path):
         find_recordings(dataset(), Path("root"), "all")
 
 
-def test_work_by_processes_comes_back_in_order_and_few_results_are_held():
+def test_work_by_processes_comes_back_in_order_and_few_results_are_held(monkeypatch):
     """Who takes one result after the other never makes more than two beyond the workers, and who
-    stops early does not wait."""
+    stops early does not wait. A process that may have no children does the work itself."""
     shares, begun = [], []
     items = [(base, 2) for base in range(5)]
     assert list(in_processes(pow, items, 1, shares.append)) == [0, 1, 4, 9, 16]
@@ -244,6 +240,9 @@ def test_work_by_processes_comes_back_in_order_and_few_results_are_held():
     stopped = time.monotonic()
     results.close()
     assert time.monotonic() - stopped < 30.0
+    config = multiprocessing.current_process()._config  # as of a child with daemon=True
+    monkeypatch.setitem(config, "daemon", True)
+    assert list(in_processes(os.getpid, [(), ()], 2)) == [os.getpid()] * 2
 
 
 def test_a_process_that_dies_is_told_in_one_line(tmp_path):
@@ -253,12 +252,6 @@ def test_a_process_that_dies_is_told_in_one_line(tmp_path):
         list(in_processes(operator.call, items, 2))
     with pytest.raises(FileNotFoundError, match="nowhere"):  # the function's own error
         list(in_processes(os.stat, [(tmp_path / "nowhere",), (tmp_path,)], 2))
-
-
-def die_in_a_child(name):
-    if multiprocessing.parent_process() is not None:
-        os._exit(3)
-    return walk(name)
 
 
 def write_slowly(folder, name):
@@ -307,12 +300,6 @@ def test_a_process_that_grows_is_replaced_without_a_word():
     assert numbers == tuple(range(8)) and len(set(processes)) > 2 and not caught
 
 
-def test_a_process_that_may_have_no_children_does_the_work_itself(monkeypatch):
-    config = multiprocessing.current_process()._config  # as of a child with daemon=True
-    monkeypatch.setitem(config, "daemon", True)
-    assert list(in_processes(os.getpid, [(), ()], 2)) == [os.getpid()] * 2
-
-
 # --- the cache
 
 
@@ -340,8 +327,8 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def source(tmp_path, cache):
-    path = tmp_path / "imu.csv"
+def source(cache):
+    path = cache.parent / "imu.csv"
     path.write_text("1,2,3")
     return path
 
@@ -369,7 +356,7 @@ def test_a_changed_file_or_package_is_read_again(source, tmp_path, monkeypatch):
     os.utime(source, ns=(status.st_atime_ns, status.st_mtime_ns + 1))
     assert call(reader, source) == 2
     source.write_text("1,2,3,4")
-    os.utime(source, ns=(status.st_atime_ns, status.st_mtime_ns))
+    os.utime(source, ns=(status.st_atime_ns, status.st_mtime_ns + 1))
     assert call(reader, source) == 3
     assert call(reader, source, other) == call(reader, source, other) == 4
     other.write_text("T_BS:")  # which was not there
@@ -409,9 +396,7 @@ def test_the_sources_that_decide_what_is_read_are_part_of_the_key(monkeypatch):
     assert hdf5._sources() == found[0]
 
 
-def test_an_entry_that_is_damaged_or_cannot_be_written_is_made_anew(
-    source, cache, monkeypatch, tmp_path
-):
+def test_an_entry_that_is_damaged_or_cannot_be_written_is_made_anew(source, cache, monkeypatch):
     reader = Reader()
     call(reader, source)
     (entry,) = cache.iterdir()
@@ -421,8 +406,8 @@ def test_an_entry_that_is_damaged_or_cannot_be_written_is_made_anew(
     assert call(reader, source) == 3 and call(reader, source) == 4
     # Where nobody has said where it lies:
     monkeypatch.delenv("GNIO_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert hdf5.cache_folder() == tmp_path / "gnio-jax"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    assert hdf5.cache_folder() == cache / "gnio-jax"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", "/home/walker")
     assert str(hdf5.cache_folder()) == "/home/walker/.cache/gnio-jax"

@@ -1,5 +1,4 @@
-"""Lists name recordings, and who is absent is counted; folds keep groups whole, share the time
-fairly, and training lacks what is left out."""
+"""Who is absent from a list is counted; folds keep groups whole and share the time fairly."""
 
 import itertools
 

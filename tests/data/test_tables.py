@@ -1,7 +1,4 @@
-"""Tables of every format: what is missing, no number or incomplete is named by file, column and
-row."""
-
-from __future__ import annotations
+"""Tables: what is missing, no number or incomplete is named by file, column and row."""
 
 import h5py
 import numpy as np

@@ -1,15 +1,11 @@
 """Waypoints turned into poses: against computed walks whose truth is known, and taps that err."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from gnio_jax.config import DataConfig, TrainConfig
 from gnio_jax.data import loading
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.data.pictures import overview
-from gnio_jax.data.self_check import self_check
 from gnio_jax.data.waypoints import levelled, with_poses
 from gnio_jax.data.windows import window_source
 from gnio_jax.numerics import rotations
@@ -99,16 +95,6 @@ def test_a_walk_whose_legs_do_not_fit_the_phone_is_refused(change, words):
     waypoints = tapped.waypoints._replace(position=change(tapped.waypoints.position))
     with pytest.raises(Refusal, match=f"^survey 2: .*{words}"):
         with_poses(tapped._replace(waypoints=waypoints))
-
-
-def test_a_picture_shows_the_waypoints_and_the_way_between_them():
-    tapped = survey(0).tapped(np.zeros(9))
-    plan, speed, *_ = overview(tapped, self_check(tapped)).axes
-    drawn = {line.get_label(): np.array(line.get_data()) for line in plan.lines}
-    np.testing.assert_array_equal(drawn["waypoint"].T, tapped.waypoints.position)
-    (way,) = (values for label, values in drawn.items() if label.startswith("_"))
-    assert np.isfinite(way).all(axis=0).mean() > 0.95
-    assert np.nanmedian(speed.lines[0].get_ydata()) > 0.8
 
 
 def test_training_cuts_windows_from_such_walks_and_leaves_out_the_others(monkeypatch, capsys):

@@ -64,8 +64,7 @@ def cut(sequences, rotation, stride, context=0):
 
 
 @pytest.mark.parametrize(
-    "rotation, stride, context",
-    [("single", 2, 0), ("per_sample", 1, 0), ("per_sample", 2, 6)],
+    "rotation, stride, context", [("single", 2, 0), ("per_sample", 1, 0), ("per_sample", 2, 6)]
 )
 def test_gather_against_a_brute_force_cutter(rotation, stride, context):
     sequences = [tumbling(57, 1), tumbling(61, 2, invalid=[0, 33])]

@@ -5,8 +5,6 @@ files.
 point of the same body.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

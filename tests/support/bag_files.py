@@ -3,8 +3,6 @@
 `write(path, kind, topics)` takes rows (topic, type, ns, message); the makers below give them.
 """
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 

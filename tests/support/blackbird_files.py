@@ -1,7 +1,5 @@
 """Files in Blackbird's layout."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 from scipy.spatial.transform import Rotation

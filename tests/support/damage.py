@@ -3,8 +3,6 @@
 A `Damage` is drawn by `damages` and done by `after`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import io

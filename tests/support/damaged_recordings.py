@@ -3,8 +3,6 @@
 What must hold is stated in `check_sequence` and `check_refusal`, without the package's help.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import re
@@ -102,9 +100,6 @@ def outcome(name, happened):
             assert len(line.splitlines()) == 1, f"not one line: {line!r}"
             assert len(line) < 2000, f"nobody reads {len(line)} characters"
         return result, "\n".join(said).replace(str(root), "ROOT")
-
-
-# --- what must hold
 
 
 def check_sequence(sequence, name):

@@ -5,8 +5,6 @@ The earth is the sphere of KITTI's own projection; a few metres from the origin 
 arcs on it to a micrometre, whatever the projection.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from tests.support import known_walk

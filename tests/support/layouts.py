@@ -1,8 +1,6 @@
 """Every layout that the loaders read, written as the known walk by the tests' own writers, in one
 table."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -148,6 +146,7 @@ LAYOUTS = {
         "kitti",
         "train",
         lambda root, seconds: kitti_files.write_drive(root, DRIVE, seconds),
+        shortest=4.0,
         targets=(STAMPS, PACKET.format("000"), PACKET.format("200")),
     ),
     "kitti npz": Layout(

@@ -3,8 +3,6 @@
 Gyroscope and accelerometer have stamps of their own, as on a phone.
 """
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path

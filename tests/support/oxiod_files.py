@@ -4,8 +4,6 @@ The conventions (iOS's sign, G, Vicon's quaternion order, where the marker body 
 down here a second time, independently of the loader.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files in RIDI's two layouts."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

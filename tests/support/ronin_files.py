@@ -1,7 +1,5 @@
 """Files in RoNIN's layout."""
 
-from __future__ import annotations
-
 import json
 
 import h5py

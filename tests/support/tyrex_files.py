@@ -1,7 +1,5 @@
 """Files in Tyrex's layout: the known walk, seen as a handle on the phone, at two phones' rates."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

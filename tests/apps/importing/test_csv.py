@@ -1,7 +1,5 @@
 """Tables of numbers must tell of the known walk again; what is ambiguous is refused."""
 
-from __future__ import annotations
-
 import os
 import threading
 
@@ -95,6 +93,20 @@ def test_units_that_are_stated_are_taken_unless_the_data_contradict_them(tmp_pat
     refused(path, "field 'time' makes gyro run at 0.0002 Hz with", MAPPED, time_unit="ms")
     refused(path, "field 'accel'", MAPPED, accel_unit="g")
     refused(path, "rate: 0 Hz", MAPPED, rate=0.0)
+
+
+def test_slow_turns_tell_their_unit_by_the_turning_of_gravity(tmp_path):
+    """A turntable tips by 20°/s at most: as numbers 20 is possible in both units."""
+    time = np.arange(2000) / 100
+    angle = np.radians(40.0) * np.sin(2 * np.pi * time / 13.0)
+    rate = np.gradient(angle, time)
+    force = [0 * time, 9.81 * np.sin(angle), 9.81 * np.cos(angle)]
+    for unit, factor in (("deg/s", 180 / np.pi), ("rad/s", 1.0)):
+        columns = [time, rate * factor, 0 * time, 0 * time, *force]
+        path = write(tmp_path / "table.csv", ["time", *AXES], columns)
+        sequence, notes = import_recording(path)
+        np.testing.assert_allclose(sequence.gyro[:, 0], rate, atol=1e-6)
+        assert any(f"gyro taken as {unit} (gravity turns by" in note for note in notes)
 
 
 def test_what_no_unit_explains_is_refused_until_it_is_stated(tmp_path):

@@ -1,7 +1,4 @@
-"""A folder of EuRoC's layout; what is no recording; damaged files, which are read, or refused in
-one line."""
-
-from __future__ import annotations
+"""EuRoC's layout; what is no recording; damaged files, which are read or refused in one line."""
 
 import h5py
 import numpy as np

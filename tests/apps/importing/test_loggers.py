@@ -1,7 +1,5 @@
 """The exports of phone loggers must tell of the known walk again, or be refused in one line."""
 
-from __future__ import annotations
-
 import numpy as np
 import openpyxl
 import pytest
@@ -39,9 +37,6 @@ def compare(sequence):
 
 def without(members, *names):
     return {name: text for name, text in members.items() if name not in names}
-
-
-# --- Sensor Logger
 
 
 SUM = "Accelerometer.csv + Gravity.csv in m/s2"
@@ -154,9 +149,6 @@ def test_a_zip_cut_short_or_with_a_member_that_lies_about_its_size_is_one_line(t
     refused(path, "Gyroscope.csv: unpacks to 3072 MiB; no table may exceed 512 MiB")
     path.write_bytes(lying_zip(sensor_logger(), "Gyroscope.csv", 5000))
     refused(path, "bomb.zip: cannot be read as a zip, it may be cut short")
-
-
-# --- phyphox
 
 
 @pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", ",")])

@@ -1,7 +1,5 @@
 """Bags that the libraries' own writers wrote must tell of the known walk again."""
 
-from __future__ import annotations
-
 import re
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """An IMU on a tracked body: known mountings must come back, whatever the rates of its sensors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,8 +15,7 @@ LEVER = np.array([-0.02, 0.08, 0.01])
 TILT = np.array([0.02, -0.01])
 
 
-def upward(tilt):
-    return np.array([*tilt, 1.0]) / np.linalg.norm([*tilt, 1.0])
+UP = np.array([*TILT, 1.0]) / np.linalg.norm([*TILT, 1.0])
 
 
 def imu(gyro_hz=100.0, accel_hz=100.0, lag=0.0, late=0.0, bias=0.0, start=-2.0, stop=42.0):
@@ -36,15 +33,14 @@ def imu(gyro_hz=100.0, accel_hz=100.0, lag=0.0, late=0.0, bias=0.0, start=-2.0, 
 def tracked(hz=100.0):
     """The marker body of that IMU, in a tilted world."""
     time = np.arange(0.0, 40.0, 1.0 / hz)
-    tilted = Rotation.align_vectors(upward(TILT)[None], [[0.0, 0.0, 1.0]])[0]
+    tilted = Rotation.align_vectors(UP[None], [[0.0, 0.0, 1.0]])[0]
     attitude = tilted * walk.attitude(time) * EXTRINSIC.inv()
     position = tilted.apply(walk.position(time)) - attitude.apply(LEVER)
     return Poses(time, attitude, position, noisy=True)
 
 
 @pytest.mark.parametrize(
-    ("gyro_hz", "accel_hz", "track_hz"),
-    [(90.3, 107.1, 60.0), (10.0, 10.0, 40.0)],
+    ("gyro_hz", "accel_hz", "track_hz"), [(90.3, 107.1, 60.0), (10.0, 10.0, 40.0)]
 )
 def test_a_known_mounting_is_found_on_a_late_clock(gyro_hz, accel_hz, track_hz):
     bias = np.array([0.01, -0.005, 0.02])
@@ -53,7 +49,7 @@ def test_a_known_mounting_is_found_on_a_late_clock(gyro_hz, accel_hz, track_hz):
     found = body.align(streams, track)
     assert np.degrees((found.extrinsic * EXTRINSIC.inv()).magnitude()) < 0.1
     np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
-    np.testing.assert_allclose(found.up, upward(TILT), atol=2e-3)
+    np.testing.assert_allclose(found.up, UP, atol=2e-3)
     np.testing.assert_allclose(found.gyro_bias, bias, atol=1e-3)
     np.testing.assert_allclose(found.lag, 0.7, atol=3e-3)
     assert found.accel_delay == pytest.approx(0.02, abs=3e-3)
@@ -139,9 +135,6 @@ def test_poses_near_flips_and_jumps_are_dropped():
     assert len(untouched.time) == len(time)
 
 
-# --- parts
-
-
 def test_the_jacobians_are_the_differences_of_the_errors():
     streams, seen = imu(), body._seen(tracked())
     felt = body._felt(streams)
@@ -172,9 +165,6 @@ def test_whitened_errors_have_the_covariance_of_white_noise_with_shared_offsets(
     assert (noise.whitened(errors) ** 2).sum() == pytest.approx(expected, rel=1e-12)
     jacobian = np.random.default_rng(1).standard_normal((8, 3, 2))
     np.testing.assert_allclose(noise.whitened(jacobian)[:, 1], noise.whitened(jacobian[..., 1]))
-
-
-# --- the lag alone
 
 
 @pytest.mark.parametrize(("lag", "hz"), [(-0.12, 100), (0.033, 60)])

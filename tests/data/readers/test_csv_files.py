@@ -1,7 +1,5 @@
 """One's own recordings: CSV and HDF5 folders must tell of the known walk again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """EuRoC and TUM-VI: a known motion written in the ASL layout, traps included, must come back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,4 @@
-"""Indoor Location: a known walk written in the competition's layout, traps included, must come back
-with its waypoints; real walks must be physical."""
-
-from __future__ import annotations
+"""Indoor Location: a known walk, traps included, must come back with its waypoints."""
 
 import numpy as np
 import pytest

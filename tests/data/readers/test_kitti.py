@@ -1,7 +1,4 @@
-"""KITTI: a known motion written as OXTS packets and as npz pieces, traps included, must come back;
-real drives must be physical."""
-
-from __future__ import annotations
+"""KITTI: a known motion as OXTS packets and as npz pieces, traps included, must come back."""
 
 import numpy as np
 import pytest

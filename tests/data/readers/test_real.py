@@ -1,7 +1,5 @@
 """Real recordings of every dataset that may be had must be physical: one table of bounds."""
 
-from __future__ import annotations
-
 import warnings
 from typing import NamedTuple
 

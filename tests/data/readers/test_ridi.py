@@ -1,7 +1,5 @@
 """RIDI: a known walk written in both of its layouts, traps included, must come back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,4 @@
-"""RoNIN: a known walk written in the authors' layout, traps included, must come back as the
-phone's, not the chest's."""
-
-from __future__ import annotations
+"""RoNIN: a known walk, traps included, must come back as the phone's, not the chest's."""
 
 import json
 

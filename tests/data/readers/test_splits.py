@@ -1,7 +1,5 @@
 """Which recordings of a copy make a split, in every dataset: one table. Nothing is read."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path

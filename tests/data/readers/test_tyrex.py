@@ -1,7 +1,4 @@
-"""Tyrex: a known walk written in the authors' layout, traps included, must come back as the
-phone's; real walks must be physical."""
-
-from __future__ import annotations
+"""Tyrex: a known walk in the authors' layout, traps included, must come back as the phone's."""
 
 import numpy as np
 import pytest
