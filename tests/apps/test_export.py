@@ -1,7 +1,5 @@
 """Trajectories in other programs' formats, read back by other means than they were written."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -23,11 +21,16 @@ def walk(time=TIME, start=START):
     return Trajectory(time, known_walk.position(time - start), wxyz)
 
 
-# --- text
-
-
 def test_csv_and_tum_have_the_poses(tmp_path, monkeypatch, gnio):
+    """Rows without a pose are left out."""
     poses = walk()
+    holed = walk()
+    holed.position[10:20] = np.nan
+    holed.orientation[15:25] = np.nan
+    assert export(tmp_path / "walk.csv", holed) == 45
+    holed.position[:] = np.nan
+    with pytest.raises(InputError, match=r"walk\.csv: the trajectory has no pose"):
+        export(tmp_path / "walk.csv", holed)
     assert export(tmp_path / "walk.csv", poses) == 60
     lines = (tmp_path / "walk.csv").read_text().splitlines()
     assert lines[0] == "time,px,py,pz,qw,qx,qy,qz"
@@ -41,19 +44,6 @@ def test_csv_and_tum_have_the_poses(tmp_path, monkeypatch, gnio):
     again = read_tum(tmp_path / "walk.tum")
     for field, own in zip(again, poses, strict=True):
         np.testing.assert_allclose(field, own, atol=1e-9)
-
-
-def test_rows_without_a_pose_are_left_out(tmp_path):
-    poses = walk()
-    poses.position[10:20] = np.nan
-    poses.orientation[15:25] = np.nan
-    assert export(tmp_path / "walk.csv", poses) == 45
-    poses.position[:] = np.nan
-    with pytest.raises(InputError, match=r"walk\.csv: the trajectory has no pose"):
-        export(tmp_path / "walk.csv", poses)
-
-
-# --- MCAP
 
 
 def test_the_mcap_is_read_by_rosbags(tmp_path):
@@ -102,20 +92,14 @@ def test_the_mcap_is_read_by_rosbags(tmp_path):
     np.testing.assert_allclose([angular.x, angular.y, angular.z], rate, atol=0.05)
 
 
-# --- the command
-
-
 LEVEL, WHOLE = "0 0 0 0 0 0 1\n", "0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n"
 
 
 @pytest.mark.parametrize(
     ("text", "out", "expected"),
     [
-        (WHOLE, None, "OUT: is missing"),
         (WHOLE, "a.dat", "a.dat: the ending of its name is not a known format; known"),
         ("0 1 2 3\n1 1 2 3\n", "a.csv", "walk.txt: has 4 columns, not 8"),
-        (f"1 {LEVEL}0 {LEVEL}", "a.csv", "walk.txt: field 'time' does not increase"),
-        ("0 0 0 0 0 0 0 2\n1 0 0 0 0 0 0 1\n", "a.csv", "are not a unit quaternion"),
         (f"0 {LEVEL}1 nan 0 0 0 0 0 1\n", "a.csv", "column 'x' is NaN or Inf in 1 rows, first in"),
         (f"-1 {LEVEL}1 {LEVEL}", "a.mcap", "a.mcap: stamps begin at -1 s; ROS has none below 0"),
         (f"0 {LEVEL}1.7e18 {LEVEL}", "a.mcap", "a.mcap: stamps end at 1.7e+18 s; ROS counts sec"),
@@ -125,5 +109,5 @@ def test_a_mistake_is_one_line(tmp_path, monkeypatch, mistake, text, out, expect
     monkeypatch.chdir(tmp_path)
     (tmp_path / "walk.txt").write_text(text)
     before = sorted(tmp_path.iterdir())
-    assert expected in mistake("data", "export", "walk.txt", *filter(None, [out]))
+    assert expected in mistake("data", "export", "walk.txt", out)
     assert sorted(tmp_path.iterdir()) == before

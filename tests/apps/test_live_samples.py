@@ -44,63 +44,47 @@ def taken_by_a_tracker(rows):
     return found
 
 
-# --- sensors with rows of their own
-
-
-def test_the_accelerometer_is_interpolated_at_the_stamps_of_the_gyro():
-    """Two clocks, 100 and 60 Hz; rows as they were taken."""
+@pytest.mark.parametrize(("start", "rate"), [(0.0, 60), (1.7e9, 10)])
+def test_the_accelerometer_is_interpolated_at_the_stamps_of_the_gyro(start, rate):
+    """Two clocks, that of the gyro with 100 Hz; rows as they were taken. Whole rows stay as they
+    are, and come at once."""
     random = np.random.default_rng(2)
-    turned, pulled = np.arange(0.02, 1.0, 0.01), np.arange(0.0, 1.02, 1 / 60)
+    turned, pulled = start + np.arange(0.02, 1.0, 0.01), start + np.arange(0, 1.2, 1 / rate)
     forces = random.normal(size=(len(pulled), 3))
     rows = [gyro(t, (t, 0.0, -t)) for t in turned]
     rows += [accel(t, tuple(f)) for t, f in zip(pulled, forces.tolist(), strict=True)]
-    found = list(paired(by_stamp(rows)))
+    found = whole(paired(by_stamp(rows)))
     assert [sample.time for sample in found] == list(turned)
     assert [sample.gyro for sample in found] == [(t, 0.0, -t) for t in turned]
     for axis in range(3):
         wanted = np.interp(turned, pulled, forces[:, axis])
-        np.testing.assert_allclose([sample.accel[axis] for sample in found], wanted, atol=1e-12)
-
-
-def test_whole_rows_come_at_once_and_as_they_are():
-    rows = [Sample(0.1 * k, SPIN, PULL) for k in range(3)]
-    rows += [None, Sample(0.3, MISSING, MISSING), Sample(0.4, (math.nan, 0.0, 0.0), PULL)]
-    taken, given = [], []
-
-    def stream():
-        for row in rows:
-            yield row
-            taken.append(len(given))
-
-    for sample in paired(stream()):
-        given.append(sample)
-    assert repr(given) == repr(rows)  # NaN is not NaN
-    assert taken == list(range(1, len(rows) + 1))
+        np.testing.assert_allclose([sample.accel[axis] for sample in found], wanted, atol=1e-6)
+    taken = []
+    odd = [None, Sample(0.3, MISSING, MISSING), Sample(0.4, (math.nan, 0.0, 0.0), PULL)]
+    rows = [*(Sample(0.1 * k, SPIN, PULL) for k in range(3)), *odd]
+    given = paired(taken.append(row) or row for row in rows)
+    assert [(repr(next(given)), len(taken)) for _ in rows] == [  # NaN is not NaN
+        (repr(row), number) for number, row in enumerate(rows, 1)
+    ]
 
 
 @pytest.mark.parametrize(
     "rows, samples",
     [
-        (  # a value that one row lacks lies between its neighbours
-            [Sample(0.0, SPIN, (0.0, 0.0, 9.0)), gyro(0.01), Sample(0.02, SPIN, (0.0, 2.0, 10.0))],
-            [(0.0, (0.0, 0.0, 9.0)), (0.01, (0.0, 1.0, 9.5)), (0.02, (0.0, 2.0, 10.0))],
-        ),
-        (  # readings that are far apart enclose nothing
-            [accel(0.0), gyro(0.05), accel(0.2), gyro(0.25), accel(0.29)],
-            [(0.05, MISSING), (0.25, PULL)],
-        ),
-        # A reading at the same stamp needs no other.
-        ([accel(0.0), gyro(0.5), accel(0.5)], [(0.5, PULL)]),
-        # One that comes twice or late is no sample.
-        (
-            [accel(0.0), accel(0.0), gyro(0.01), accel(0.02), accel(0.01)],
-            [None, None, (0.01, PULL)],
-        ),
+        ([(0.0, 0.2, 0.29), (0.05, 0.25)], [(0.05, MISSING), (0.25, PULL)]),
+        ([(0.0, 0.5), (0.5,)], [(0.5, PULL)]),
     ],
 )
 def test_few_rows_by_hand(rows, samples):
-    found = [each and (each.time, each.accel) for each in paired(rows)]
-    assert [*map(str, found)] == [*map(str, samples)]
+    """Readings that are far apart enclose nothing, and one at the same stamp needs no other."""
+    rows = by_stamp(map(gyro, rows[1]), map(accel, rows[0]))
+    found = [(each.time, each.accel) for each in paired(rows)]
+    assert repr(found) == repr(samples)  # NaN is not NaN
+
+
+def test_a_row_that_comes_twice_or_late_is_no_sample():
+    found = list(paired([accel(0.0), accel(0.0), gyro(0.01), accel(0.02), accel(0.01)]))
+    assert found == [None, None, Sample(0.01, SPIN, PULL)]
 
 
 def test_without_the_accelerometer_the_gyro_waits_no_longer_than_it_must():
@@ -111,7 +95,7 @@ def test_without_the_accelerometer_the_gyro_waits_no_longer_than_it_must():
     assert [sample.time for sample in given] == [row.time for row in rows[1:]]
 
 
-@pytest.mark.parametrize("late", [0.0, 0.011, 0.09, -0.006, -0.09])
+@pytest.mark.parametrize("late", [0.0, 0.09, -0.006, -0.09])
 @pytest.mark.parametrize("between", [None, 0.02])
 def test_either_sensor_may_come_late(late, between):
     """In the order of arrival, the gyro `late` s after the accelerometer: where rows of it are
@@ -127,18 +111,8 @@ def test_either_sensor_may_come_late(late, between):
     assert [row.time for row in found] == [row.time for row in turned[:-1]]
 
 
-@pytest.mark.parametrize("first, length", [("accel", 5), ("gyro", 10)])
-def test_rows_may_come_in_batches(first, length):
-    pulled, turned = at_100_hz()
-    rows = []
-    for k in range(0, len(pulled), length):
-        both = (pulled[k : k + length], turned[k : k + length])
-        rows += itertools.chain(*(both if first == "accel" else both[::-1]))
-    assert len(whole(taken_by_a_tracker(rows))) >= len(turned) - 1
-
-
 @pytest.mark.parametrize("sensor", [gyro, accel])
-@pytest.mark.parametrize("off", [1e6, 5.0, -5.0])
+@pytest.mark.parametrize("off", [1e6, -5.0])
 def test_one_wrong_stamp_holds_nothing_up(sensor, off):
     """What a tracker makes of one that comes through is its own matter."""
     pulled, turned = at_100_hz()
@@ -151,11 +125,9 @@ def test_one_wrong_stamp_holds_nothing_up(sensor, off):
     assert len([row for row in whole(found) if row.time != wrong.time]) > len(turned) - 25
 
 
-@pytest.mark.parametrize("then", [SPIN, (math.nan, 0.0, 0.0), MISSING])
+@pytest.mark.parametrize("then", [gyro(1.0), Sample(1.0, MISSING, MISSING)])
 def test_a_clock_that_stands_still_gives_no_samples(then):
-    then = gyro(1.0) if then == SPIN else Sample(1.0, MISSING, then)
-    found = list(paired([gyro(1.0), *[then] * 999]))
-    assert found.count(None) >= 998
+    assert list(paired([gyro(1.0), *[then] * 999])).count(None) >= 998
 
 
 def test_where_the_gyro_falls_silent_time_passes():
@@ -170,15 +142,6 @@ def test_where_the_gyro_falls_silent_time_passes():
     assert len(list(paired([accel(1e6), *pulled]))) == pytest.approx(189, abs=2)
     back = [row._replace(time=row.time - 50.0) for row in pulled]
     assert len(list(paired([*rows, *back]))) == pytest.approx(len(found) + 189, abs=3)
-
-
-def test_an_accelerometer_of_10_hz_is_enough_also_by_unix_time():
-    pulled = [accel(1.7e9 + k / 10) for k in range(50)]
-    turned = [gyro(1.7e9 + k / 100 + 0.001) for k in range(490)]
-    assert len(whole(paired(by_stamp(pulled, turned)))) == 490
-
-
-# --- lines
 
 
 @pytest.mark.parametrize(
@@ -212,8 +175,7 @@ def test_what_is_missing_is_nan():
         "1,0,0,0,0,0,9810",  # mg
         '{"time": 1, "gyro": [0, 0], "accel": [0, 0, 9.81]}',
         '{"time": true, "gyro": [0, 0, 0], "accel": [0, 0, 9.81]}',
-        "{" * 4000,
-        "[" * 2000,
+        "[" * 4000,
         f'{{"time": 1, "gyro": [0, 0, {"9" * 400}], "accel": [0, 0, 9.81]}}',
         '{"time": 1, "gyro": {"0": 0}, "accel": "009"}',
         "1" * 5000,
@@ -230,9 +192,6 @@ def test_no_text_at_all_is_an_error():
         assert found is None or math.isfinite(found.time)
 
 
-# --- the drawing
-
-
 def test_the_drawing_has_one_scale_and_y_up():
     """From the bottom left to the right, then up to the marker; as high as it is wide."""
     side = np.arange(30.0)
@@ -244,9 +203,6 @@ def test_the_drawing_has_one_scale_and_y_up():
     assert abs(2 * np.ptp(rows) - np.ptp(columns)) <= 2 and np.ptp(rows) > 15
     assert drawn[rows[-1]].sum() == len(columns) and drawn[:, columns[-1]].sum() == len(rows)
     assert lines[rows[0]][columns[-1]] == "●" and drawn[rows[5]].sum() == 1
-
-
-def test_a_drawing_of_nothing_is_empty_and_standing_is_a_point():
     assert drawing(np.full((3, 3), np.nan), 10, 4).strip() == ""
     still = drawing(np.random.default_rng(0).normal(0, 0.01, (50, 3)), 40, 20)
     assert still.count("●") == 1 and sum(sign not in " \u2800\n" for sign in still) <= 4

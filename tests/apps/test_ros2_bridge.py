@@ -43,13 +43,9 @@ class Recorder:
 
 
 def message(sec, nanosec, gyro=(0.1, 0.2, 0.3), accel=(0.0, 1.0, 9.8)):
-    vector = lambda values: SimpleNamespace(**dict(zip("xyz", values, strict=True)))  # noqa: E731
-    stamp = SimpleNamespace(sec=sec, nanosec=nanosec)
-    return SimpleNamespace(
-        header=SimpleNamespace(stamp=stamp),
-        angular_velocity=vector(gyro),
-        linear_acceleration=vector(accel),
-    )
+    turned, pulled = (SimpleNamespace(**dict(zip("xyz", x, strict=True))) for x in (gyro, accel))
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec))
+    return SimpleNamespace(header=header, angular_velocity=turned, linear_acceleration=pulled)
 
 
 def test_messages_become_odometry(bridge):

@@ -4,6 +4,7 @@ All filters here have the tracker's own settings; the network says nothing.
 """
 
 import numpy as np
+import pytest
 from flax import linen as nn
 
 from gnio_jax.apps.track import tracking_filter
@@ -61,6 +62,7 @@ def nees(prepared):
     return np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error) / 2
 
 
+@pytest.mark.slow
 def test_the_true_end_of_a_hole_lies_within_what_the_filter_says():
     prepared, _ = prepare(recordings(), WINDOWS, FILTER.initial_std)
     found = nees(prepared)

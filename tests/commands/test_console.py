@@ -24,12 +24,12 @@ def handlers(monkeypatch):
     signal.signal(signal.SIGTERM, before)
 
 
-def mistaken():
-    raise InputError("file.csv", "has no column x", "add\nit")
-
-
 def interrupted():
     raise KeyboardInterrupt
+
+
+def mistaken():
+    raise InputError("file.csv", "has no column x", "add\nit")
 
 
 @pytest.mark.parametrize(
@@ -43,6 +43,8 @@ def interrupted():
     ],
 )
 def test_run_ends_in_one_line_and_a_status(main, status, line, capsys):
+    with pytest.raises(ZeroDivisionError):  # faults of the program keep their traceback
+        console.run(lambda: 1 / 0)
     if status is None:
         console.run(main)
     else:
@@ -50,11 +52,6 @@ def test_run_ends_in_one_line_and_a_status(main, status, line, capsys):
             console.run(main)
         assert left.value.code == status
     assert capsys.readouterr() == ("", line)
-
-
-def test_faults_of_the_program_keep_their_traceback():
-    with pytest.raises(ZeroDivisionError):
-        console.run(lambda: 1 / 0)
 
 
 def test_names_of_files_are_no_controls_of_the_terminal(capsys):
@@ -91,31 +88,13 @@ def test_another_copy_of_the_package_in_the_working_folder_is_told(tmp_path, mon
     assert line.startswith("warning: ") and "pip install -e ." in line
 
 
-def test_what_is_compiled_is_kept(tmp_path):
-    program = (
-        "from gnio_jax.commands import console\n"
-        "def main():\n    import jax\n"
-        "    jax.config.update('jax_persistent_cache_min_compile_time_secs', 0)\n"
-        "    print(jax.config.jax_compilation_cache_dir, jax.jit(lambda x: x + 1)(1.0))\n"
-        "console.run(main)\n"
-    )
-    kept = {name: value for name, value in os.environ.items() if "CACHE" not in name}
-    given = {"capture_output": True, "text": True, "timeout": 60}
-    environment = {**kept, "XDG_CACHE_HOME": str(tmp_path)}
-    shown = subprocess.run([sys.executable, "-c", program], env=environment, **given)
-    place = tmp_path / "gnio-jax" / "compiled"
-    assert shown.stdout == f"{place} 2.0\n" and shown.stderr == ""
-    assert any(place.iterdir())
-
-
-def test_where_compiled_programs_are_kept(tmp_path, monkeypatch):
+def test_compiled_programs_are_kept(tmp_path, monkeypatch):
     """In the user's cache, or where the user says, and nowhere if that cannot be written: a file in
     its place, a folder into which nobody may write."""
     (tmp_path / "file" / "gnio-jax").mkdir(parents=True)
     (tmp_path / "file" / "gnio-jax" / "compiled").write_text("")
     below = Path("gnio-jax") / "compiled"
     for given, place in (
-        ({"XDG_CACHE_HOME": str(tmp_path)}, tmp_path / below),
         ({"HOME": str(tmp_path / "home")}, tmp_path / "home" / ".cache" / below),
         ({"XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": "own"}, "own"),
         ({"XDG_CACHE_HOME": str(tmp_path / "file")}, None),
@@ -130,3 +109,16 @@ def test_where_compiled_programs_are_kept(tmp_path, monkeypatch):
             console.keep_compiled_programs()
             found = os.environ.get("JAX_COMPILATION_CACHE_DIR")
         assert found == (None if place is None else str(place)), given
+    program = (
+        "from gnio_jax.commands import console\n"
+        "def main():\n    import jax\n"
+        "    jax.config.update('jax_persistent_cache_min_compile_time_secs', 0)\n"
+        "    print(jax.config.jax_compilation_cache_dir, jax.jit(lambda x: x + 1)(1.0))\n"
+        "console.run(main)\n"
+    )
+    kept = {name: value for name, value in os.environ.items() if "CACHE" not in name}
+    given = {"capture_output": True, "text": True, "timeout": 60}
+    environment = {**kept, "XDG_CACHE_HOME": str(tmp_path)}
+    shown = subprocess.run([sys.executable, "-c", program], env=environment, **given)
+    assert shown.stdout == f"{tmp_path / below} 2.0\n" and shown.stderr == ""
+    assert any((tmp_path / below).iterdir())

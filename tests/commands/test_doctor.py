@@ -29,34 +29,25 @@ def home(tmp_path, monkeypatch):
     return tmp_path
 
 
-def told(capsys, *arguments):
-    """What the command prints; it leaves without an error."""
-    run("doctor", *arguments)
-    return capsys.readouterr().out
-
-
-def test_what_is_found(home, capsys):
-    found = json.loads(told(capsys, "--json"))
+def test_what_is_found_fits_a_screen_and_says_what_is_wrong(home, capsys, monkeypatch):
+    run("doctor", "--json")
+    found = json.loads(capsys.readouterr().out)
     assert f"jax {jax.__version__}, " in found["packages"]
     assert "optax is not installed" in found["packages"]
     kind = jax.devices()[0].device_kind
     assert found["devices"] == f"{len(jax.devices())} × cpu {kind}" and found["float64"] == "works"
-    recordings = home / "recordings"
-    assert {name: place for name, place in found.items() if name.startswith("dataset")} == {
-        "dataset oxiod": str(recordings / "oxiod"),
-        "dataset tlio": str(recordings / "tlio_layout"),
-        "dataset randomised": "computed",
-        "dataset synthetic": "computed",
-    }
+    places = {name: place for name, place in found.items() if name.startswith("dataset")}
+    computed = dict.fromkeys(("dataset randomised", "dataset synthetic"), "computed")
+    there = {"dataset oxiod": "oxiod", "dataset tlio": "tlio_layout"}
+    there = {name: str(home / "recordings" / place) for name, place in there.items()}
+    assert places == computed | there
     assert found["recordings read"] == str(home / "kept") and "pedestrian" in found["weights"]
     assert found["newest run"].startswith("none: runs: holds no run; train one with gnio train")
-
-
-def test_it_fits_a_screen_and_says_what_is_wrong(home, capsys, monkeypatch):
     monkeypatch.setenv("GNIO_WEIGHTS", str(home / "nowhere"))
     (home / "runs" / "mine").mkdir(parents=True)
     (home / "runs" / "mine" / "config.yaml").write_text("")
-    text = told(capsys)
+    run("doctor")
+    text = capsys.readouterr().out
     assert len(text.splitlines()) <= 45 and "\x1b" not in text and "runs/mine" in text
     (line,) = [line for line in text.splitlines() if line.startswith("weights")]
     assert "$GNIO_WEIGHTS" in line and "is not a folder" in line

@@ -1,5 +1,4 @@
-"""Every layout that is read is found, checked and converted; what comes back is what its own loader
-gives, to the bit."""
+"""Every layout is found, checked and converted; what comes back is what was there, to the bit."""
 
 import json
 import warnings

@@ -43,24 +43,14 @@ def test_hdf5_that_is_cut_short_or_foreign_is_named(tmp_path):
         assert all(word in str(error.value) for word in words)
         assert "cut short" in words or "cut short" not in str(error.value)
 
-    for share in (0.9, 0.5, 0.01, 0.0):
-        path.write_bytes(whole[: int(len(whole) * share)])
+    for content in (whole[: len(whole) // 2], whole[:9], b"", b"time,gyro_x\n0,1\n"):
+        path.write_bytes(content)
         fails("cut short")
-    path.write_text("time,gyro_x\n0,1\n")
-    fails("cut short")
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["gyro"] = circle().gyro
-    for link in (h5py.ExternalLink("other.h5", "gyro"), h5py.SoftLink("/accel")):
-        path.write_bytes(whole)
-        with h5py.File(path, "a") as file:
-            del file["gyro"]
-            file["gyro"] = link
-        fails("field 'gyro' is a link")
     path.write_bytes(whole)
     with h5py.File(path, "a") as file:
         del file["gyro"]
-        file.create_dataset("gyro", (10**9, 3), "f8", chunks=(10**5, 3), compression="gzip")
-    fails("field 'gyro' would take 24000000000 bytes, which the file does not hold")
+        file["gyro"] = h5py.SoftLink("/accel")
+    fails("field 'gyro' is a link")
     with h5py.File(path, "w") as file:
         file["synced"] = 1.0
     fails("format")
@@ -71,24 +61,18 @@ def test_hdf5_that_is_cut_short_or_foreign_is_named(tmp_path):
 def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path, monkeypatch):
     path = tmp_path / "walk.h5"
     write_hdf5(path, circle())
+    for place, error, told, words in (
+        ("Sequence", TypeError("ours"), TypeError, "ours"),
+        ("hdf5_field", NameError("ours"), NameError, "ours"),
+        ("hdf5_field", MemoryError(), InputError, "does not fit into memory"),
+    ):
 
-    def raising(error):
-        def fails(*_, **__):
+        def fails(*_, error=error, **__):
             raise error
 
-        return fails
-
-    for error in (NameError("ours"), TypeError("ours"), AttributeError("ours")):
-        monkeypatch.setattr(hdf5, "Sequence", raising(error))
-        with pytest.raises(type(error), match="ours"):
+        with monkeypatch.context() as patch, pytest.raises(told, match=words):
+            patch.setattr(hdf5, place, fails)
             read_hdf5(path)
-    monkeypatch.undo()
-    monkeypatch.setattr(hdf5, "hdf5_field", raising(MemoryError()))
-    with pytest.raises(InputError, match="does not fit into memory"):
-        read_hdf5(path)
-    monkeypatch.setattr(hdf5, "hdf5_field", raising(NameError("ours")))
-    with pytest.raises(NameError):
-        read_hdf5(path)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):

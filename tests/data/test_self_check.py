@@ -27,16 +27,20 @@ def asking(**options):
     return dataclasses.replace(data.get("tlio"), **options)
 
 
-def test_self_check_of_a_consistent_walk():
-    check = self_check(circle())
-    assert check.failures == ()
-    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.05)
-    assert check.duration == pytest.approx(29.99)
-    assert check.rate == pytest.approx(100.0)
-    assert check.share_valid == 1.0
-    assert check.gyro_consistency_degrees < 1e-6
-    assert check.median_speed == pytest.approx(1.2, abs=0.1)
-    assert check.accel_correlation_horizontal > 0.999
+def test_self_check_of_a_consistent_walk_looks_at_valid_samples_only():
+    sequence, lost = circle(), slice(700, 760)
+    spoilt = changed(changed(sequence, "accel", lost, 90.0), "valid", lost, False)
+    for field in ("position", "velocity", "orientation"):
+        spoilt = changed(spoilt, field, lost, np.nan)
+    for each, share in ((sequence, 1.0), (spoilt, 0.98)):
+        check = self_check(each)
+        assert check.failures == ()
+        np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.05)
+        assert check.duration == pytest.approx(29.99) and check.rate == pytest.approx(100.0)
+        assert check.share_valid == pytest.approx(share)
+        assert check.gyro_consistency_degrees < 1e-6
+        assert check.median_speed == pytest.approx(1.2, abs=0.1)
+        assert check.accel_correlation_horizontal > 0.99
 
 
 def test_self_check_removes_one_constant_gyro_bias_and_judges_by_the_median_window():
@@ -45,6 +49,13 @@ def test_self_check_removes_one_constant_gyro_bias_and_judges_by_the_median_wind
     spoilt = changed(sequence, "gyro", slice(3000, 4000), [1.0, 0.5, 0.0])
     for each in (biased, spoilt):
         assert self_check(each).gyro_consistency_degrees < 0.1
+    # Half a radian about x in the second from 40 to 41 s, which the windows that begin at 35 and 40
+    # s see; one ends between two samples of which one is touched.
+    starts, degrees = gyro_windows(changed(sequence, "gyro", slice(4000, 4100), [0.5, 0.0, 0.4]))
+    np.testing.assert_allclose(starts, np.arange(0, 86, 5.0))
+    touched = np.isin(starts, [35.0, 40.0])
+    np.testing.assert_allclose(degrees[touched], np.degrees(0.5), atol=0.5)
+    assert degrees[~touched].max() < 0.2
     drifting = sequence._replace(gyro=sequence.gyro + 0.1 * np.sin(0.3 * sequence.time)[:, None])
     assert any("gyro" in failure for failure in self_check(drifting).failures)
 
@@ -53,19 +64,18 @@ def test_self_check_removes_one_constant_gyro_bias_and_judges_by_the_median_wind
     ("spoil", "reason"),
     [
         (lambda s: s._replace(accel=s.accel * 1.1), "mean of R·accel"),
-        (lambda s: s._replace(accel=s.accel[:, [1, 2, 0]]), "mean of R·accel"),
-        (lambda s: s._replace(accel=-s.accel), "mean of R·accel"),
         (lambda s: s._replace(gyro=s.gyro[:, [2, 0, 1]] * np.sin(s.time)[:, None]), "gyro"),
         (lambda s: s._replace(position=s.position * [-1, 1, 1]), "correlates"),
         (lambda s: s._replace(velocity=s.velocity * 4), "too fast for a pedestrian"),
         (lambda s: s._replace(valid=np.zeros_like(s.valid)), "no sample has a valid reference"),
         (lambda s: s._replace(valid=(np.arange(len(s.time)) % 700) < 100), "no window"),
     ],
-    ids=["scale", "axes", "sign", "gyro", "mirrored", "speed", "nothing-valid", "no-window"],
+    ids=["scale", "gyro", "mirrored", "speed", "nothing-valid", "no-window"],
 )
 def test_self_check_says_what_is_implausible(spoil, reason):
-    failures = self_check(spoil(circle())).failures
-    assert any(reason in failure for failure in failures)
+    spoilt = spoil(circle())._replace(attributes={"accel_clipped": 0.21})
+    (failure, *_) = (each for each in self_check(spoilt).failures if reason in each)
+    assert ("clips in 21% of the samples" in failure) == (reason == "mean of R·accel")
 
 
 @pytest.mark.parametrize(("turn", "passes"), [(0.1, False), (2.0, True)])
@@ -80,22 +90,11 @@ def test_a_gyro_may_be_off_by_a_percent_of_what_it_turns(turn, passes):
     assert (check.failures == ()) == passes and len(said) == (not passes)
 
 
-def test_a_clipped_accelerometer_is_named_as_the_reason():
-    sequence = circle()
-    sequence = sequence._replace(accel=0.9 * sequence.accel, attributes={"accel_clipped": 0.21})
-    (failure,) = self_check(sequence).failures
-    assert "mean of R·accel" in failure and "clips in 21% of the samples" in failure
-
-
 def test_self_check_spares_those_who_stand():
     sequence = circle()
-    still = sequence._replace(
-        gyro=0 * sequence.gyro,
-        accel=0 * sequence.accel + [0, 0, 9.81],
-        velocity=0 * sequence.velocity,
-        position=0 * sequence.position,
-        orientation=0 * sequence.orientation + [1, 0, 0, 0],
-    )
+    nothing, level = np.zeros_like(sequence.gyro), 0 * sequence.orientation + [1, 0, 0, 0]
+    still = sequence._replace(gyro=nothing, position=nothing, velocity=nothing, orientation=level)
+    still = still._replace(accel=np.tile([0, 0, 9.81], (len(nothing), 1)))
     assert self_check(still).failures == ()
     rng = np.random.default_rng(2)
     noisy = still._replace(
@@ -110,28 +109,16 @@ def test_self_check_spares_those_who_stand():
     assert any("correlates" in failure for failure in self_check(pinned).failures)
 
 
-def test_self_check_looks_at_valid_samples_only():
-    sequence = changed(circle(), "accel", slice(700, 760), 90.0)
-    for field in ("position", "velocity", "orientation"):
-        sequence = changed(sequence, field, slice(700, 760), np.nan)
-    check = self_check(changed(sequence, "valid", slice(700, 760), False))
-    assert check.failures == ()
-    assert check.share_valid == pytest.approx(0.98)
-    assert check.accel_correlation_horizontal > 0.99
-    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.05)
-
-
 def speeding(seconds=4.0, start=5.0, push=1.5):
     """Straight ahead, ever faster, as a car leaves a crossing."""
-    sequence = circle(seconds=seconds, turn=0.01)
-    time, zero = sequence.time, 0 * sequence.time
-    still = np.tile([1.0, 0, 0, 0], (len(time), 1))
+    sequence, ahead = circle(seconds=seconds, turn=0.01), np.array([1.0, 0.0, 0.0])
+    time = sequence.time[:, None]
     return sequence._replace(
-        orientation=still,
-        gyro=np.zeros((len(time), 3)),
-        accel=np.stack([zero + push, zero, zero + 9.81], axis=1),
-        velocity=np.stack([start + push * time, zero, zero], axis=1),
-        position=np.stack([start * time + push * time**2 / 2, zero, zero], axis=1),
+        orientation=0 * time + [1.0, 0, 0, 0],
+        gyro=0 * time * ahead,
+        accel=0 * time + [push, 0.0, 9.81],
+        velocity=(start + push * time) * ahead,
+        position=(start * time + push * time**2 / 2) * ahead,
     )
 
 
@@ -144,20 +131,17 @@ def test_who_ends_faster_than_he_began_is_not_tilted():
     check = self_check(tilted, pedestrian=False)
     np.testing.assert_allclose(check.gravity_mean, [1.5, 0, 9.81], atol=1e-9)
     assert "mean of R·accel is (1.50, 0.00, 9.81)" in check.failures[0]
-
-
-def test_the_gain_in_speed_is_that_of_the_valid_stretches():
-    sequence = speeding(seconds=12.0, push=0.5)
-    time = sequence.time
     # A stop and start in the middle that nobody has seen: speeds before and after say nothing of
     # each other.
-    velocity = np.where(time[:, None] >= 6.0, sequence.velocity - [4.0, 0, 0], sequence.velocity)
-    sequence = sequence._replace(velocity=velocity, valid=(time < 5.0) | (time >= 7.0))
-    check = self_check(sequence, pedestrian=False)
+    sequence = speeding(seconds=12.0, push=0.5)
+    late = sequence.time[:, None] >= 6.0
+    seen = (sequence.time < 5.0) | (sequence.time >= 7.0)
+    velocity = np.where(late, sequence.velocity - [4.0, 0, 0], sequence.velocity)
+    check = self_check(sequence._replace(velocity=velocity, valid=seen), pedestrian=False)
     np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=1e-9)
 
 
-@pytest.mark.parametrize(("seconds", "judged"), [(4.0, False), (19.9, False), (20.1, True)])
+@pytest.mark.parametrize(("seconds", "judged"), [(19.9, False), (20.1, True)])
 def test_one_window_says_nothing_of_the_gyro_since_a_bias_explains_it(seconds, judged):
     sequence = circle(seconds=seconds)
     wrong = sequence._replace(gyro=sequence.gyro[:, [1, 2, 0]] * np.sin(sequence.time)[:, None])
@@ -171,17 +155,6 @@ def test_one_window_says_nothing_of_the_gyro_since_a_bias_explains_it(seconds, j
         seen = (sequence.time >= 20.0) & (sequence.time < 31.0)
         check = self_check(sequence._replace(valid=seen))
         assert np.isnan(check.gyro_consistency_degrees) and check.failures == ()
-
-
-def test_windows_of_the_gyro_tell_when_it_is_off():
-    sequence = circle(seconds=100.0)
-    starts, degrees = gyro_windows(changed(sequence, "gyro", slice(4000, 4100), [0.5, 0.0, 0.4]))
-    np.testing.assert_allclose(starts, np.arange(0, 86, 5.0))
-    # Half a radian about x in the second from 40 to 41 s, which the windows that begin at 35 and 40
-    # s see.
-    touched = np.isin(starts, [35.0, 40.0])
-    np.testing.assert_allclose(degrees[touched], np.degrees(0.5), atol=0.5)
-    assert degrees[~touched].max() < 0.2  # one ends between two samples of which one is touched
 
 
 def test_what_is_implausible_is_left_out_and_named_unless_the_dataset_does_not_ask():

@@ -12,7 +12,6 @@ GOOD = circle(seconds=2.0)
 BAD = [
     (GOOD._replace(gyro=GOOD.gyro[:-1]), "'gyro'", "shape"),
     (GOOD._replace(velocity=GOOD.velocity[:, :2]), "'velocity'", "shape"),
-    (GOOD._replace(device_orientation=GOOD.orientation[1:]), "'device_orientation'", "shape"),
     (GOOD._replace(time=GOOD.time[:1]), "'time'", "two stamps"),
     (GOOD._replace(valid=GOOD.valid.astype(float)), "'valid'", "booleans"),
     (GOOD._replace(imu_valid=GOOD.valid[1:]), "'imu_valid'", "booleans"),
@@ -25,10 +24,8 @@ BAD = [
     (GOOD._replace(accel=GOOD.accel * 1e3), "'accel'", "not in m/s²"),
     (GOOD._replace(gyro=GOOD.gyro * 180 / np.pi), "'gyro'", "looks like deg/s"),
     (changed(GOOD, "orientation", 5, [0.9, 0, 0, 0]), "'orientation'", "row 6"),
-    (changed(GOOD, "orientation", 5, 0.0), "'orientation'", "row 6"),
     (changed(GOOD, "orientation", 5, np.nan), "'orientation'", "row 6"),
     (changed(GOOD, "position", 5, np.nan), "'position'", "mark these rows invalid"),
-    (changed(GOOD, "velocity", 5, np.inf), "'velocity'", "row 6"),
     (changed(GOOD, "velocity", 5, 400.0), "'velocity'", "in 1 rows, first 0.050 s after"),
     (changed(GOOD, "position", 5, 1e9), "'position'", "in 1 rows, first 0.050 s after"),
     (changed(GOOD, "position", 5, 12.0), "'position'", "jumps in 2 rows, first 0.050 s after"),
@@ -52,15 +49,12 @@ def test_validate_names_file_field_and_problem_in_one_line(sequence, field, prob
     assert text.startswith("walk.csv: ") and field in text and problem in text and "\n" not in text
 
 
-def test_validate_lets_the_reference_be_missing_where_it_is_marked_invalid():
-    sequence = GOOD
+def test_validate_lets_the_reference_be_missing_and_normalizes_rounded_quaternions():
+    """Exact ones are kept bit for bit. What is missing is marked invalid."""
+    sequence = changed(GOOD, "valid", 5, False)
     for field in ("position", "velocity", "orientation"):
         sequence = changed(sequence, field, 5, np.nan)
-    sequence = changed(sequence, "valid", 5, False)
     assert validate(sequence, "walk.csv").valid.sum() == len(GOOD.time) - 1
-
-
-def test_validate_normalizes_rounded_quaternions_and_keeps_exact_ones_bit_for_bit():
     assert validate(GOOD, "walk.csv").orientation is GOOD.orientation
     rounded = validate(GOOD._replace(orientation=np.round(GOOD.orientation, 4)), "walk.csv")
     np.testing.assert_allclose(np.linalg.norm(rounded.orientation, axis=1), 1.0, atol=1e-14)

@@ -1,15 +1,11 @@
 """Waypoints turned into poses: against computed walks whose truth is known, and taps that err."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from gnio_jax.config import DataConfig, TrainConfig
 from gnio_jax.data import loading
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.data.pictures import overview
-from gnio_jax.data.self_check import self_check
 from gnio_jax.data.waypoints import levelled, with_poses
 from gnio_jax.data.windows import window_source
 from gnio_jax.numerics import rotations
@@ -31,7 +27,7 @@ def off_truth(found, truth):
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_taps_give_the_attitude_and_the_path(seed):
     walk = survey(seed)
     found = with_poses(walk.tapped(np.zeros(9)))
@@ -52,6 +48,18 @@ def test_taps_give_the_attitude_and_the_path(seed):
     assert np.sqrt((place**2).mean()) < 1.1 and np.sqrt((speed**2).mean()) < 0.6
 
 
+def test_waypoints_that_nobody_walks_between_are_not_valid():
+    """A tap that follows another after 0.2 s, 40 m away and back."""
+    walk = survey(7)
+    tapped = walk.tapped(np.zeros(9))
+    time, place = tapped.waypoints
+    time, place = np.insert(time, 4, time[4] - 0.2), np.insert(place, 4, place[4] + 40.0, axis=0)
+    found = with_poses(tapped._replace(waypoints=Waypoints(time, place)))
+    assert not found.valid[(found.time > time[3] + 0.05) & (found.time < time[5] - 0.05)].any()
+    _, place, speed = off_truth(found, walk.truth)
+    assert place.max() < 2.0 and speed.max() < 2.0
+
+
 def test_gravity_levels_a_gyro_that_drifts():
     truth = survey(5).truth
     biased = truth.gyro + np.array([0.01, -0.008, 0.0])  # 20° over the walk
@@ -62,41 +70,23 @@ def test_gravity_levels_a_gyro_that_drifts():
 
 
 def test_a_tap_again_where_the_surveyor_stands_is_no_leg():
+    """Nor has a sample a pose that was not measured."""
     walk = survey(6, pause=6.0)
+    lost = (walk.truth.time > 5.0) & (walk.truth.time < 5.5)
     ends = np.sort(np.concatenate([walk.ends, walk.ends[[3, 6]] - 6.0]))
     tapped = walk._replace(ends=ends).tapped(np.zeros(11))
-    found = with_poses(tapped)
+    found = with_poses(tapped._replace(imu_valid=~lost))
+    assert not found.valid[lost].any()
     standing = (found.time > ends[3] + 0.05) & (found.time < ends[4] - 0.05)
     assert standing.any() and not found.valid[standing].any()
     angle, place, _ = off_truth(found, walk.truth)
     assert np.median(angle) < 9.0 and place.max() < 2.0
 
 
-def test_waypoints_that_nobody_walks_between_are_not_valid():
-    walk = survey(7)
-    tapped = walk.tapped(np.zeros(9))
-    time, place = tapped.waypoints
-    # A tap that follows another after 0.2 s, 40 m away and back.
-    time, place = np.insert(time, 4, time[4] - 0.2), np.insert(place, 4, place[4] + 40.0, axis=0)
-    found = with_poses(tapped._replace(waypoints=Waypoints(time, place)))
-    near = (found.time > time[3] + 0.05) & (found.time < time[5] - 0.05)
-    assert not found.valid[near].any()
-    _, place, speed = off_truth(found, walk.truth)
-    assert place.max() < 2.0 and speed.max() < 2.0
-
-
-def test_samples_that_were_not_measured_have_no_pose():
-    walk = survey(1)
-    lost = (walk.truth.time > 5.0) & (walk.truth.time < 5.5)
-    found = with_poses(walk.tapped(np.zeros(9))._replace(imu_valid=~lost))
-    assert not found.valid[lost].any() and found.valid.sum() > 0.8 * len(found.valid)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda place: place[:, ::-1], "y axis is .*° off the median leg"),
-        (lambda place: place * 0.0, "walked 0 of its 8 legs"),
         (lambda place: place * 10.0, "walked 0 of its 8 legs"),
     ],
 )
@@ -105,16 +95,6 @@ def test_a_walk_whose_legs_do_not_fit_the_phone_is_refused(change, words):
     waypoints = tapped.waypoints._replace(position=change(tapped.waypoints.position))
     with pytest.raises(Refusal, match=f"^survey 2: .*{words}"):
         with_poses(tapped._replace(waypoints=waypoints))
-
-
-def test_a_picture_shows_the_waypoints_and_the_way_between_them():
-    tapped = survey(0).tapped(np.zeros(9))
-    plan, speed, *_ = overview(tapped, self_check(tapped)).axes
-    drawn = {line.get_label(): np.array(line.get_data()) for line in plan.lines}
-    np.testing.assert_array_equal(drawn["waypoint"].T, tapped.waypoints.position)
-    (way,) = (values for label, values in drawn.items() if label.startswith("_"))
-    assert np.isfinite(way).all(axis=0).mean() > 0.95
-    assert np.nanmedian(speed.lines[0].get_ydata()) > 0.8
 
 
 def test_training_cuts_windows_from_such_walks_and_leaves_out_the_others(monkeypatch, capsys):

@@ -5,7 +5,6 @@ import re
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -30,32 +29,6 @@ def loaded():
     return interop.load_tlio_state_dict(WEIGHTS)
 
 
-def test_every_array_has_its_place(loaded):
-    """Each array by its name in both worlds, spelled out; that the names mean the same the recorded
-    outputs show elsewhere."""
-    params, statistics = loaded["params"], loaded["batch_stats"]
-    stem = WEIGHTS["input_block.0.weight"]
-    for ours, theirs in enumerate([3, 4, 5, 0, 1, 2]):  # accel first, then gyro
-        found = params["encoder"]["stem_conv"]["kernel"][:, ours]
-        np.testing.assert_array_equal(found, stem[:, theirs].T)
-    encoder = params["encoder"]
-    for found, name in (
-        (
-            encoder["group3_block1"]["shortcut_conv"]["kernel"][0].T,
-            "residual_groups.2.0.downsample.0.weight",
-        ),
-        (
-            statistics["encoder"]["group4_block2"]["bn2"]["var"],
-            "residual_groups.3.1.bn2.running_var",
-        ),
-        (params["displacement"]["fc1"]["kernel"].T, "output_block1.fc1.weight"),
-        (params["log_std"]["neck_bn"]["scale"], "output_block2.bn1.weight"),
-    ):
-        np.testing.assert_array_equal(found, np.squeeze(WEIGHTS[name]))
-    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == 5_424_646
-    assert {leaf.dtype for leaf in jax.tree.leaves(loaded)} == {jnp.dtype("float32")}
-
-
 def test_an_npz_holds_the_same(tmp_path, loaded):
     doubled = {
         f"module.{key}": value.astype(np.float64) if value.shape else value
@@ -66,16 +39,13 @@ def test_an_npz_holds_the_same(tmp_path, loaded):
     equal(interop.load_tlio_state_dict({"model_state_dict": WEIGHTS, "epoch": 3}), loaded)
 
 
-# --- PyTorch
-
-
 def tensors():
     """PyTorch, and the weights as a network of it gives them."""
     torch = pytest.importorskip("torch")
     return torch, {key: torch.from_numpy(np.array(value)) for key, value in WEIGHTS.items()}
 
 
-@pytest.mark.parametrize("form", ["checkpoint", "bare", "old format", "parallel", "half precision"])
+@pytest.mark.parametrize("form", ["checkpoint", "old format", "parallel", "half precision"])
 def test_a_checkpoint_of_pytorch(tmp_path, loaded, form):
     torch, state = tensors()
     if form == "checkpoint":
@@ -116,23 +86,18 @@ class Stranger:
     """Something that only a pickle can hold."""
 
 
-def test_a_checkpoint_with_more_than_tensors_is_not_run(tmp_path):
+def test_a_checkpoint_with_more_than_tensors_is_not_run(tmp_path, monkeypatch):
+    """Without PyTorch it says how to get it."""
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "torch", None)
+        (tmp_path / "a.pth").write_bytes(b"weights")
+        with pytest.raises(InputError, match=r"a\.pth: needs the package torch; pip install"):
+            interop.load_tlio_state_dict(tmp_path / "a.pth")
     torch = pytest.importorskip("torch")
     torch.save({"model_state_dict": {}, "args": Stranger()}, tmp_path / "checkpoint.pt")
     problem = r"checkpoint\.pt: cannot be read .*tensors and plain values only"
     with pytest.raises(InputError, match=problem):
         interop.load_tlio_state_dict(tmp_path / "checkpoint.pt")
-
-
-def test_without_pytorch_it_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    (tmp_path / "a.pth").write_bytes(b"weights")
-    remedy = r"pip install 'gnio-jax\[torch\]'$"
-    with pytest.raises(InputError, match=rf"a\.pth: needs the package torch; {remedy}"):
-        interop.load_tlio_state_dict(tmp_path / "a.pth")
-
-
-# --- Mistakes
 
 
 def changed(**parts):
@@ -150,25 +115,15 @@ NOT_FINITE = "'output_block1.fc3.bias' holds values that are not finite numb"
     [
         ({}, "'output_block1.fc1.weight' is missing"),
         ({"model_state_dict": 3}, "its model_state_dict is not a mapping"),
-        (
-            changed(residual_groups__1__0__bn1__bias=None),
-            "'residual_groups.1.0.bn1.bias' is missing;",
-        ),
-        (changed(output_block3__fc1=ZEROS(3)), "'output_block3.fc1' is unexpected;"),
         (changed(yyy=ZEROS(3), zzz=ZEROS(3)), "'yyy' is unexpected (and 1 more);"),
         (
             changed(input_block__0__weight=ZEROS((64, 9, 7))),
             "'input_block.0.weight' must have shape (64, 6, 7), found (64, 9, 7);",
         ),
         (
-            changed(output_block2__fc1__weight=ZEROS((512, 512))),
-            "'output_block2.fc1.weight' must have shape (512, 896), found (512, 512);",
-        ),
-        (
             changed(output_block1__fc1__weight=ZEROS((512, 900))),
             "'output_block1.fc1.weight' must have shape (512, 128·⌈N/32⌉) for windows of N samples",
         ),
-        (changed(output_block1__fc3__bias=np.full(3, np.nan, np.float32)), NOT_FINITE),
         (changed(output_block1__fc3__bias=np.array(["a"] * 3)), NOT_FINITE),
     ],
 )
@@ -178,22 +133,16 @@ def test_weights_that_do_not_fit(given, problem):
 
 
 def test_files_that_are_none(tmp_path):
-    with pytest.raises(InputError, match=r"none\.npz: no such file; give"):
-        interop.load_tlio_state_dict(tmp_path / "none.npz")
     (tmp_path / "damaged.npz").write_bytes(b"PK\x03\x04 and no more")
     np.savez(tmp_path / "objects.npz", **{"output_block1.fc1.weight": np.array([{}], object)})
-    np.savez(tmp_path / "other.npz", weights=np.zeros(3))
     for name, problem in [
+        ("none", "no such file; give"),
         ("damaged", "cannot be read"),
         ("objects", "cannot be read"),
-        ("other", "'output_block1.fc1.weight' is missing"),
     ]:
         with pytest.raises(InputError, match=f"{name}.npz: {problem}") as told:
             interop.load_tlio_state_dict(tmp_path / f"{name}.npz")
         assert "\n" not in str(told.value)
-
-
-# --- The command line
 
 
 @pytest.fixture(scope="module")
@@ -219,10 +168,15 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     assert filter_setup(run.config.data, run.config.filter).config.window_rotation == "tlio"
     assert filter_setup(run.config.data, FilterSettings()).config.window_rotation == "per_sample"
     equal(run.variables, loaded)
-    with pytest.raises(SystemExit) as left:  # a second time
-        command(monkeypatch, file, tmp_path / "run")
-    assert left.value.code == 2
-    assert capsys.readouterr().err == f"{tmp_path / 'run'}: is there already; name another folder\n"
+    for name, options, problem in (
+        ("run", (), f"{tmp_path / 'run'}: is there already; name another folder"),
+        ("new", ("--rate", "100"), "is for windows of 193 to 224 samples, not 100; give"),
+        ("new", ("--stride-seconds", "0.3"), "data.stride_seconds"),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            command(monkeypatch, file, tmp_path / name, *options)
+        told = capsys.readouterr().err
+        assert problem in told and told.count("\n") == 1 and not (tmp_path / "new").exists()
 
 
 def test_a_run_appears_whole_or_not_at_all(file, tmp_path, monkeypatch):
@@ -235,21 +189,3 @@ def test_a_run_appears_whole_or_not_at_all(file, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space"):
         interop.write_run(file, tmp_path / "run", DataConfig())
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    "options, problem",
-    [
-        (["--rate", "100"], "is for windows of 193 to 224 samples, not 100; give the --rate and"),
-        (["--stride-seconds", "0.3"], "data.stride_seconds"),
-        (["--rates", "100"], "rate"),
-    ],
-)
-def test_options_that_do_not_fit_leave_nothing_behind(
-    file, tmp_path, monkeypatch, capsys, options, problem
-):
-    with pytest.raises(SystemExit) as left:
-        command(monkeypatch, file, tmp_path / "run", *options)
-    told = capsys.readouterr().err
-    assert left.value.code == 2 and problem in told and told.count("\n") == 1
-    assert not (tmp_path / "run").exists()

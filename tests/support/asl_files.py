@@ -5,9 +5,6 @@ files.
 point of the same body.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,20 +13,12 @@ from scipy.spatial.transform import Rotation
 from tests.support import known_walk
 
 EPOCH = 1_520_530_308_181_901_469
-
-
-def _names(*blocks: tuple[str, str, str]) -> list[str]:
-    return [f" {name}_{axis} [{unit}]" for name, axes, unit in blocks for axis in axes]
-
-
-IMU_HEADER = [
-    "#timestamp [ns]",
-    *_names(("w_RS_S", "xyz", "rad s^-1"), ("a_RS_S", "xyz", "m s^-2")),
-]
-IMU_HEADER = [name.strip() for name in IMU_HEADER]
-POSE_HEADER = ["#timestamp", *_names(("p_RS_R", "xyz", "m"), ("q_RS", "wxyz", ""))]
-LONG_HEADER = [*POSE_HEADER, *_names(("v_RS_R", "xyz", "m s^-1"), ("b_w_RS_S", "xyz", "rad s^-1"))]
-LONG_HEADER += _names(("b_a_RS_S", "xyz", "m s^-2"))
+IMU_HEADER = ["#timestamp [ns]", *(f"w_RS_S_{axis} [rad s^-1]" for axis in "xyz")]
+IMU_HEADER += [f"a_RS_S_{axis} [m s^-2]" for axis in "xyz"]
+POSE_HEADER = ["#timestamp", *(f" p_RS_R_{axis} [m]" for axis in "xyz")]
+POSE_HEADER += [f" q_RS_{axis} []" for axis in "wxyz"]
+MORE = ("v_RS_R", "m s^-1"), ("b_w_RS_S", "rad s^-1"), ("b_a_RS_S", "m s^-2")
+LONG_HEADER = [*POSE_HEADER, *(f" {name}_{axis} [{unit}]" for name, unit in MORE for axis in "xyz")]
 SHORT_HEADER = "#time(ns) px py pz qw qx qy qz vx vy vz bwx bwy bwz bax bay baz".split()
 
 
@@ -40,19 +29,11 @@ class Mount(NamedTuple):
     translation: np.ndarray = np.zeros(3)
 
 
-def mount(axes: str, degrees: list[float], translation: list[float]) -> Mount:
+def mount(axes, degrees, translation):
     return Mount(Rotation.from_euler(axes, degrees, degrees=True), np.array(translation))
 
 
-def write_table(
-    path: Path,
-    header: list[str],
-    time: np.ndarray,
-    values: np.ndarray,
-    style: str = "%.9f",
-    shuffle: bool = False,
-    spoil=None,
-) -> None:
+def write_table(path, header, time, values, style="%.9f", shuffle=False, spoil=None):
     """`spoil(stamps, values) -> (stamps, values)` may damage the rows."""
     stamps = EPOCH + np.round(time * 1e9).astype(np.int64)
     if spoil:
@@ -69,29 +50,22 @@ def write_table(
     path.write_text("\n".join(text) + "\n")
 
 
-def write_yaml(path: Path, mount: Mount, opencv: bool = False) -> None:
+def write_yaml(path, mount, opencv=False):
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = mount.rotation.as_matrix(), mount.translation
-    data = ", ".join(repr(float(value)) for value in matrix.ravel())
     head = "%YAML:1.0\n---\n" if opencv else "#Default imu sensor yaml file\n"
     tag = " !!opencv-matrix" if opencv else ""
-    path.write_text(
-        f"{head}sensor_type: imu\ncomment: VI-Sensor IMU\n\n"
-        f"T_BS:{tag}\n  cols: 4\n  rows: 4\n  data: [{data}]\nrate_hz: 200\n"
-    )
+    about = f"sensor_type: imu\n\nT_BS:{tag}\n  cols: 4\n  rows: 4\n"
+    path.write_text(f"{head}{about}  data: {matrix.ravel().tolist()}\nrate_hz: 200\n")
 
 
-def write_imu(
-    mav: Path, seconds: float = 12.0, step: float = 0.005, bias: float = 0.0, shuffle: bool = False
-) -> None:
+def write_imu(mav, seconds=12.0, step=0.005, bias=0.0, shuffle=False):
     time = np.arange(round(seconds / step)) * step
     values = np.concatenate([known_walk.rate(time) + bias, known_walk.force(time)], axis=1)
     write_table(mav / "imu0" / "data.csv", IMU_HEADER, time, values, shuffle=shuffle)
 
 
-def poses(
-    time: np.ndarray, mount: Mount, imu_mount: Mount
-) -> tuple[np.ndarray, Rotation, np.ndarray]:
+def poses(time, mount, imu_mount):
     """(position, attitude, velocity) of the reference's sensor: world ← IMU ← body ← sensor."""
     attitude = known_walk.attitude(time)
     turn = imu_mount.rotation.inv() * mount.rotation
@@ -102,37 +76,20 @@ def poses(
 
 
 def write_estimate(
-    mav: Path,
-    first: float = 1.0,
-    last: float = 11.0,
-    step: float = 0.005,
-    header: list[str] = LONG_HEADER,
-    mount: Mount | None = None,
-    imu_mount: Mount | None = None,
-    spoil=None,
-    shuffle: bool = False,
-) -> None:
-    """state_groundtruth_estimate0, at stamps of its own."""
+    mav, first=1.0, last=11.0, step=0.005, header=LONG_HEADER, mount=None, imu_mount=None, **options
+):
+    """state_groundtruth_estimate0, at stamps of its own; `options` as of `write_table`."""
     time = np.arange(first + 0.0013, last, step)
     place, attitude, speed = poses(time, mount or Mount(), imu_mount or Mount())
     biases = np.full((len(time), 6), 0.07)
     values = np.concatenate([place, attitude.as_quat(scalar_first=True), speed, biases], axis=1)
     folder = mav / "state_groundtruth_estimate0"
-    write_table(folder / "data.csv", header, time, values, shuffle=shuffle, spoil=spoil)
+    write_table(folder / "data.csv", header, time, values, **options)
     if mount is not None:
         write_yaml(folder / "sensor.yaml", mount)
 
 
-def write_mocap(
-    mav: Path,
-    first: float = 1.0,
-    last: float = 11.0,
-    gaps: tuple[tuple[float, float], ...] = (),
-    noise: float = 0.0,
-    flips: tuple[float, ...] = (),
-    mount: Mount | None = None,
-    spoil=None,
-) -> None:
+def write_mocap(mav, first=1.0, last=11.0, gaps=(), noise=0.0, flips=(), mount=None, spoil=None):
     """mocap0 at 120 Hz: nothing within `gaps` (s), flips of single poses; `noise` 1 is 0.1° and 0.4
     mm."""
     random = np.random.default_rng(11)

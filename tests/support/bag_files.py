@@ -3,8 +3,6 @@
 `write(path, kind, topics)` takes rows (topic, type, ns, message); the makers below give them.
 """
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 
@@ -46,32 +44,24 @@ class Maker:
     def vector(self, values, name="Vector3"):
         return self.new(f"geometry_msgs/msg/{name}", *map(float, values))
 
-    def quaternion(self, rotation):
-        return self.new("geometry_msgs/msg/Quaternion", *rotation.as_quat().tolist())
-
     def pose(self, time, mount):
         """Of the body on which the IMU sits at `mount` (rotation, lever)."""
         quaternion, place = _body(time, tuple(mount[0].as_quat()), tuple(mount[1]))
         turn = self.new("geometry_msgs/msg/Quaternion", *quaternion)
         return self.new("geometry_msgs/msg/Pose", self.vector(place, "Point"), turn)
 
-    def transform(self, time, mount, frame, child):
-        pose = self.pose(time, mount)
-        moved = self.new(
-            "geometry_msgs/msg/Transform",
-            self.vector([pose.position.x, pose.position.y, pose.position.z]),
-            pose.orientation,
-        )
-        return self.joined(self.header(time, frame), child, moved)
-
-    def joined(self, header, child, moved):
+    def joined(self, header, child, place, turn):
+        moved = self.new("geometry_msgs/msg/Transform", self.vector(place), turn)
         return self.new("geometry_msgs/msg/TransformStamped", header, child, moved)
 
+    def transform(self, time, mount, frame, child):
+        pose = self.pose(time, mount)
+        place = [pose.position.x, pose.position.y, pose.position.z]
+        return self.joined(self.header(time, frame), child, place, pose.orientation)
+
     def static(self, parent, child, rotation, lever):
-        moved = self.new(
-            "geometry_msgs/msg/Transform", self.vector(lever), self.quaternion(rotation)
-        )
-        one = self.joined(self.header(0.0, parent), child, moved)
+        turn = self.new("geometry_msgs/msg/Quaternion", *rotation.as_quat().tolist())
+        one = self.joined(self.header(0.0, parent), child, lever, turn)
         return self.new("tf2_msgs/msg/TFMessage", [one])
 
 

@@ -1,9 +1,5 @@
 """Files in Blackbird's layout."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import h5py
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,9 +11,7 @@ START = 1_525_745_865.0016553
 FLIP = np.diag([1.0, -1.0, -1.0])  # forward-left-up to forward-right-down, and z-up to z-down
 
 
-def write(
-    folder: Path, down: bool = False, text: int = 11, spoil=None, seconds: float = 12.0
-) -> Path:
+def write(folder, down=False, text=11, spoil=None, seconds=12.0):
     """One flight: body front-right-down, world z-up or z-down; the text beside it has `text`
     columns (0: none)."""
     time = np.arange(round(seconds * 100)) / 100
@@ -30,8 +24,7 @@ def write(
     bias = np.array([0.01, -0.02, 0.005])
     fields = {"ts": START + time, "gyro_calib": gyro, "accel_calib": accel, "traj_target": pose}
     fields |= {"gyro_raw": gyro + bias, "accel_raw": accel + bias, "thrust": 0 * gyro}
-    fields |= {"gyro_bias": bias, "accel_bias": bias, "i_thrust": 0 * gyro}
-    fields["traj_target_oris_from_imu"] = np.ones((1, 10))
+    fields |= {"gyro_bias": bias, "accel_bias": bias}
     if spoil:
         spoil(fields)
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,5 @@
 """Recordings as CSV."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tests.support import known_walk

@@ -3,8 +3,6 @@
 What must hold is stated in `check_sequence` and `check_refusal`, without the package's help.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import re
@@ -12,7 +10,6 @@ import signal
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -20,15 +17,14 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.errors import InputError
-from gnio_jax.types import Sequence
-from tests.support.damage import PLACES, Damage, after
+from tests.support.damage import PLACES, after
 from tests.support.layouts import LAYOUTS
 
 SECONDS_PER_EXAMPLE = 20
 
 
 @functools.cache
-def written(name: str) -> dict[str, bytes]:
+def written(name):
     """The files of a layout's undamaged recording, by their paths."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
@@ -37,28 +33,21 @@ def written(name: str) -> dict[str, bytes]:
         return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
 
-def write_damaged(name: str, root: Path, happened: list[Damage]) -> None:
+def write_damaged(name, root, happened):
     contents = dict(written(name))
     for damage in happened:
         if damage.what not in PLACES:
             contents[damage.file] = after(contents[damage.file], damage)
     places = {damage.file: damage.what for damage in happened if damage.what in PLACES}
     for file, content in contents.items():
-        path = root / file
+        path, place = root / file, places.get(file)
         path.parent.mkdir(parents=True, exist_ok=True)
-        match places.get(file):
-            case "delete":
-                pass
-            case "rename":
-                path.with_name("old_" + path.name).write_bytes(content)
-            case "folder":
-                path.mkdir()
-            case "dangling link":
-                path.symlink_to("nowhere")
-            case "looping link":
-                path.symlink_to(path.name)
-            case _:
-                path.write_bytes(content)
+        if place == "folder":
+            path.mkdir()
+        elif place in ("dangling link", "looping link"):
+            path.symlink_to("nowhere" if place == "dangling link" else path.name)
+        elif place != "delete":
+            path.with_name("old_" * (place == "rename") + path.name).write_bytes(content)
 
 
 class TooLong(BaseException):
@@ -66,8 +55,8 @@ class TooLong(BaseException):
 
 
 @contextlib.contextmanager
-def at_most(seconds: int) -> Iterator[None]:
-    def stop(*_: object) -> None:
+def at_most(seconds):
+    def stop(*_):
         raise TooLong(f"no end after {seconds} s")
 
     # By the processor's time: a busy machine is no fault of the loader.
@@ -84,7 +73,7 @@ IMPOSSIBLE = (LookupError, RuntimeError, ValueError, TypeError, OSError, EOFErro
 """What two damages raise that do not go together."""
 
 
-def outcome(name: str, happened: list[Damage]) -> tuple[list[Sequence] | InputError, str]:
+def outcome(name, happened):
     """(sequences or the refusal, everything that was said) of a load after the damage."""
     layout = LAYOUTS[name]
     with (
@@ -100,7 +89,6 @@ def outcome(name: str, happened: list[Damage]) -> tuple[list[Sequence] | InputEr
             write_damaged(name, root, happened)
         except (*IMPOSSIBLE, zipfile.BadZipFile):
             return [], "two damages that do not go together"
-        result: list[Sequence] | InputError
         try:
             with at_most(SECONDS_PER_EXAMPLE):
                 result = data.load(layout.dataset, root, layout.split)
@@ -114,16 +102,11 @@ def outcome(name: str, happened: list[Damage]) -> tuple[list[Sequence] | InputEr
         return result, "\n".join(said).replace(str(root), "ROOT")
 
 
-# --- what must hold
-
-
-def check_sequence(sequence: Sequence, name: str) -> None:
+def check_sequence(sequence, name):
     dataset, count, valid = data.get(LAYOUTS[name].dataset), len(sequence.time), sequence.valid
-    assert count >= 2
+    assert count >= 2 and valid.shape == (count,) and valid.dtype == np.bool_
     for values in (sequence.gyro, sequence.accel, sequence.position, sequence.velocity):
         assert values.shape == (count, 3)
-    assert sequence.orientation.shape == (count, 4)
-    assert valid.shape == (count,) and valid.dtype == np.bool_
     for values in (sequence.time, sequence.gyro, sequence.accel):
         assert values.dtype == np.float64 and np.isfinite(values).all()
     steps = np.diff(sequence.time)
@@ -136,11 +119,13 @@ def check_sequence(sequence: Sequence, name: str) -> None:
     assert sequence.time[-1] - sequence.time[0] < 2.5 * LAYOUTS[name].shortest
     assert np.abs(sequence.gyro).max() < 110.0 and np.abs(sequence.accel).max() < 1100.0
     assert 5.0 < np.median(np.linalg.norm(sequence.accel, axis=1)) < 50.0
-    np.testing.assert_allclose(np.linalg.norm(sequence.orientation[valid], axis=1), 1.0, atol=1e-9)
-    if sequence.device_orientation is not None:
-        assert sequence.device_orientation.shape == (count, 4)
-        norm = np.linalg.norm(sequence.device_orientation, axis=1)
-        np.testing.assert_allclose(norm[np.isfinite(norm)], 1.0, atol=1e-9)
+    for attitude in (sequence.orientation[valid], sequence.device_orientation):
+        if attitude is not None:
+            assert attitude.shape[1] == 4
+            norm = np.linalg.norm(attitude, axis=1)
+            there = np.isfinite(norm)
+            np.testing.assert_allclose(norm[there], 1.0, atol=1e-9)
+            assert there.all() or attitude is sequence.device_orientation
     position, velocity = sequence.position[valid], sequence.velocity[valid]
     assert np.isfinite(position).all() and np.isfinite(velocity).all()
     assert np.abs(velocity).max(initial=0.0) < 330.0
@@ -150,7 +135,7 @@ def check_sequence(sequence: Sequence, name: str) -> None:
     assert all(isinstance(each, str | float | int | bool) for each in sequence.attributes.values())
 
 
-def check_refusal(said: str, name: str, happened: list[Damage]) -> None:
+def check_refusal(said, happened):
     """What was said names a damaged file; or, where files are gone, the root; or the recording,
     which only the self-check refuses."""
     gone = any(damage.what in PLACES for damage in happened) and "ROOT" in said
@@ -164,10 +149,10 @@ def check_refusal(said: str, name: str, happened: list[Damage]) -> None:
         assert re.search(r"(field|column)s? '", said) or whole, f"names no field: {said}"
 
 
-def check(name: str, happened: list[Damage]) -> tuple[list[Sequence] | InputError, str]:
+def check(name, happened):
     result, said = outcome(name, happened)
     if isinstance(result, InputError):
-        check_refusal(said, name, happened)
+        check_refusal(said, happened)
     else:
         for sequence in result:
             check_sequence(sequence, name)

@@ -1,7 +1,5 @@
 """Files in IDOL's layout."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

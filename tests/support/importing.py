@@ -11,12 +11,12 @@ from tests.support import known_walk
 
 
 def import_recording(path, columns=None, rate=None, name=None, **stated):
-    """`columns`: from our names to the file's; `stated`: the other fields of `ImportOptions`."""
+    """(sequence, notes). `columns`: from our names to the file's; `stated`: the other fields of
+    `ImportOptions`."""
     return imported(path, columns, rate, name, **stated)[:2]
 
 
 def imported(path, columns=None, rate=None, name=None, **stated):
-    """With its warnings."""
     words = tuple(f"{ours}={theirs}" for ours, theirs in (columns or {}).items())
     options = ImportOptions(columns=words, **stated)
     return importing.import_recording(path, options, rate=rate, name=name)

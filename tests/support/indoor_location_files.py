@@ -1,7 +1,5 @@
 """Files in the layout of the Indoor Location Competition: the known walk at 50 Hz, with taps."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

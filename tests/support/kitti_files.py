@@ -5,10 +5,6 @@ The earth is the sphere of KITTI's own projection; a few metres from the origin 
 arcs on it to a micrometre, whatever the projection.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 from tests.support import known_walk
@@ -18,7 +14,7 @@ HOME = (49.015, 8.434, 116.4)
 START = np.datetime64("2011-09-26T13:02:25.594360375", "ns")
 
 
-def packets(time: np.ndarray) -> np.ndarray:
+def packets(time):
     """(n, 30) values of the packets at times (s)."""
     place = known_walk.position(time)
     latitude = HOME[0] + np.degrees(place[:, 1] / RADIUS)
@@ -35,30 +31,27 @@ def packets(time: np.ndarray) -> np.ndarray:
     return np.stack([*rows, *known_walk.rate(time).T, *level, *accuracy], axis=1)
 
 
-def stamp(seconds: float) -> str:
+def stamp(seconds):
     return str(START + np.timedelta64(round(seconds * 1e9), "ns")).replace("T", " ")
 
 
-def write_rows(oxts: Path, stamps: list[str], values: np.ndarray) -> Path:
+def write_rows(oxts, stamps, values):
     (oxts / "data").mkdir(parents=True)
     (oxts / "timestamps.txt").write_text("\n".join(stamps) + "\n")
-    (oxts / "dataformat.txt").write_text("lat: latitude of the oxts-unit (deg)\n")
     style = " ".join(["%.15g"] * values.shape[1]) + "\n"
     for row, line in enumerate(values.tolist()):
         (oxts / "data" / f"{row:010d}.txt").write_text(style % tuple(line))
     return oxts
 
 
-def write_drive(
-    root: Path, drive: str, seconds: float = 12.0, export: str = "extract", rate: float = 100.0
-) -> Path:
+def write_drive(root, drive, seconds=12.0, export="extract", rate=100.0):
     """A drive without traps."""
     time = np.arange(round(seconds * rate)) / rate
     oxts = root / drive[:10] / f"{drive}_{export}" / "oxts"
     return write_rows(oxts, [stamp(t) for t in time], packets(time))
 
 
-def write_published(root: Path, drive: str) -> tuple[Path, np.ndarray]:
+def write_published(root, drive):
     """A drive of 16 s with every trap; returns its folder and the times at which its two pieces
     begin and end.
 
@@ -84,18 +77,13 @@ def write_published(root: Path, drive: str) -> tuple[Path, np.ndarray]:
     return write_rows(oxts, stamps, packets(time[order])), pieces
 
 
-def write_piece(path: Path, spoil=None, first: float = 25.0, seconds: float = 12.0) -> Path:
+def write_piece(path, spoil=None, first=25.0, seconds=12.0):
     """An npz piece in single precision; `spoil(arrays)` may damage the arrays."""
     time = first + np.arange(round(seconds * 100)) / 100
     yaw, pitch, roll = known_walk.attitude(time).as_euler("ZYX").T
-    arrays = {
-        "t": time,
-        "p_gt": known_walk.position(time),
-        "ang_gt": np.stack([roll, pitch, yaw], axis=1),
-        "v_gt": known_walk.velocity(time),
-        "u": np.concatenate([known_walk.rate(time), known_walk.force(time)], axis=1),
-        "t0": np.array(first),
-    }
+    arrays = {"t": time, "t0": np.array(first), "ang_gt": np.stack([roll, pitch, yaw], axis=1)}
+    arrays |= {"p_gt": known_walk.position(time), "v_gt": known_walk.velocity(time)}
+    arrays["u"] = np.concatenate([known_walk.rate(time), known_walk.force(time)], axis=1)
     arrays = {name: values.astype(np.float32) for name, values in arrays.items()}
     if spoil:
         spoil(arrays)

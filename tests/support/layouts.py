@@ -1,8 +1,6 @@
 """Every layout that the loaders read, written as the known walk by the tests' own writers, in one
 table."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -96,22 +94,18 @@ def _csv(root: Path, seconds: float) -> None:
     csv_writers.write_native(root / "walk.csv", time, velocity=True)
 
 
+def _ridi(root: Path, seconds: float) -> None:
+    ridi_files.write_table(root, "hang_leg1", np.arange(int(seconds * 202.3)) / 202.3)
+
+
 def _hdf5(root: Path, seconds: float) -> None:
     time = np.arange(round(seconds * 200.0)) / 200.0
     attitude = known_walk.attitude(time).as_quat(scalar_first=True)
-    sequence = Sequence(
-        "walk",
-        time,
-        known_walk.rate(time),
-        known_walk.force(time),
-        attitude,
-        known_walk.position(time),
-        known_walk.velocity(time),
-        valid=np.ones(len(time), dtype=bool),
-        device_orientation=attitude,
-        attributes={"dataset": "csv", "group": "walk", "start_time": 12.5},
-    )
-    write_hdf5(root / "walk.h5", sequence)
+    place, valid = known_walk.position(time), np.ones(len(time), dtype=bool)
+    signals = known_walk.rate(time), known_walk.force(time)
+    walk = Sequence("walk", time, *signals, attitude, place, known_walk.velocity(time), valid)
+    about = {"dataset": "csv", "group": "walk", "start_time": 12.5}
+    write_hdf5(root / "walk.h5", walk._replace(device_orientation=attitude, attributes=about))
 
 
 LAYOUTS = {
@@ -133,14 +127,7 @@ LAYOUTS = {
         lambda root, seconds: ronin_files.write(root / "a011_2", seconds, start_frame=100),
         {"lists/list_train.txt": "a011_2"},
     ),
-    "ridi table": Layout(
-        "ridi",
-        "test",
-        lambda root, s: ridi_files.write_table(
-            root, "hang_leg1", np.arange(int(s * 202.3)) / 202.3
-        ),
-        OF_RIDI,
-    ),
+    "ridi table": Layout("ridi", "test", _ridi, OF_RIDI),
     "ridi text": Layout(
         "ridi",
         "test",
@@ -159,6 +146,7 @@ LAYOUTS = {
         "kitti",
         "train",
         lambda root, seconds: kitti_files.write_drive(root, DRIVE, seconds),
+        shortest=4.0,
         targets=(STAMPS, PACKET.format("000"), PACKET.format("200")),
     ),
     "kitti npz": Layout(

@@ -3,8 +3,6 @@
 Gyroscope and accelerometer have stamps of their own, as on a phone.
 """
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path
@@ -20,14 +18,11 @@ RATE = 100.0
 SECONDS = 8.0
 DELAY = 0.003
 """s by which the accelerometer's stamps follow the gyro's."""
-METADATA = (
-    "version,device name,recording epoch time,recording time,recording timezone,platform,"
-    "appVersion,device id,sensors,sampleRateMs,standardisation,platform version"
-)
+METADATA = "version,device name,recording epoch time,platform,sampleRateMs,standardisation"
 
 
-def clock(rate=RATE, seconds=SECONDS):
-    return np.arange(round(seconds * rate)) / rate
+def clock(seconds=SECONDS):
+    return np.arange(round(seconds * RATE)) / RATE
 
 
 def gravity(time):
@@ -45,13 +40,12 @@ def sensor_table(time, values):
 
 
 def metadata(platform, standardised):
-    row = f"3,phone,{EPOCH},2026-01-01_00-00-00,Europe/Berlin,{platform},1.4,id,all,10,"
-    return f"{METADATA}\n{row}{str(standardised).lower()},17\n"
+    return f"{METADATA}\n3,phone,{EPOCH},{platform},10,{str(standardised).lower()}\n"
 
 
-def sensor_logger(platform="android", standardised=False, rate=RATE, seconds=SECONDS):
+def sensor_logger(platform="android", standardised=False, seconds=SECONDS):
     """Every sensor that the app writes on a system."""
-    time = clock(rate, seconds)
+    time = clock(seconds)
     later = time + DELAY
     sign = -1.0 if platform == "ios" and not standardised else 1.0
     down, force = gravity(later), known_walk.force(later)
@@ -84,9 +78,9 @@ def axes(name, unit):
     return [f"{name} {axis} ({unit})".strip() for axis in "xyz"]
 
 
-def phyphox_sets(rate=RATE, seconds=SECONDS):
+def phyphox_sets(seconds=SECONDS):
     """Set -> (stamps, values, labels) of an experiment of gyroscope and accelerometer."""
-    time = clock(rate, seconds)
+    time = clock(seconds)
     later = time + DELAY
     return {
         "Gyroscope": (time, known_walk.rate(time), axes("Gyroscope", "rad/s")),
@@ -99,7 +93,6 @@ def phyphox(separator=",", decimal=".", sets=None):
         f"{name}.csv": phyphox_table(*entry, separator, decimal)
         for name, entry in (sets or phyphox_sets()).items()
     }
-    members["meta/device.csv"] = '"property","value"\n"version","1.2"\n'
     members["meta/time.csv"] = '"event","experiment time","system time","system time text"\n'
     return members
 

@@ -4,9 +4,6 @@ The conventions (iOS's sign, G, Vicon's quaternion order, where the marker body 
 down here a second time, independently of the loader.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +46,7 @@ class Truth(NamedTuple):
     """In syn files Vicon's row i is the phone's row i + lag."""
 
 
-def iphone_columns(time: np.ndarray, truth: Truth) -> np.ndarray:
+def iphone_columns(time, truth):
     """The 15 columns after the time. The phone's yaw is its own; gravity and acceleration are in G
     with iOS's sign."""
     own = Rotation.from_euler("z", 1.1) * truth.walk.attitude(time)
@@ -60,7 +57,7 @@ def iphone_columns(time: np.ndarray, truth: Truth) -> np.ndarray:
     return np.concatenate([angles, gyro, gravity, user, magnet], axis=1)
 
 
-def vicon_columns(time: np.ndarray, truth: Truth, seed: int = 0) -> np.ndarray:
+def vicon_columns(time, truth, seed=0):
     """Position and quaternion xyzw of the marker body in Vicon's tilted world, noisy, with one flip
     and one jump of 3 rows."""
     noise = np.random.default_rng(seed)
@@ -77,7 +74,7 @@ def vicon_columns(time: np.ndarray, truth: Truth, seed: int = 0) -> np.ndarray:
     return np.concatenate([place, quaternion], axis=1)
 
 
-def write_rows(path: Path, time: list[str], columns: np.ndarray, style: str) -> None:
+def write_rows(path, time, columns, style):
     path.parent.mkdir(parents=True, exist_ok=True)
     styles = ",".join([style] * columns.shape[1])
     values = columns.tolist()
@@ -85,19 +82,19 @@ def write_rows(path: Path, time: list[str], columns: np.ndarray, style: str) -> 
     path.write_text("\n".join(rows) + "\n")
 
 
-def write_vicon(path: Path, stamps: list[str], columns: np.ndarray, style: str = "%.9f") -> None:
+def write_vicon(path, stamps, columns, style="%.9f"):
     """With the number of the frame in front."""
     frames = np.arange(len(columns))[:, None] + 54908.0
     write_rows(path, stamps, np.concatenate([frames, columns], axis=1), style)
 
 
-def nanoseconds(time: np.ndarray, truth: Truth) -> list[str]:
+def nanoseconds(time, truth):
     """Vicon's stamps: unix ns of whole milliseconds."""
     unix = EPOCH + time * (1 + truth.skew) + truth.offset
     return [f"{round(stamp)}000000" for stamp in unix * 1e3]
 
 
-def write_raw(folder: Path, number: int, truth: Truth, seconds: float = 60.0) -> None:
+def write_raw(folder, number, truth, seconds):
     """`raw/imuK.csv` in unix seconds of two decimals, `raw/viK.csv` in unix ns that begins 3 s
     earlier and lacks 15 rows."""
     time = np.arange(int(seconds * 99.92)) / 99.92 + 0.003
@@ -113,7 +110,7 @@ def write_raw(folder: Path, number: int, truth: Truth, seconds: float = 60.0) ->
     write_vicon(path, nanoseconds(seen, truth), vicon_columns(seen, truth))
 
 
-def write_syn(folder: Path, number: int, truth: Truth, seconds: float = 60.0) -> None:
+def write_syn(folder, number, truth, seconds):
     """`syn` files: no time left, the phone's rows repeated onto 100 Hz, Vicon late by `lag_rows`
     and held now and then."""
     sampled, grid = np.arange(int(seconds * 99.92) + 200) / 99.92, np.arange(seconds * 100) / 100
@@ -126,7 +123,7 @@ def write_syn(folder: Path, number: int, truth: Truth, seconds: float = 60.0) ->
     write_vicon(folder / "syn" / f"vi{number}.csv", stamps, vicon, "%.5g")
 
 
-def write_nexus_raw(folder: Path, number: int, truth: Truth, seconds: float = 60.0) -> None:
+def write_nexus_raw(folder, number, truth, seconds):
     """Rows `t_ms, type, x, y, z`: 1 accelerometer (m/s², Android's sign), 2 magnetometer, 4 gyro;
     Vicon at 200 Hz."""
     time = np.arange(int(seconds * 99.297)) / 99.297
@@ -140,17 +137,14 @@ def write_nexus_raw(folder: Path, number: int, truth: Truth, seconds: float = 60
         rows.append(np.column_stack([stamps, np.full(len(time), kind), values])[first:])
     table = np.concatenate(rows)
     table = table[np.lexsort([table[:, 1], table[:, 0]])]
-    path = folder / "raw" / f"imu{number}.csv"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savetxt(path, table, ["%d", "%d", *3 * ["%.7f"]], ",")
+    stamps = [f"{stamp:.0f}" for stamp in table[:, 0]]
+    write_rows(folder / "raw" / f"imu{number}.csv", stamps, table[:, 1:], "%.9g")
     seen = np.arange(-1.0, seconds + 1.0, 0.005)
     path = folder / "raw" / f"vi{number}.csv"
     write_vicon(path, nanoseconds(seen, truth), vicon_columns(seen, truth))
 
 
-def write_large_scale(
-    folder: Path, number: int, truth: Truth, seconds: float = 90.0, broken: bool = False
-) -> None:
+def write_large_scale(folder, number, truth, seconds, broken=False):
     """`syn/imuK.csv` with true unix seconds, `syn/tangoK.csv` with a dozen more rows, another yaw
     and a useless attitude, 0.2 s late."""
     time = np.arange(int(seconds * 99.92)) / 99.92

@@ -1,7 +1,5 @@
 """Files in RIDI's two layouts."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -15,13 +13,10 @@ GAME_YAW = Rotation.from_euler("z", -1.3)
 
 def table(time):
     """The table's columns by name, without its index."""
-    attitude, force = walk.attitude(time), walk.force(time)
-    gravity = attitude.inv().apply([0, 0, 9.81])
+    attitude = walk.attitude(time)
     blocks = {
         "gyro": walk.rate(time),
-        "acce": force,
-        "linacce": force - gravity,
-        "grav": gravity,
+        "acce": walk.force(time),
         "magnet": np.full((len(time), 3), 30.0),
         "pos": walk.position(time),
         "ori": attitude.as_quat(scalar_first=True),
@@ -34,10 +29,9 @@ def table(time):
     return columns
 
 
-def write_table(root, name, time=None, order=None, rows=None, spoil=None):
+def write_table(root, name, time, order=None, rows=None, spoil=None):
     """`<name>/processed/data.csv` as pandas writes it: an index without a name first. `rows` picks
     (and reorders) rows."""
-    time = np.arange(int(walk.SECONDS * 202.3)) / 202.3 if time is None else time
     columns = table(time)
     if spoil:
         spoil(columns)

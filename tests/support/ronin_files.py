@@ -1,7 +1,5 @@
 """Files in RoNIN's layout."""
 
-from __future__ import annotations
-
 import json
 
 import h5py
@@ -37,29 +35,19 @@ def drifting(time, degrees, end):
 
 
 def write(
-    folder,
-    seconds=walk.SECONDS,
-    start_frame=600,
-    drifts=(4.0, 7.0),
-    errors=None,
-    ekf=True,
-    spoil=None,
-    spoil_info=None,
+    folder, seconds=36.0, start_frame=600, drifts=(4.0, 7.0), errors=None, ekf=True, spoil=None
 ):
-    """`data.hdf5` and `info.json`; game rotation vector and EKF drift by `drifts`, degrees of
-    yaw."""
+    """`data.hdf5` and `info.json`; game rotation vector and EKF drift by `drifts`, degrees of yaw.
+    `spoil(fields, info)` may damage what is in them."""
     time = np.arange(round(seconds * 200)) / 200
     phone = walk.attitude(time)
     # The phone's place on the chest is known for the first row alone.
     start_calibration = wxyz(chest(time[:1]).inv() * phone[:1])[0]
-    gravity = phone.inv().apply([0, 0, 9.81])
     fields = {
         "synced/time": FIRST + time,
         "synced/gyro": walk.rate(time) + 0.003,  # as the phone compensated it, which is not used
         "synced/gyro_uncalib": walk.rate(time) + BIAS,
         "synced/acce": walk.force(time) / SCALE + FORCE_BIAS,
-        "synced/linacce": walk.force(time) - gravity,
-        "synced/grav": gravity,
         "synced/magnet": np.full((len(time), 3), 30.0),
         "synced/rv": wxyz(Rotation.from_euler("z", 0.2) * phone),
         "synced/game_rv": wxyz(GAME_YAW * drifting(time, drifts[0], time[-1]) * phone),
@@ -69,25 +57,19 @@ def write(
     if ekf:
         fields["pose/ekf_ori"] = wxyz(EKF_YAW * drifting(time, drifts[1], time[-1]) * phone)
     info = {
-        "type": "annotated",
         "device": "asus4",
-        "date": "01/21/19",
         "imu_init_gyro_bias": BIAS,
         "imu_acce_bias": FORCE_BIAS,
         "imu_acce_scale": SCALE,
         "imu_end_gyro_bias": [0.1, 0.1, 0.1],
         "start_calibration": list(start_calibration),
-        "align_tango_to_body": [0.5, 0.5, 0.5, 0.5],
-        "length": seconds,
     }
     kinds = ("gyro_integration_error", "grv_ori_error", "ekf_ori_error")
     info |= dict(zip(kinds, errors or (30.0, *drifts), strict=True))
     if start_frame is not None:
         info["start_frame"] = start_frame
     if spoil:
-        spoil(fields)
-    if spoil_info:
-        spoil_info(info)
+        spoil(fields, info)
     folder.mkdir(parents=True)
     with h5py.File(folder / "data.hdf5", "w") as file:
         for name, values in fields.items():

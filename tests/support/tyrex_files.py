@@ -1,7 +1,5 @@
 """Files in Tyrex's layout: the known walk, seen as a handle on the phone, at two phones' rates."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -62,29 +60,15 @@ def track(seconds: float) -> dict:
     place = walk.position(time) - handle.apply(LEVER)
     matrices = handle.as_matrix().transpose(0, 2, 1).reshape(-1, 9)
     place[LOST], matrices[LOST] = np.nan, np.nan
-    return {
-        "File": "C:\\walk.qtm",
-        "Frames": float(len(frame)),
-        "FrameRate": 60.0,
-        "RigidBodies": {
-            "Bodies": 1.0,
-            "Name": "Nexus5-Handler",
-            "Positions": (1e3 * place.T)[None],
-            "Rotations": matrices.T[None],
-            "Residual": np.full((1, 1, len(frame)), 0.4),
-        },
-    }
+    bodies = {"Name": "Handler", "Positions": (1e3 * place.T)[None], "Rotations": matrices.T[None]}
+    return {"File": "C:\\walk.qtm", "FrameRate": 60.0, "RigidBodies": bodies}
 
 
-def write(root: Path, name: str = NEXUS, seconds: float = walk.SECONDS, spoil=None) -> Path:
-    """One walk below `root`; returns its phone's folder. `spoil` changes what the tracker's file
-    holds."""
+def write(root, name=NEXUS, seconds=walk.SECONDS):
+    """One walk below `root`; returns its phone's folder."""
     folder = root / "datasets" / ("ios" if "iPhone" in name else "android") / name
     write_phone(folder, seconds)
-    struct = track(seconds)
-    if spoil:
-        spoil(struct)
     path = root / "datasets" / "qualisys" / f"{name}.mat"
     path.parent.mkdir(exist_ok=True)
-    savemat(path, {name: struct}, long_field_names=True)
+    savemat(path, {name: track(seconds)}, long_field_names=True)
     return folder

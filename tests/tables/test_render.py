@@ -34,12 +34,12 @@ def test_a_table_by_hand():
     assert list(figures) == ["ate", "rpe_1s"]
     figures |= make._over_seeds("more", [np.zeros(0), np.array([0.25, 0.75])])
     text = make.render(table_of(*results), figures)
-    assert (
-        "| B | 1.50 ± 0.71 | 0.150 ± 0.071 | 0.500 ± 0.354 | 1.50 | ↓ 50.0 % "
-        "| -1.50 (-5.80 to +2.80) | 1.80 | ↓ 25.0 % |"
-    ) in text
+    means = "| B | 1.50 ± 0.71 | 0.150 ± 0.071 | 0.500 ± 0.354 | 1.50 | ↓ 50.0 % "
+    assert means + "| -1.50 (-5.80 to +2.80) | 1.80 | ↓ 25.0 % |" in text
     assert "| A | 3.00 ± 0.00 | 0.300 ± 0.000 | – | 2.50 |  |  | 2.40 |  |" in text
     assert "there are 3." in text and "†" not in text
+    found = [make.arrow(gain) for gain in (12.34, -5.0, 0.01, None)]
+    assert found == ["↓ 12.3 %", "↑ 5.0 %", "0 %", "–"]
 
 
 def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
@@ -72,8 +72,3 @@ def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == ["A", "B\n(2 of 3 diverged)", "C\n(3 of 3 diverged)"]
     assert [bar.get_width() for bar in axes.patches] == [pytest.approx(7 / 3), 8.0, 0.0]
-
-
-def test_arrows_point_as_the_error_goes():
-    found = [make.arrow(gain) for gain in (12.34, -5.0, 0.01, None)]
-    assert found == ["↓ 12.3 %", "↑ 5.0 %", "0 %", "–"]

@@ -1,7 +1,5 @@
 """The exports of phone loggers must tell of the known walk again, or be refused in one line."""
 
-from __future__ import annotations
-
 import numpy as np
 import openpyxl
 import pytest
@@ -41,9 +39,6 @@ def without(members, *names):
     return {name: text for name, text in members.items() if name not in names}
 
 
-# --- Sensor Logger
-
-
 SUM = "Accelerometer.csv + Gravity.csv in m/s2"
 RAW = "AccelerometerUncalibrated.csv: accel taken as"
 
@@ -52,7 +47,6 @@ RAW = "AccelerometerUncalibrated.csv: accel taken as"
     ("platform", "standardised", "dropped", "words"),
     [
         ("android", False, (), "(Android); time in ns, Gyroscope.csv in rad/s, TotalAcceleration."),
-        ("android", False, ("TotalAcceleration.csv",), SUM),
         ("ios", False, (), f"(iOS); time in ns, Gyroscope.csv in rad/s, {SUM}"),
         ("ios", False, ("Accelerometer.csv",), f"{RAW} g"),
         ("ios", True, ("Accelerometer.csv",), f"{RAW} m/s2"),
@@ -62,37 +56,17 @@ def test_sensor_logger(tmp_path, platform, standardised, dropped, words):
     members = without(sensor_logger(platform, standardised), *dropped)
     sequence, notes = import_recording(zipped(tmp_path / "walk.zip", members))
     compare(sequence)
+    # The same as a folder, or packed as macOS packs one.
+    extra = {f"walk/{name}": text for name, text in members.items()}
+    extra["__MACOSX/walk/._Gyroscope.csv"] = "\0"
+    for path in (zipped(tmp_path / "inside.zip", extra), unpacked(tmp_path / "walk", members)):
+        other, _ = import_recording(path)
+        np.testing.assert_array_equal(other.accel, sequence.accel)
+        np.testing.assert_array_equal(other.gyro, sequence.gyro)
     text = " | ".join(notes)
     assert words in text and sequence.name == "walk"
     assert ("negated (iOS's sign)" in text) == (platform == "ios" and not standardised)
     assert sequence.attributes["start_time"] - EPOCH * 1e-9 == pytest.approx(0.01, abs=1e-6)
-
-
-@pytest.mark.parametrize("name", ["Gyroscope.csv", "GyroscopeUncalibrated.csv"])
-def test_a_gyro_whose_bias_is_its_own_says_so(tmp_path, name):
-    """Where there are both, the other one is taken."""
-    members = sensor_logger()
-    members["GyroscopeUncalibrated.csv"] = members["Gyroscope.csv"]
-    if name != "Gyroscope.csv":
-        del members["Gyroscope.csv"]
-    sequence, notes = import_recording(zipped(tmp_path / "walk.zip", members))
-    compare(sequence)
-    assert name in " ".join(notes)
-    raw = name == "GyroscopeUncalibrated.csv"
-    assert sequence.attributes.get("imu_compensated") == ("no" if raw else None)
-
-
-def test_a_folder_reads_as_its_zip(tmp_path):
-    members = sensor_logger("ios")
-    packed, _ = import_recording(zipped(tmp_path / "walk.zip", members))
-    # As macOS packs a folder.
-    extra = {f"walk/{name}": text for name, text in members.items()}
-    extra["__MACOSX/walk/._Gyroscope.csv"] = "\0"
-    inside, _ = import_recording(zipped(tmp_path / "inside.zip", extra))
-    folder, _ = import_recording(unpacked(tmp_path / "walk", members))
-    for other in (inside, folder):
-        np.testing.assert_array_equal(other.accel, packed.accel)
-        np.testing.assert_array_equal(other.gyro, packed.gyro)
 
 
 def test_the_metadata_tell_the_sign_or_it_must_be_stated(tmp_path):
@@ -107,29 +81,22 @@ def test_the_metadata_tell_the_sign_or_it_must_be_stated(tmp_path):
         "version,device name,recording time,platform,appVersion,device id,sensors,sampleRateMs\n"
         "3,iPhone 12 mini,2022-09-12_11-36-02,ios,1.10.4,id,Accelerometer|Gravity,10|10"
     )
-    compare(import_recording(zipped(path, members))[0])
+    # Of a gyro whose bias is its own the sequence says so, where there is no other.
+    members["GyroscopeUncalibrated.csv"] = members["Gyroscope.csv"]
+    for raw in (None, "no"):
+        sequence, notes = import_recording(zipped(path, members))
+        compare(sequence)
+        assert ("GyroscopeUncalibrated.csv" in " ".join(notes)) == (raw == "no")
+        assert sequence.attributes.get("imu_compensated") == raw
+        members.pop("Gyroscope.csv", None)
     members["Metadata.csv"] = "platform,standardisation\nios,perhaps\n"
     refused(zipped(path, members), unknown)
-
-
-def test_gravity_of_other_stamps_is_interpolated(tmp_path):
-    members = without(sensor_logger("android"), "TotalAcceleration.csv")
-    time = logger_files.clock(50.0) + 0.007
-    members["Gravity.csv"] = sensor_table(time, logger_files.gravity(time))
-    sequence, _ = import_recording(zipped(tmp_path / "walk.zip", members))
-    place = sequence.attributes["start_time"] - EPOCH * 1e-9
-    force = known_walk.force(sequence.time + place)
-    np.testing.assert_allclose(sequence.accel[20:-20], force[20:-20], atol=0.03)
 
 
 @pytest.mark.parametrize(
     ("members", "words"),
     [
         (without(sensor_logger(), "Gyroscope.csv"), "has no gyro .found: Accelerometer.csv, .*; "),
-        (
-            {"Gyroscope.csv": sensor_logger()["Gyroscope.csv"]},
-            "walk.zip: has no accelerometer .found: Gyroscope.csv.; record the gyroscope",
-        ),
         (
             without(sensor_logger("ios"), "Gravity.csv", "AccelerometerUncalibrated.csv"),
             "walk.zip: holds acceleration without gravity .Accelerometer.csv.; record .* Gravity",
@@ -142,13 +109,8 @@ def test_gravity_of_other_stamps_is_interpolated(tmp_path):
             sensor_logger() | {"TotalAcceleration.csv": "time,seconds_elapsed,z,y\n1,2,3,4\n"},
             "TotalAcceleration.csv: column 'x' is missing",
         ),
-        (
-            sensor_logger() | {"Gyroscope.csv": "time,seconds_elapsed,z,y,x\n1,2,a,b,c\n"},
-            "Gyroscope.csv: column 'x' holds 'c' in its row 2, no number",
-        ),
         (sensor_logger(seconds=0.5), "walk.zip: both sensors were recorded for 0.49 s, less than"),
         ({"notes.txt": "hello"}, "layout of no known recording .found: no CSV file.; known"),
-        ({"a.csv": "\xff" * 9}, "the layout of no known recording .found: a.csv"),
         (sensor_logger() | {"../../etc/Gyroscope.csv": "x"}, r"2 recordings: ., \.\./\.\./etc"),
         ({f"{number}.csv": "" for number in range(201)}, "walk.zip: holds 201 CSV files"),
     ],
@@ -189,15 +151,26 @@ def test_a_zip_cut_short_or_with_a_member_that_lies_about_its_size_is_one_line(t
     refused(path, "bomb.zip: cannot be read as a zip, it may be cut short")
 
 
-# --- phyphox
-
-
-@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), ("\t", ","), (";", ",")])
+@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", ",")])
 def test_phyphox_as_text(tmp_path, separator, decimal):
     sequence, notes = import_recording(zipped(tmp_path / "w.zip", phyphox(separator, decimal)))
     compare(sequence)
     text = "phyphox; time in s, Gyroscope.csv in rad/s, Accelerometer.csv in m/s2"
     assert f"w.zip: {text}" in notes
+
+
+def test_phyphox_in_one_file(tmp_path):
+    """The columns tell, whatever the file is called; a file of ours has names of ours."""
+    time = logger_files.clock()
+    values = np.concatenate([known_walk.rate(time), known_walk.force(time), time[:, None]], axis=1)
+    labels = [*axes("Gyroscope", "rad/s"), *axes("Acceleration", "m/s^2"), "Absolute (m/s^2)"]
+    (tmp_path / "Raw Data.csv").write_text(phyphox_table(time, values, labels))
+    sequence, _ = import_recording(tmp_path / "Raw Data.csv")
+    np.testing.assert_allclose(sequence.gyro, known_walk.rate(sequence.time), atol=1e-8)
+    np.testing.assert_allclose(sequence.accel, known_walk.force(sequence.time), atol=1e-8)
+    (tmp_path / "gyro.csv").write_text(phyphox()["Gyroscope.csv"])
+    refused(tmp_path / "gyro.csv", "gyro.csv: has no accelerometer .found: gyro.csv.; record")
+    refused(tmp_path / "gyro.csv", "gyro.csv: has no topics", imu_topic="/imu")
 
 
 def test_phyphox_as_a_workbook(tmp_path, monkeypatch):
@@ -218,18 +191,13 @@ def test_phyphox_that_was_paused_is_refused(tmp_path):
     lines = [f'"{event}",{time:.9E},{system:.3f},"x"' for event, time, system in events]
     members = phyphox()
     header = members["meta/time.csv"]
-    words = r"walk[a-z]*\.?[a-z]*: was paused 1 times, for up to 3\.5 s"
-    for kept, paused in ((3, True), (2, False)):
-        members["meta/time.csv"] = header + "\n".join(lines[:kept]) + "\n"
-        for path in (
-            zipped(tmp_path / "walk.zip", members),
-            zipped(tmp_path / "walkb.zip", {f"deep/{name}": t for name, t in members.items()}),
-            unpacked(tmp_path / f"walk{'a' * kept}", members),
-        ):
-            if paused:
-                refused(path, words)
-            else:
-                compare(import_recording(path)[0])
+    words = r"walk\w*\.?[a-z]*: was paused 1 times, for up to 3\.5 s"
+    members["meta/time.csv"] = header + "\n".join(lines) + "\n"
+    refused(unpacked(tmp_path / "walk", members), words)
+    deep = {f"deep/{name}": text for name, text in members.items()}
+    refused(zipped(tmp_path / "walk.zip", deep), words)
+    members["meta/time.csv"] = header + "\n".join(lines[:2]) + "\n"
+    compare(import_recording(zipped(tmp_path / "walk.zip", members))[0])
     workbooks(tmp_path, phyphox_sets())
     book = openpyxl.load_workbook(tmp_path / "walk.xlsx")
     sheet = book.create_sheet("Metadata Time")
@@ -252,6 +220,9 @@ def test_phyphox_of_an_earlier_release_in_another_language_in_degrees(tmp_path):
     sequence, notes = import_recording(zipped(path, phyphox(sets=sets)))
     compare(sequence)
     assert "Gyroscope.csv in deg/s" in notes[0]
+    second = {"Second": (time, rate, axes("Gyroscope", "rad/s"))}
+    words = "holds 2 sets of a sensor: .*; leave the table of one of them in it"
+    refused(zipped(path, phyphox(sets=sets | second)), words)
     del sets["Beschleunigung"]
     words = "walk.zip: holds acceleration without gravity .Linear Accelerometer.csv.; record"
     refused(zipped(path, phyphox(sets=sets)), words)
@@ -259,26 +230,3 @@ def test_phyphox_of_an_earlier_release_in_another_language_in_degrees(tmp_path):
     for rows in (slice(None), np.random.default_rng(0).permutation(len(later))):
         sets["Gravity"] = (later[rows], down[rows], axes("Gravity", "m/s^2"))
         compare(import_recording(zipped(path, phyphox(sets=sets)))[0])
-
-
-def test_of_two_tables_of_a_sensor_the_remedy_can_be_followed(tmp_path):
-    sets = phyphox_sets()
-    sets["Second"] = (*sets["Gyroscope"][:2], axes("Gyroscope", "deg/s"))
-    path = zipped(tmp_path / "walk.zip", phyphox(sets=sets))
-    refused(path, "holds 2 sets of a sensor: .*; leave the table of one of them in it")
-    compare(import_recording(zipped(path, without(phyphox(sets=sets), "Second.csv")))[0])
-
-
-def test_phyphox_in_one_file(tmp_path):
-    """The columns tell, whatever the file is called; a file of ours has names of ours."""
-    time = logger_files.clock()
-    values = np.concatenate([known_walk.rate(time), known_walk.force(time)], axis=1)
-    labels = [*axes("Gyroscope", "rad/s"), *axes("Acceleration", "m/s^2"), "Absolute (m/s^2)"]
-    table = phyphox_table(time, np.column_stack([values, time]), labels)
-    (tmp_path / "Raw Data.csv").write_text(table)
-    sequence, _ = import_recording(tmp_path / "Raw Data.csv")
-    np.testing.assert_allclose(sequence.gyro, known_walk.rate(sequence.time), atol=1e-8)
-    np.testing.assert_allclose(sequence.accel, known_walk.force(sequence.time), atol=1e-8)
-    (tmp_path / "gyro.csv").write_text(phyphox()["Gyroscope.csv"])
-    refused(tmp_path / "gyro.csv", "gyro.csv: has no accelerometer .found: gyro.csv.; record")
-    refused(tmp_path / "gyro.csv", "gyro.csv: has no topics", imu_topic="/imu")

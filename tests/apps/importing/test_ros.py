@@ -1,7 +1,5 @@
 """Bags that the libraries' own writers wrote must tell of the known walk again."""
 
-from __future__ import annotations
-
 import re
 import sys
 import tempfile
@@ -63,16 +61,13 @@ def test_every_kind_of_reference(tmp_path, kind):
     assert ("taken as one" in text) == (kind != "TransformStamped")
 
 
-@pytest.mark.parametrize("forward", [True, False])
-def test_a_reference_is_moved_along_static_transforms(tmp_path, forward):
-    """base_link → plate → imu_link, the first given in either direction; one that is no rotation
-    joins nothing."""
-    make = Maker()
+def test_a_reference_is_moved_along_static_transforms(tmp_path):
+    """base_link → plate → imu_link, the first given in the other direction; one that is no rotation
+    joins nothing. Empty headers leave the bag's stamps."""
+    make = Maker(headers=False)
     half = Rotation.from_euler("x", 0.7)
     rest = half.inv() * MOUNT[0], half.inv().apply(MOUNT[1] - [0.1, 0.0, 0.0])
-    first = ("base_link", "plate", half, [0.1, 0.0, 0.0])
-    if not forward:
-        first = ("/plate", "base_link", half.inv(), half.inv().apply([-0.1, 0.0, 0.0]))
+    first = ("/plate", "base_link", half.inv(), half.inv().apply([-0.1, 0.0, 0.0]))
     static = [make.static(*first), make.static("plate", "imu_link", *rest)]
     static.append(make.static("base_link", "imu_link", half, [9.0, 9.0, 9.0]))
     static[-1].transforms[0].transform.rotation = make.new("geometry_msgs/msg/Quaternion", *ZERO)
@@ -82,6 +77,8 @@ def test_a_reference_is_moved_along_static_transforms(tmp_path, forward):
     sequence, notes = import_recording(write(tmp_path, "mcap", entries))
     compare_reference(sequence, INNER, 2e-3)
     assert any("moved from 'base_link' to 'imu_link' by /tf_static" in note for note in notes)
+    assert any("stamped by its bag: its headers have no time" in note for note in notes)
+    assert sequence.attributes["start_time"] == pytest.approx((EPOCH + LOGGED) * 1e-9, abs=1e-6)
 
 
 def test_transforms_need_a_frame_where_several_move(tmp_path):
@@ -94,16 +91,6 @@ def test_transforms_need_a_frame_where_several_move(tmp_path):
     words = "topic /tf moves the frames imu_link, wheel; name one: --reference-topic /tf:FRAME"
     refused(path, words, reference_topic="/tf")
     compare_reference(import_recording(path, reference_topic="/tf:imu_link")[0], INNER, 2e-3)
-
-
-def test_empty_headers_leave_the_bags_stamps(tmp_path):
-    make = Maker(headers=False)
-    entries = imu(make) + poses(make, "Odometry", ONE, child="imu_link")
-    sequence, notes = import_recording(write(tmp_path, "mcap", entries))
-    compare_imu(sequence)
-    compare_reference(sequence, INNER, 2e-3)
-    assert sequence.attributes["start_time"] == pytest.approx((EPOCH + LOGGED) * 1e-9, abs=1e-6)
-    assert any("stamped by its bag: its headers have no time" in note for note in notes)
 
 
 def test_topics_are_chosen_and_named(tmp_path):
@@ -167,37 +154,29 @@ def test_a_reference_that_is_none_is_left_out_unless_it_was_named(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["rosbag1", "db3", "mcap"])
-def test_a_bag_cut_short_is_one_line(tmp_path, kind):
+def test_only_what_a_library_cannot_read_is_called_damage(tmp_path, monkeypatch, kind):
+    """A bag that is cut short, or one whose index counts wrongly: `rosbags` asserts what it expects
+    of an index. An error of ours is none."""
     path = write(tmp_path, kind, imu(Maker(kind), seconds=2.0))
     whole = path.read_bytes()
-    for kept in (0.1, 0.9, 0.99):
+    for kept in (0.1, 0.99):
         path.write_bytes(whole[: int(kept * len(whole))])
         refused(path, f"{path.name}: (cannot be read as a ROS . bag, it may be|is) cut short")
+    if kind == "rosbag1":
+        data = bytearray(whole)
+        index = data.index(b"op=\x04")  # a record of this kind, in whose header the count stands
+        data[data.index(b"count=", index - 60) + 6] ^= 1
+        path.write_bytes(data)
+        refused(path, "walk.bag: cannot be read as a ROS 1 bag, it may be cut short")
+    path.write_bytes(whole)
+    for error in (ZeroDivisionError, MemoryError):
 
+        def fails(_, error=error):
+            raise error
 
-def test_a_bag_whose_index_counts_wrongly_is_one_line(tmp_path):
-    """`rosbags` asserts what it expects of an index."""
-    path = write(tmp_path, "rosbag1", imu(Maker("rosbag1"), seconds=2.0))
-    data = bytearray(path.read_bytes())
-    index = data.index(b"op=\x04")  # a record of this kind, in whose header the count stands
-    data[data.index(b"count=", index - 60) + 6] ^= 1
-    path.write_bytes(data)
-    refused(path, "walk.bag: cannot be read as a ROS 1 bag, it may be cut short")
-
-
-class Bug(Exception):
-    """Of ours."""
-
-
-@pytest.mark.parametrize("error, kind", [(Bug, "rosbag1"), (MemoryError, "mcap")])
-def test_only_what_a_library_cannot_read_is_called_damage(tmp_path, monkeypatch, error, kind):
-    def fails(_):
-        raise error
-
-    path = write(tmp_path, kind, imu(Maker(kind), seconds=2.0))
-    monkeypatch.setattr(ros, "_stamp", fails)
-    with pytest.raises(error):
-        import_recording(path)
+        monkeypatch.setattr(ros, "_stamp", fails)
+        with pytest.raises(error):
+            import_recording(path)
 
 
 def test_a_bag_compressed_as_a_whole_is_unpacked_by_its_owner(tmp_path, monkeypatch):

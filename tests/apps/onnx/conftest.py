@@ -2,8 +2,8 @@
 
 import contextlib
 import io
+from collections import namedtuple
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -33,11 +33,8 @@ BIAS = np.array([0.02, -0.01, 0.03])
 """Of the gyro, rad/s."""
 
 
-class Walked(NamedTuple):
-    """A second at rest and a pedestrian, a minute in all, by a gyro with a bias."""
-
-    gyro: np.ndarray
-    accel: np.ndarray
+Walked = namedtuple("Walked", "gyro accel")
+"""A second at rest and a pedestrian, a minute in all, by a gyro with a bias."""
 
 
 def draw(random, kind, shape):

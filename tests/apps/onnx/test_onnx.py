@@ -41,7 +41,7 @@ def from_rest(setup, walked):
     return filtering.level_state(setup.config, gyro, accel, setup.initial_std)
 
 
-def test_a_minute_is_that_of_the_package(found, walked, package):
+def test_a_minute_is_that_of_the_package(found, models, walked, package):
     def start(setup):
         return from_rest(setup, walked)
 
@@ -53,6 +53,14 @@ def test_a_minute_is_that_of_the_package(found, walked, package):
     np.testing.assert_allclose(found.position, history.position, atol=1e-3)
     np.testing.assert_allclose(found.rotation, history.rotation, atol=1e-5)
     np.testing.assert_allclose(found.covariance, history.covariance, rtol=1e-3, atol=1e-4)
+    # So does the command say, and refuses what is off.
+    folder, printed = models
+    measured = json.loads((folder / "export.json").read_text())["accuracy"]
+    assert "network.onnx" in printed and "rms" in printed
+    assert measured["displacement_largest"] <= 1e-5 and measured["position_largest"] <= 1e-3
+    assert measured["ate"] == pytest.approx(measured["ate_of_package"], abs=1e-3)
+    with pytest.raises(ValueError, match=r"walk: .* off by 0\.0001 m a window"):
+        check(Deviation(1e-4, 1e-4, 0.0, 1.0, 1.0), "walk")
     # The walk says something: it moves, and the network turns it from where the IMU alone leads.
     assert np.ptp(found.position, axis=0).max() > 1 and np.abs(found.displacement).max() > 0.05
 
@@ -67,11 +75,8 @@ def test_the_start_has_the_bias_of_a_gyro_at_rest(run, models, walked):
     for name, value in wanted.items():
         np.testing.assert_allclose(arrays[name], value, atol=1e-9, err_msg=name)
     np.testing.assert_allclose(arrays["state.gyro_bias"], BIAS, atol=1e-9)
-
-
-def test_a_state_that_a_run_left_is_refused(run, walked):
-    """Its clones are ordered by age, and the models would take them for a ring."""
-    setup = tracking_filter(load_run(run))
+    # The clones of a state that a run left are ordered by age: the models would take them for a
+    # ring.
     state = from_rest(setup, walked)
     with pytest.raises(ValueError, match=r"^state: is one after 3 clone intervals of a run"):
         start_arrays(state._replace(step=state.step + 3), setup)
@@ -99,53 +104,30 @@ def test_the_filter_is_in_float64_and_every_tensor_is_described(models):
     assert manifest["rate"] == CONFIG.data.rate and manifest["filter"]["noise"]["std_factor"][0] > 1
 
 
-def test_the_command_prints_how_far_it_is_from_the_package(models):
-    folder, printed = models
-    measured = json.loads((folder / "export.json").read_text())["accuracy"]
-    assert "network.onnx" in printed and "rms" in printed
-    assert measured["displacement_largest"] <= 1e-5 and measured["position_largest"] <= 1e-3
-    assert measured["ate"] == pytest.approx(measured["ate_of_package"], abs=1e-3)
-
-
-def test_a_conversion_that_is_off_is_refused():
-    off = Deviation(1e-4, 1e-4, 0.0, 1.0, 1.0)
-    with pytest.raises(ValueError, match=r"walk: .* off by 0\.0001 m a window"):
-        check(off, "walk")
-
-
 @pytest.mark.parametrize(
-    "arguments, words",
+    ("arguments", "words"),
     [
         (["untrained", "--out", "taken"], "taken: is there already"),
         (["untrained"], "untrained/checkpoints/best: holds no checkpoint"),
-        (["untrained", "--to", "torch"], "--to: unknown option"),
+        (None, "gnio export: needs the package jax2onnx; pip install 'gnio-jax[onnx]'"),
     ],
 )
-def test_mistakes(run, tmp_path, monkeypatch, capsys, arguments, words):
-    for name in PACKAGES:  # as if they were installed: none is needed so early
-        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
-    assert words in refused(run, tmp_path, monkeypatch, capsys, arguments)
-
-
-def test_a_missing_package_is_named(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "jax2onnx", None)  # as if it were not installed
-    words = "gnio export: needs the package jax2onnx; pip install 'gnio-jax[onnx]'"
-    assert words in refused(run, tmp_path, monkeypatch, capsys, ["untrained"])
-
-
-def refused(run, folder, monkeypatch, capsys, arguments):
-    """The line on stderr of a command that leaves nothing behind."""
-    monkeypatch.chdir(folder)
-    (folder / "taken").mkdir()
-    (folder / "taken" / "thesis.tex").touch()
-    (folder / "untrained").mkdir()
-    shutil.copy(run / "config.yaml", folder / "untrained")
+def test_mistakes_are_one_line_and_leave_nothing_behind(
+    run, tmp_path, monkeypatch, capsys, arguments, words
+):
+    for name in PACKAGES:  # as if they were installed, or not: none is needed so early
+        there = types.ModuleType(name) if arguments else None
+        monkeypatch.setitem(sys.modules, name, there)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "thesis.tex").touch()
+    (tmp_path / "untrained").mkdir()
+    shutil.copy(run / "config.yaml", tmp_path / "untrained")
     with pytest.raises(SystemExit, match="2"):
-        console.run(lambda: app.main(["export", *arguments]))
+        console.run(lambda: app.main(["export", *(arguments or ["untrained"])]))
     error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert not (folder / "exports").exists()
-    return error
+    assert words in error and error.count("\n") == 1
+    assert not (tmp_path / "exports").exists()
 
 
 def library(folder):

@@ -1,7 +1,5 @@
 """An IMU on a tracked body: known mountings must come back, whatever the rates of its sensors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,8 +15,7 @@ LEVER = np.array([-0.02, 0.08, 0.01])
 TILT = np.array([0.02, -0.01])
 
 
-def upward(tilt):
-    return np.array([*tilt, 1.0]) / np.linalg.norm([*tilt, 1.0])
+UP = np.array([*TILT, 1.0]) / np.linalg.norm([*TILT, 1.0])
 
 
 def imu(gyro_hz=100.0, accel_hz=100.0, lag=0.0, late=0.0, bias=0.0, start=-2.0, stop=42.0):
@@ -36,15 +33,14 @@ def imu(gyro_hz=100.0, accel_hz=100.0, lag=0.0, late=0.0, bias=0.0, start=-2.0, 
 def tracked(hz=100.0):
     """The marker body of that IMU, in a tilted world."""
     time = np.arange(0.0, 40.0, 1.0 / hz)
-    tilted = Rotation.align_vectors(upward(TILT)[None], [[0.0, 0.0, 1.0]])[0]
+    tilted = Rotation.align_vectors(UP[None], [[0.0, 0.0, 1.0]])[0]
     attitude = tilted * walk.attitude(time) * EXTRINSIC.inv()
     position = tilted.apply(walk.position(time)) - attitude.apply(LEVER)
     return Poses(time, attitude, position, noisy=True)
 
 
 @pytest.mark.parametrize(
-    ("gyro_hz", "accel_hz", "track_hz"),
-    [(100.0, 100.0, 100.0), (90.3, 107.1, 60.0), (10.0, 10.0, 40.0)],
+    ("gyro_hz", "accel_hz", "track_hz"), [(90.3, 107.1, 60.0), (10.0, 10.0, 40.0)]
 )
 def test_a_known_mounting_is_found_on_a_late_clock(gyro_hz, accel_hz, track_hz):
     bias = np.array([0.01, -0.005, 0.02])
@@ -53,7 +49,7 @@ def test_a_known_mounting_is_found_on_a_late_clock(gyro_hz, accel_hz, track_hz):
     found = body.align(streams, track)
     assert np.degrees((found.extrinsic * EXTRINSIC.inv()).magnitude()) < 0.1
     np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
-    np.testing.assert_allclose(found.up, upward(TILT), atol=2e-3)
+    np.testing.assert_allclose(found.up, UP, atol=2e-3)
     np.testing.assert_allclose(found.gyro_bias, bias, atol=1e-3)
     np.testing.assert_allclose(found.lag, 0.7, atol=3e-3)
     assert found.accel_delay == pytest.approx(0.02, abs=3e-3)
@@ -70,50 +66,40 @@ def test_a_known_mounting_is_found_on_a_late_clock(gyro_hz, accel_hz, track_hz):
     np.testing.assert_allclose(place, yaw.apply(walk.position(event)), atol=0.02)
 
 
-def test_a_jump_of_the_tracker_bends_nothing_and_its_poses_are_left_out():
-    track = tracked()
-    jumped = (track.time > 20.0) & (track.time < 20.3)
+def test_jumps_and_drop_outs_and_repeated_rows_bend_nothing():
+    """The poses of a jump are left out, what the IMU did not measure is no evidence, and rows may
+    be out of order or there twice."""
+    streams, track, kept = imu(), tracked(), []
+    jumped = (track.time > 22.5) & (track.time < 22.8)
     track.position[jumped] += [0.4, 0.2, 0.1]
-    found = body.align(imu(), track)
-    np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
-    np.testing.assert_allclose(found.lag, 0.0, atol=3e-3)
-    kept = found.poses.time - found.lag.mean()
-    assert np.abs(kept[:, None] - [20.0, 20.3]).min() > 0.05
-    assert len(track.time) - 150 < len(kept) < len(track.time) - 20
-
-
-def test_what_the_imu_did_not_measure_is_no_evidence():
-    streams, kept = imu(), []
     for sensor in (streams.gyro, streams.accel):
-        measured = (sensor.time % 4.0 > 1.9) | (sensor.time < 1.0)
-        kept.append(sensor._replace(time=sensor.time[measured], values=sensor.values[measured]))
-    found = body.align(streams._replace(gyro=kept[0], accel=kept[1]), tracked())
-    np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
-    assert found.gyro_unexplained < 0.001 and found.accel_unexplained < 0.001
-
-
-def test_rows_out_of_order_and_stamps_that_are_there_twice_change_nothing():
-    streams, track = imu(), tracked()
-    rows = np.repeat(np.arange(len(streams.gyro.time)), 2)
-    rows[100:120] = rows[100:120][::-1]
-    gyro = Samples(streams.gyro.time[rows], streams.gyro.values[rows], "gyro")
-    found = body.align(streams._replace(gyro=gyro), track.rows(np.arange(8000) // 2))
+        rows = np.flatnonzero((sensor.time % 4.0 > 1.9) | (sensor.time < 1.0)).repeat(2)
+        rows[100:120] = rows[100:120][::-1]
+        kept.append(sensor._replace(time=sensor.time[rows], values=sensor.values[rows]))
+    found = body.align(streams._replace(gyro=kept[0], accel=kept[1]), track)
     np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
     np.testing.assert_allclose(found.lag, 0.0, atol=3e-3)
+    assert found.gyro_unexplained < 0.001 and found.accel_unexplained < 0.001
+    kept = found.poses.time - found.lag.mean()
+    assert np.abs(kept[:, None] - [22.5, 22.8]).min() > 0.05
+    assert len(track.time) - 150 < len(kept) < len(track.time) - 20
+    # Of a fit the worst tenth of the rows is not asked.
+    error = np.full((100, 3), 0.1)
+    error[:9] = 100.0
+    assert body.unexplained(error, np.ones((100, 3))) == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize(
-    ("streams", "problem"),
+    ("streams", "problem", "rows"),
     [
-        (imu(start=-20.0, stop=4.0), "less than 10 s of the track overlap"),
-        (imu(lag=60.0), "less than 10 s of the track overlap"),
-        (imu(stop=7.0), "less than 10 s are recorded in gyro"),
-        (imu()._replace(accel=imu(stop=7.0).accel), "less than 10 s are recorded in accel"),
+        (imu(lag=60.0), "less than 10 s of the track overlap", slice(None)),
+        (imu(stop=7.0), "less than 10 s are recorded in gyro", slice(None)),
+        (imu(), "poses in a row", np.flatnonzero(np.arange(4000) % 40 < 4)),
     ],
 )
-def test_too_short_an_overlap_is_refused(streams, problem):
+def test_too_little_is_refused(streams, problem, rows):
     with pytest.raises(body.TooLittle, match=problem):
-        body.align(streams, tracked())
+        body.align(streams, tracked().rows(rows))
 
 
 @pytest.mark.parametrize("strength", [0.5, 0.0])
@@ -134,14 +120,6 @@ def test_a_mounting_that_the_motion_does_not_tell_is_uncertain(strength):
         body.check_fit(fit, "track", {"mounting's uncertainty": (2.0, "°")})
 
 
-def test_a_track_of_single_poses_is_refused():
-    track = tracked()
-    rows = np.flatnonzero(np.arange(len(track.time)) % 40 < 4)
-    seldom = Poses(track.time[rows], track.attitude[rows], track.position[rows], noisy=True)
-    with pytest.raises(body.TooLittle, match="poses in a row"):
-        body.align(imu(), seldom)
-
-
 def test_poses_near_flips_and_jumps_are_dropped():
     time = np.arange(0.0, 5.0, 0.01)
     angles = np.zeros(len(time))
@@ -155,9 +133,6 @@ def test_poses_near_flips_and_jumps_are_dropped():
     assert lost == {round(0.01 * i, 2) for i in (*range(89, 114), *range(289, 311))}
     untouched = body.without_jumps(poses._replace(time=time * 100), 1e3, 1e3)
     assert len(untouched.time) == len(time)
-
-
-# --- parts
 
 
 def test_the_jacobians_are_the_differences_of_the_errors():
@@ -192,17 +167,7 @@ def test_whitened_errors_have_the_covariance_of_white_noise_with_shared_offsets(
     np.testing.assert_allclose(noise.whitened(jacobian)[:, 1], noise.whitened(jacobian[..., 1]))
 
 
-def test_the_worst_tenth_of_the_rows_is_not_held_against_a_fit():
-    signal = np.ones((100, 3))
-    error = 0.1 * signal
-    error[:9] = 100.0
-    assert body.unexplained(error, signal) == pytest.approx(0.01)
-
-
-# --- the lag alone
-
-
-@pytest.mark.parametrize(("lag", "hz"), [(-0.12, 100), (0.0, 30), (0.033, 60), (0.187, 100)])
+@pytest.mark.parametrize(("lag", "hz"), [(-0.12, 100), (0.033, 60)])
 def test_lag_from_noisy_rates_with_a_bias(lag, hz):
     noise = np.random.default_rng(1)
     time, stamps = np.arange(0, 60, 0.01), np.arange(0, 60, 1.0 / hz)

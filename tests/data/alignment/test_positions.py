@@ -1,7 +1,5 @@
 """A phone and tracked positions, against a walk in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -30,9 +28,11 @@ def phone(seconds, lag=0.0, drift=0.0, tilt=(0.0, 0.0)):
 
 
 def test_clock_and_attitude_are_found_and_a_relocalisation_does_not_matter():
+    """Nor what the tracker lost; each of its rows is there twice."""
     time = np.arange(3.0, 80.0, 0.01)
+    time = np.repeat(time[(time < 55.0) | (time > 70.0)], 2)
     position = walk.position(time)
-    position[5000:] += [2.0, -1.0, 0.3]  # the tracker relocalised
+    position[time > 53.0] += [2.0, -1.0, 0.3]  # the tracker relocalised
     streams = phone(85.0, lag=1.3, drift=0.003, tilt=(0.05, -0.03))
     found = positions.align_positions(streams, Samples(time, position, "track"))
     np.testing.assert_allclose(found.lag, 1.3, atol=0.01)
@@ -41,7 +41,7 @@ def test_clock_and_attitude_are_found_and_a_relocalisation_does_not_matter():
     poses = found.poses
     event = poses.time - 1.3
     error = (poses.attitude * walk.attitude(event).inv()).as_rotvec()
-    inner = (event > 6.0) & (event < 77.0) & (np.abs(event - 53.0) > 2.0)
+    inner = (event > 6.0) & (event < 77.0) & (np.abs(event - 61.5) > 10.5)
     assert np.degrees(np.linalg.norm(error[inner, :2], axis=1)).max() < 0.05
     assert np.degrees(np.abs(error[inner, 2])).max() < 2.0
     inner &= event < 50.0
@@ -50,30 +50,10 @@ def test_clock_and_attitude_are_found_and_a_relocalisation_does_not_matter():
     assert np.abs(poses.velocity - walk.velocity(event))[inner].max() < 0.2
 
 
-def test_what_the_tracker_lost_bends_nothing():
-    time = np.arange(0.0, 90.0, 0.01)
-    time = np.repeat(time[(time < 30.0) | (time > 65.0)], 2)  # each row is there twice
-    track = Samples(time, walk.position(time), "track")
-    found = positions.align_positions(phone(95.0, lag=0.8, drift=0.003), track)
-    np.testing.assert_allclose(found.lag, 0.8, atol=0.01)
-    assert found.yaw_drift == pytest.approx(0.003 * 90, abs=0.1)
-    poses = found.poses
-    error = (poses.attitude * walk.attitude(poses.time - 0.8).inv()).as_rotvec()
-    inner = (poses.time > 5.0) & (poses.time < 85.0)
-    assert np.degrees(np.abs(error[inner, :2])).max() < 0.5
-
-
-def test_positions_of_another_walk_do_not_correlate():
-    time = np.arange(0.0, 50.0, 0.01)
-    other = Samples(time, walk.position(1.3 * time), "track")
-    assert positions.align_positions(phone(50.0), other).correlation < 0.5
-
-
 @pytest.mark.parametrize(
     ("seconds", "lag", "device", "gain", "problem"),
     [
         (19.0, 0.0, 0.0, 1.0, "less than 20 s are recorded"),
-        (40.0, 35.0, 0.0, 1.0, "less than 20 s of moving positions overlap"),
         (40.0, 0.0, 0.0, 0.0, "less than 20 s of moving positions overlap"),
         (40.0, 0.0, 35.0, 1.0, "gyro, accelerometer and attitude share less than 20 s"),
     ],

@@ -4,10 +4,10 @@ One table over all layouts, of what users may get wrong and of what once was wro
 changes one file of the layout's known walk; `None` takes it away.
 """
 
-from __future__ import annotations
-
 import io
 import json
+import os
+import pickle
 
 import numpy as np
 import pytest
@@ -85,10 +85,6 @@ def fields(change):
 
 def put(name, rows, value):
     return fields(lambda arrays: arrays[name].__setitem__(rows, value))
-
-
-def only(name, rows):
-    return fields(lambda arrays: arrays.update({name: arrays[name][rows]}))
 
 
 def times(prefix, factor):
@@ -185,16 +181,12 @@ BAD = {
     "tlio": [
         (".npy", put("", (7, 0), 0.0), "'time'", "does not increase"),
         (".npy", put("", (8, slice(7, 11)), 0.0), "'qxyzw_World_Device'", "row 9"),
-        (".npy", put("", (9, 15), np.inf), "'vel_World'", "row 10"),
-        (".npy", times("", np.zeros((1, 1, 1))), "shape (1, 2400, 17)"),
-        (".npy", only("", np.s_[:, 1:]), "expected floats (N, 17)"),
-        (".npy", only("", np.s_[:0]), "shape (0, 17)"),
+        (".npy", fields(lambda x: x.update({"": x[""][:0]})), "shape (0, 17)"),
         ("description.json", written_as("{}"), "'columns_name(width)'"),
         ("description.json", described("ts_us 1", *TLIO[1:]), "ts_us 1"),
         ("description.json", described(*TLIO[:-1]), "'vel_World' is missing"),
         ("description.json", described(*WIDER), "width 4, expected 3"),
         ("description.json", once("deep"), "is no JSON"),
-        ("description.json", None, "cannot be read"),
         ("list.txt", LONG_NAME, "1 of 2 listed sequences are absent"),
     ],
     "oxiod raw": [("Test.txt", once("deep"), "entry '[[[")],
@@ -206,26 +198,17 @@ BAD = {
         ("imu1.csv", lines(lambda rows: rows[:300]), "holds 300 rows"),
         ("vi1.csv", scaled(slice(2, 5), 1e3), "looks like mm"),
         ("vi1.csv", scaled(8, 0.3), "hold a pose"),
-        ("vi1.csv", NARROWER, "has 8 columns, expected 9"),
     ],
     "oxiod Tango": [("imu1.csv", once("cell", 0.5, 0.5, "9" * 400), "")],
     "ronin": [
-        (".hdf5", put("synced/time", 9, 0.0), "'time'", "does not increase"),
         (".hdf5", put("synced/game_rv", 10, 0.0), "'synced/game_rv'", "not a unit quaternion"),
-        (".hdf5", put("pose/tango_ori", 0, 2.0), "'pose/tango_ori'", "not a unit quaternion"),
-        (".hdf5", once("type", 0.35, token="S8"), "field 'synced/game_rv' holds"),
+        (".hdf5", once("type", 0.45, token="S8"), "field 'synced/game_rv' holds"),
         (".hdf5", once("value", 0.6, 0.73, 1e9), "field 'gyro' is beyond 100 rad/s in 1 rows"),
-        (".json", about(imu_acce_scale=None), "'imu_acce_scale' is missing"),
-        (".json", about(imu_acce_bias=[0.1, 0.2]), "'imu_acce_bias'", "not hold 3 numbers"),
-        (".json", about(imu_init_gyro_bias="none"), "'imu_init_gyro_bias'", "not hold 3 numbers"),
         (".json", about(imu_init_gyro_bias=[10**400, 0, 0]), "'imu_init_gyro_bias'"),
         (".json", about(start_calibration=[1, 1, 0, 0]), "'start_calibration' is not a unit"),
         (".json", about(start_frame=1400), "'start_frame' is 1400, the recording has 1400 rows"),
-        (".json", about(start_frame=-1), "'start_frame' is -1"),
         (".json", about(start_frame="late"), "'start_frame' is no number"),
         (".json", about(grv_ori_error=None), "'grv_ori_error' is missing"),
-        (".json", about(ekf_ori_error=10**400), "field 'ekf_ori_error' is no number"),
-        (".json", once("deep"), "is no JSON"),
     ],
     "ridi table": [
         (".csv", scaled("time", 0.0), "'time'", "only 1 different stamps"),
@@ -234,37 +217,27 @@ BAD = {
     ],
     "ridi text": [
         ("/pose.txt", cell(91, 7, "2.0", " "), "not a unit quaternion"),
-        ("/pose.txt", None, "cannot be read"),
         ("/pose.txt", once("scale column", 0.0, 0.0, 1e-9), "field 'time' (-"),
         ("gyro.txt", once("scale column", 0.0, 0.0, 1e-3), "check the unit of the stamps"),
         ("gyro.txt", once("cell", 0.5, 0.0, "-1e30"), "field 'time' goes over"),
-        ("gyro.txt", once("scale column", 0.0, 0.0, 1e9), "field 'time' goes over"),
         ("acce.txt", once("scale column", 0.0, 0.0, 1e-9), "field 'time' gives"),
-        ("acce.txt", once("scale column", 0.0, 0.0, 0.5), "field 'time'"),
-        ("orientation.txt", once("scale column", 0.0, 0.0, 1e-9), "field 'time' gives"),
     ],
     "idol": [
         (".feather", times("timestamp", 0.0), "'timestamp' holds only 1 different stamps"),
-        (".feather", times("timestamp", 1e3), "expected 10 to 2000 Hz"),
         (".feather", times("iphoneAcc", 9.8), "'iphoneAcc' have a median length of 9.8", "1 (G)"),
         (".feather", put("orientW", 60, 3.0), "not a unit quaternion in 1 rows"),
         (".feather", times("processedPosX", np.nan), "hold a pose in only 0 of 1200 rows"),
         (".feather", times("stencilAcc", np.nan), "'stencilAcc' hold numbers in only 0 rows"),
-        (".json", written_as("{"), "is no JSON"),
-        (".json", once("deep"), "is no JSON"),
     ],
     "euroc": [
         (TRUTH, cells(few_poses), "holds 3 poses"),
         (TRUTH, cell(8, slice(4, 8), "0.0"), "'q_rs_w', 'q_rs_x'", "not a unit quater", "row 9"),
         (TRUTH, cells(lambda x: x[::40]), "field 'time'", "5 Hz, too slow for a reference"),
         ("imu0/data.csv", replaced("w_RS_S_y", "w_RS_S_q"), "'w_rs_s_y' is missing", "w_RS_S_q"),
-        ("imu0/data.csv", replaced("#timestamp [ns]", "#when"), "'timestamp' is missing", "when"),
         ("imu0/data.csv", once("stray line", 0.5, 0.5, "9" * 400), ""),
         (YAML, written_as("T_BS:\n  data: [1, 2, 3]\n"), "'T_BS' is no pose"),
-        (YAML, written_as("T_BS:\n  cols: 4\n"), "'T_BS' is no pose"),
         (YAML, written_as(HALF_POSE), "its rotation is none"),
         (YAML, written_as("a: [\n"), "cannot be read as YAML"),
-        (YAML, once("deep"), "cannot be read as YAML"),
         (YAML, once("content", token=NO_DATE), "cannot be read as YAML"),
         (YAML, once("content", token=BILLIONS), "field 'T_BS' is no pose"),
         (YAML, once("content", token=GALAXY), "field 'T_BS' is no pose"),
@@ -272,24 +245,16 @@ BAD = {
     "tumvi": [("mocap0/data.csv", once("column", 0.5, 0.2, "1e300"), "'position' is beyond")],
     "kitti packets": [
         (PACKET, cell(0, 17, "nan", " "), "'wx'"),
-        (PACKET, cell(0, 13, "inf", " "), "'az'"),
-        (PACKET, cell(0, 0, "nan", " "), "'lat'"),
         (PACKET, cell(0, 0, "1e300", " "), "field 'lat' is 1e+300"),
         (PACKET, HALF, "expected 30", "cut short"),
         (PACKET, replaced(" ", " x"), "no number"),
-        ("timestamps.txt", lines(lambda x: x[:-3]), "holds 697 stamps, but there is a packet 699"),
-        ("timestamps.txt", once("stray line", token="now"), "line 351 ('now') is no stamp"),
-        ("timestamps.txt", once("hole", 0.001, 0.12), "line 1 ('2011-09-26"),
+        ("timestamps.txt", lines(lambda x: x[:-3]), "holds 397 stamps, but there is a packet 399"),
+        ("timestamps.txt", once("stray line", token="now"), "line 201 ('now') is no stamp"),
         ("timestamps.txt", BLANK_STAMPS, "gives 1 packets a stamp"),
-        ("timestamps.txt", None, "cannot be read"),
     ],
-    "kitti npz": [
-        (".npz", put("t", 9, 0.0), "field 'time'", "does not increase", "row 10"),
-        (".npz", times("t", 10), "field 'time'", "10 Hz", "_extract"),
-    ],
+    "kitti npz": [(".npz", times("t", 10), "field 'time'", "10 Hz", "_extract")],
     "blackbird": [
         (".hdf5", put("traj_target", (7, slice(3, 7)), 0.0), "not a unit quaternion", "row 8"),
-        (".hdf5", put("ts", 8, 1_525_745_865.0), "field 'time'", "does not increase", "row 9"),
         ("imu.txt", lines(lambda rows: rows[:-5]), "'ts'", "695 and 700 rows"),
         ("imu.txt", lines(lambda rows: [rows[0], *rows[2:], rows[1]]), "'ts'"),
         ("imu.txt", NO_CELL, "has 10 columns"),
@@ -298,11 +263,8 @@ BAD = {
     ],
     "tyrex Nexus": [
         (".mat", track(lambda struct: struct.pop("RigidBodies")), "'RigidBodies'", "QTM"),
-        (".mat", track(lambda x: x["RigidBodies"].pop("Rotations")), "'RigidBodies'", "Rotations"),
         (".mat", track(lambda struct: struct.update(FrameRate=0.0)), "'FrameRate' is 0.0 Hz"),
-        (".mat", track(lambda x: x.update(FrameRate="fast")), "'FrameRate' is fast"),
         (".mat", body("Positions", lambda x: x[:2]), "'Positions'", ", 3)"),
-        (".mat", body("Positions", lambda x: x[:, :50]), "'Rotations' has shape", "(50, 9)"),
         (".mat", body("Positions", lambda x: x * 1e-3), "'Positions' spans", "give it in mm"),
         (".mat", body("Positions", lambda x: x * np.nan), "only 0 of", "frames hold a pose"),
         (".mat", body("Rotations", mirrored), "'Rotations' is no rotation in 1 frames", "frame 21"),
@@ -311,48 +273,31 @@ BAD = {
     ],
     "tyrex iPhone": [
         ("description.txt", written_as("[Time]\n"), "'BootTime' is missing"),
-        (
-            "description.txt",
-            written_as("BootTime = 12.5"),
-            "gyroscope.txt: field 'time'",
-            "one phone",
-        ),
+        ("description.txt", written_as("BootTime = 12.5"), "gyroscope.txt: field 'time'"),
         ("timeAlignment.txt", written_as("later"), "holds 'later'", "seconds"),
         ("gyroscope.txt", written_as(THREE), "3 columns, expected 4"),
-        (
-            "accelerometer.txt",
-            ANOTHER_PHONE,
-            "(column 0) begins",
-            "s after the record",
-            "one phone",
-        ),
+        ("accelerometer.txt", ANOTHER_PHONE, "(column 0) begins", "s after the r", "one phone"),
         ("accelerometer.txt", once("scale column", 0, 0, 1.03), "(column 0) ends 2.46e+03 s after"),
     ],
     "indoor_location": [
         (".txt", lines(lambda rows: [*rows[:99], rows[99][:-20]]), "is cut short", "in line 100"),
-        (".txt", lines(lambda rows: [*rows[:99], "15746"]), "line 100 is '15746'"),
         (".txt", lines(lambda rows: rows + rows), "'startTime' is there 2 times"),
         (".txt", NO_GYRO, "'TYPE_GYROSCOPE' holds 0"),
         (".txt", of_kind("WAYPOINT", *MONTH), "'TYPE_WAYPOINT' has 4 of 4 stamps", "one phone"),
-        (".txt", of_kind("ACCEL", *MONTH), "'TYPE_WAYPOINT'", "one phone"),
         (".txt", of_kind("GYRO", "\t0.", "\tnan\t0."), "'TYPE_GYROSCOPE' holds NaN"),
     ],
     "csv": [
         ("walk.csv", without("qx"), "column 'qx' is missing while 'qw' is there"),
-        ("walk.csv", without("pz"), "column 'pz' is missing"),
         ("walk.csv", cell(8, "time", "0.0"), "field 'time'", "does not increase", "row 9"),
         ("walk.csv", cell(9, "qw", "3.0"), "'qw', 'qx', 'qy', 'qz'", "not a unit quater", "row 10"),
         ("walk.csv", scaled("time", 1e3), "field 'time'", "look like ms: divide them by 1000"),
-        ("walk.csv", scaled("time", 1e9), "field 'time'", "look like ns: divide them by 1e+09"),
         ("walk.csv", scaled("time", 20.0), "field 'time'", "expected 10 to 2000 Hz"),
         ("walk.csv", once("hole", 0.3, 0.3), ""),
         ("walk.csv", once("cell", 0.5, 0.99, "1e30"), "'accel' is beyond 1000 m/s² in 1 rows"),
-        ("walk.csv", once("column", 0.5, 0.5, "1e30"), "field 'position' is beyond"),
         ("test.txt", LONG_NAME, "1 of 2 listed sequences are absent"),
     ],
     "hdf5": [
         (".h5", fields(lambda arrays: arrays.pop("accel")), "field 'accel' is missing"),
-        (".h5", put("gyro", 4, np.nan), "'gyro'", "row 5"),
         (".h5", fields(lambda x: x.update(velocity=b"fast")), "'velocity' is not an array of num"),
         (".h5", once("type", 0.17, token="bool"), "'device_orientation' is not an array"),
         (".h5", once("scale field", 0.7, token=1e9), "field 'time' runs at"),
@@ -364,7 +309,6 @@ GOOD = {
     "csv": [
         ("walk.csv", once("BOM")),
         ("walk.csv", once("cell", 0.5, 0.01, "1e30")),  # contradicts the position: not valid
-        ("walk.csv", once("cell", 0.5, 0.5, "1e6")),
         ("walk.csv", once("cell", 0.5, 0.5, "9" * 400)),  # infinite: not valid
     ],
     "hdf5": [(".h5", once("type", 0.28, token="<f4"))],
@@ -400,3 +344,53 @@ def test_what_is_harmless_is_read(case):
     damage, _ = changed(*case)
     result, said = check(case[0], [damage])
     assert not isinstance(result, InputError) and len(result) == 1 and said == "", said
+
+
+# --- what would execute when it is loaded: pickles in NumPy's files, tags of YAML
+
+
+class Bomb:
+    """Whoever unpickles it makes a folder."""
+
+    def __init__(self, folder):
+        self.folder = str(folder)
+
+    def __reduce__(self):
+        return os.mkdir, (self.folder,)
+
+
+def of_numpy(bomb):
+    out = io.BytesIO()
+    np.save(out, np.array([bomb], dtype=object), allow_pickle=True)
+    return out.getvalue()
+
+
+def of_numpy_zip(bomb):
+    """The gyro and accelerometer of an otherwise sound piece."""
+    arrays, _ = unpacked(".npz", *written("kitti npz").values())
+    return packed(".npz", arrays | {"u": np.array([bomb], dtype=object)}, {})
+
+
+def of_yaml(bomb):
+    return f"T_BS: !!python/object/apply:os.mkdir ['{bomb.folder}']\n".encode()
+
+
+@pytest.mark.parametrize(
+    ("layout", "ending", "make"),
+    [
+        ("tlio", ".npy", pickle.dumps),
+        ("tlio", ".npy", of_numpy),
+        ("kitti npz", ".npz", of_numpy_zip),
+        ("euroc", "imu0/sensor.yaml", of_yaml),
+    ],
+)
+def test_what_would_execute_is_refused_unexecuted(tmp_path, layout, ending, make):
+    (file,) = (file for file in written(layout) if file.endswith(ending))
+    content = make(Bomb(tmp_path / "trap"))
+    result, said = check(layout, [Damage(file, "content", token=content)])
+    assert isinstance(result, InputError) and file in said
+    assert not (tmp_path / "trap").exists(), "it was executed"
+    if make is not of_yaml:  # were pickles loaded, this would have seen it
+        loaded = np.load(io.BytesIO(content), allow_pickle=True)
+        _ = loaded["u"] if make is of_numpy_zip else loaded
+        assert (tmp_path / "trap").exists()

@@ -1,7 +1,4 @@
-"""IDOL: a known walk written in the authors' layout, traps included, must come back as the phone's,
-not the rig's."""
-
-from __future__ import annotations
+"""IDOL: a known walk, traps included, must come back as the phone's, not the rig's."""
 
 import sys
 
@@ -32,9 +29,7 @@ def compare(sequence):
     return time
 
 
-@pytest.mark.parametrize(
-    ("lag", "degrees"), [(0.0, 6.0), (0.19, 8.4), (-0.05, 0.0)], ids=lambda value: f"{value:g}"
-)
+@pytest.mark.parametrize(("lag", "degrees"), [(0.19, 8.4), (-0.05, 0.0)])
 def test_a_walk_comes_back_level_in_the_phones_frame_and_on_its_clock(tmp_path, lag, degrees):
     tilt = Rotation.from_rotvec(np.radians(degrees) * np.array([0.8, -0.6, 0.0]))
     (sequence,) = idol.read(write(tmp_path, frame(lag=lag, tilt=tilt)))
@@ -61,14 +56,10 @@ def wild(table):
     return pd.concat([table.iloc[:1].assign(timestamp=0.0), table], ignore_index=True)
 
 
-def unoriented(value):
-    """Core Motion's attitude is optional: a row that lacks it is no reason to refuse a walk."""
-
-    def change(table):
-        table.loc[100:102, CORE_MOTION] = value
-        return table
-
-    return change
+def unoriented(table):
+    """Core Motion's attitude is optional: rows that lack it are no reason to refuse a walk."""
+    table.loc[100:102, CORE_MOTION], table.loc[200:202, CORE_MOTION] = np.nan, 0.0
+    return table
 
 
 def thrown(row):
@@ -81,7 +72,7 @@ def thrown(row):
     return change
 
 
-TRAPS = [disordered, wild, unoriented(np.nan), unoriented(0.0), thrown(0), thrown(-1)]
+TRAPS = [disordered, wild, unoriented, thrown(0), thrown(-1)]
 
 
 @pytest.mark.parametrize("trap", TRAPS)
@@ -105,52 +96,41 @@ def test_poses_that_are_not_of_this_phone_are_refused(tmp_path, options, words):
         idol.read(write(tmp_path, frame(seconds=20.0, **options)))
 
 
-def test_a_hole_of_two_seconds_costs_two_seconds(tmp_path):
-    """Nothing of the hole is left for a filter to integrate."""
+def test_a_hole_of_two_seconds_costs_two_seconds(tmp_path, monkeypatch):
+    """Nothing of the hole is left for a filter to integrate. Rows without a pose are marked."""
     table = frame(seconds=38.0, lag=0.15)
+    table.loc[500:549, "processedPosY"] = np.nan
+    table.loc[1000:1049, ["orientW", "orientX"]] = np.nan
+    table.loc[3000:3049, ["orientW", "orientX", "orientY", "orientZ"]] = 0.0
     time = table["timestamp"] - EPOCH
     path = write(tmp_path, table[(time < 19.0) | (time > 21.3)])
-    words = r"field 'time' has gaps longer than 1 s \(1, up to 2\.3 s\); kept: 35\."
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pyarrow", None)
+        words = r"3\.feather: needs the package pyarrow.*pip install 'gnio-jax\[idol\]'"
+        with pytest.raises(InputError, match=words):
+            idol.read(path)
+    words = r"field 'time' has gaps longer than 1 s \(1, up to 2\.3 s\); kept: 3[45]\."
     with pytest.warns(UserWarning, match=words):
         pieces = idol.read(path)
-    assert sum(piece.valid.sum() for piece in pieces) / 100.0 >= 35.0
+    assert sum(piece.valid.sum() for piece in pieces) / 100.0 >= 33.3
     assert [piece.name for piece in pieces] == [f"building1_known_3_piece{k}" for k in (1, 2)]
     for piece in pieces:
         compare(piece)
         assert piece.attributes["lag"] == pytest.approx(0.15, abs=3e-3)
+        time = piece.time + piece.attributes["start_time"] - EPOCH + 0.15
+        for middle in (5.25, 10.25, 30.25):
+            assert not piece.valid[np.abs(time - middle) < 0.2].any()
     assert pieces[1].attributes["start_time"] - EPOCH == pytest.approx(21.3, abs=0.02)
-
-
-def test_rows_without_a_pose_are_marked(tmp_path):
-    table = frame()
-    table.loc[1000:1049, "processedPosY"] = np.nan
-    table.loc[2000:2049, ["orientW", "orientX"]] = np.nan
-    table.loc[3000:3049, ["orientW", "orientX", "orientY", "orientZ"]] = 0.0
-    (sequence,) = idol.read(write(tmp_path, table))
-    for middle in (10.25, 20.25, 30.25):
-        assert not sequence.valid[np.abs(sequence.time - middle) < 0.2].any()
-    assert sequence.valid.mean() > 0.95
-    compare(sequence)
 
 
 def test_smoothed_positions_or_no_core_motion_leave_no_walk_out(tmp_path):
     """The authors' positions hold no gait: they do not correlate with the accelerometer, as little
     as a wrong time would."""
-    table = frame()
+    table = frame(seconds=20.0).drop(columns=CORE_MOTION[1])
     time = table["timestamp"] - EPOCH
     for axis, place in zip("XYZ", (0.9 * time, 0.3 * np.sin(time / 4.0), 1.0), strict=True):
         table[f"processedPos{axis}"] = place
-    table[CORE_MOTION] = 0.0
-    for each in (table, table.drop(columns=CORE_MOTION[1])):
-        (sequence,) = idol.read(write(tmp_path, each))
-        check = check_sequence(sequence, idol.DATASET)
-        assert check.failures == () and check.accel_correlation_horizontal < 0.3
-        assert sequence.device_orientation is None and sequence.valid.all()
-
-
-def test_without_pyarrow_it_says_what_to_install(tmp_path, monkeypatch):
-    path = write(tmp_path, frame(seconds=15.0))
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    words = r"3\.feather: needs the package pyarrow.*pip install 'gnio-jax\[idol\]'"
-    with pytest.raises(InputError, match=words):
-        idol.read(path)
+    (sequence,) = idol.read(write(tmp_path, table))
+    check = check_sequence(sequence, idol.DATASET)
+    assert check.failures == () and check.accel_correlation_horizontal < 0.3
+    assert sequence.device_orientation is None and sequence.valid.all()

@@ -1,7 +1,5 @@
 """Real recordings of every dataset that may be had must be physical: one table of bounds."""
 
-from __future__ import annotations
-
 import warnings
 from typing import NamedTuple
 
@@ -16,16 +14,11 @@ from gnio_jax.numerics import rotations
 class Bounds(NamedTuple):
     """What the self-check may find, and what the attributes say within a margin."""
 
-    correlation: float
-    """Of the horizontal accelerations, at least."""
-    degrees: float
-    """Of the gyro in 10 s, at most."""
-    speed: tuple[float, float]
-    """Of the median, m/s."""
-    gravity: float
-    """m/s² by which the mean of R·accel may be off."""
-    valid: float
-    """Share of the samples, at least."""
+    correlation: float  # of the horizontal accelerations, at least
+    degrees: float  # of the gyro in 10 s, at most
+    speed: tuple[float, float]  # of the median, m/s
+    gravity: float  # m/s² by which the mean of R·accel may be off
+    valid: float  # share of the samples, at least
     seconds: tuple[float, float]
     about: dict[str, tuple[float, float]] = {}
 
@@ -72,8 +65,15 @@ REAL = {
 FOLDERS = {"ridi": "kiod", "tlio": "tlio_layout"}
 
 
+def cases():
+    """One of every dataset is among the quick tests."""
+    quick = {real[0]: real for real in reversed(REAL)}
+    for real in REAL:
+        yield pytest.param(real, marks=() if quick[real[0]] == real else pytest.mark.slow)
+
+
 @pytest.mark.recordings
-@pytest.mark.parametrize("real", REAL, ids="-".join)
+@pytest.mark.parametrize("real", [*cases()], ids="-".join)
 def test_a_real_recording_is_physical(recordings, real):
     name, split, walk, form = real
     root, dataset, bounds = recordings / FOLDERS.get(name, name), data.get(name), REAL[real]

@@ -1,7 +1,5 @@
 """Which recordings of a copy make a split, in every dataset: one table. Nothing is read."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path
@@ -9,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data.readers import csv_files, euroc, kitti, oxiod, ronin
+from gnio_jax.data.readers import euroc, kitti, oxiod, ronin
 from gnio_jax.data.splits import held_out
 from gnio_jax.errors import InputError
 
@@ -174,29 +172,21 @@ def test_splits(copied, name):
         assert len(said) == (split in absent) and all(absent[split] in each for each in said)
 
 
+HANDHELD, RUNNING = "deep/deeper/handheld", "deep/deeper/running"
 WRONG = [
     # dataset, what becomes of files (None: gone), split, problem
     ("ridi", {"deep/list_train_publish_v2.txt": "dan_bag1"}, "val", "would be empty"),
-    ("ridi", {"deep/list_test_publish_v2.txt": None}, "test", "the list cannot be read"),
     ("idol", {f"deep/building1/train/{n}.feather": None for n in range(2, 10)}, "val", "0 of 1"),
-    ("idol", {"deep/building3/unknown/0.feather": None}, "unseen", "holds no sequence"),
     ("euroc", {"V1_02_medium/mav0/imu0/data.csv": None}, "val", "sequences are V1_02_medium"),
     ("tumvi", {}, "test", "holds no sequence of split 'test'"),
     ("kitti", {"train__2011_09_26_drive_0009_extract0.npz": None}, "val", "none of its drives"),
-    ("tyrex", {"android/Guillaume_iPhone5_Dist_AR": None}, "val", "no walk of split 'val'"),
     ("indoor_location", {"site1/F3/path_data_files/x.txt": None}, "val", "the floors F3"),
-    ("csv", {}, "val", "val.txt: the list cannot be read"),
     ("csv", {"train.txt": None, "test.txt": None}, "train", "has no list train.txt; "),
     ("csv", {}, "readme", "unknown split 'readme'"),
     ("oxiod", {}, "unseen", "no recording of split 'unseen'"),
-    ("oxiod", {"deep/deeper/handheld/Train.txt": "data1/vi3.csv"}, "train", "'data1/vi3.csv'"),
-    ("oxiod", {"deep/deeper/handheld/Train.txt": "\n"}, "train", "Train.txt: the list is empty"),
-    (
-        "oxiod",
-        {f"deep/deeper/{s}/Test.txt": None for s in ("handheld", "running")},
-        "test",
-        "no scene has its list",
-    ),
+    ("oxiod", {f"{HANDHELD}/Train.txt": "data1/vi3.csv"}, "train", "'data1/vi3.csv'"),
+    ("oxiod", {f"{HANDHELD}/Train.txt": "\n"}, "train", "Train.txt: the list is empty"),
+    ("oxiod", {f"{HANDHELD}/Test.txt": None, f"{RUNNING}/Test.txt": None}, "test", "no scene has"),
     *((name, None, data.get(name).splits[-1], "expected layout: ") for name in COPIES),
 ]
 
@@ -208,7 +198,7 @@ def test_a_split_that_is_not_there_is_refused(copied, tmp_path, name, changes, s
         if text is not None:
             (root / place).write_text(text)
         else:
-            (root / place).rmdir() if (root / place).is_dir() else (root / place).unlink()
+            (root / place).unlink()
     with pytest.raises(InputError) as caught:
         next(data.load_each(name, root, split))
     assert str(caught.value).startswith(str(root)) and problem in str(caught.value)
@@ -236,7 +226,7 @@ def test_who_validates_does_not_depend_on_what_a_copy_holds(tmp_path):
     folder.mkdir(parents=True)
     entries = {str(n): {"subjectID": n % 20} for n in range(60)}
     (folder / "metadata.json").write_text(json.dumps(entries))
-    for people in (range(20), range(0, 20, 2), range(3), range(11, 17)):
+    for people in (range(20), range(0, 20, 2), range(11, 17)):
         for n in range(60):
             (folder / f"{n}.feather").unlink(missing_ok=True)
             if n % 20 in people:
@@ -248,14 +238,7 @@ def test_who_validates_does_not_depend_on_what_a_copy_holds(tmp_path):
     assert {entry["subjectID"] for entry in held} == {2, 13} and len(held) == 6
 
 
-def test_the_truth_chooses_an_orientation_where_one_trains_alone(copied, monkeypatch):
-    monkeypatch.setattr(ronin, "read", lambda _, choose: choose)
-    root = copied("ronin")
-    for split, choose in (("val", True), ("seen", False), ("unseen", False), ("test", False)):
-        assert [each.read() for each in ronin.recordings(root, split)] == [choose]
-
-
-def test_of_copies_the_first_is_taken_and_links_are_followed(copied, tmp_path):
+def test_of_copies_the_first_is_taken_and_links_are_followed(copied, tmp_path, monkeypatch):
     root = copied("ronin") / "unseen_subjects_test_set"
     (root / "later" / "a006_2").mkdir(parents=True)
     (root / "later" / "a006_2" / "data.hdf5").touch()
@@ -263,6 +246,10 @@ def test_of_copies_the_first_is_taken_and_links_are_followed(copied, tmp_path):
     with pytest.warns(UserWarning, match=twice):
         assert names("ronin", tmp_path, "unseen") == "a006_2"
     (root / "later" / "a006_2" / "data.hdf5").unlink()
+    # The truth chooses an orientation where one trains, and nowhere else.
+    monkeypatch.setattr(ronin, "read", lambda _, choose: choose)
+    for split, choose in (("val", True), ("seen", False), ("unseen", False), ("test", False)):
+        assert [each.read() for each in ronin.recordings(tmp_path, split)] == [choose]
     linked = tmp_path / "linked"
     linked.mkdir()
     (linked / "unseen").symlink_to(root)
@@ -271,23 +258,16 @@ def test_of_copies_the_first_is_taken_and_links_are_followed(copied, tmp_path):
     assert names("ronin", linked, "unseen") == "a006_2"
 
 
-def test_published_names_are_in_one_split_each_and_rooms_of_the_unseen_in_none():
+def test_splits_by_names_are_disjoint_and_what_is_unseen_is_of_another_room():
     for splits in (euroc.EUROC_SPLITS, euroc.TUMVI_SPLITS):
         every = [name for chosen in splits.values() for name in chosen]
         assert len(every) == len(set(every)) == {"V2_01_easy": 11}.get(splits["unseen"][0], 28)
     rooms = {split: {name[:2] for name in names} for split, names in euroc.EUROC_SPLITS.items()}
     assert not rooms.pop("unseen") & set.union(*rooms.values())
-
-
-def test_drives_are_shared_out_by_their_names():
     drives = [f"2011_{month:02d}_26_drive_{n:04d}" for month in (9, 10) for n in range(500)]
     shares = [kitti.share_of(drive) for drive in drives]
     for split, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
         assert shares.count(split) / len(drives) == pytest.approx(share, abs=0.04)
-
-
-def test_a_text_that_names_no_recording_is_no_list(copied):
-    assert csv_files.list_splits(copied("csv")) == ("train", "test", "winter")
 
 
 # --- the sessions of OxIOD

@@ -1,5 +1,4 @@
-"""TLIO's golden layout, written here with its traps, and read from the real recordings where they
-are."""
+"""TLIO's golden layout, written here with its traps."""
 
 import numpy as np
 import pytest

@@ -1,7 +1,4 @@
-"""Tyrex: a known walk written in the authors' layout, traps included, must come back as the
-phone's; real walks must be physical."""
-
-from __future__ import annotations
+"""Tyrex: a known walk in the authors' layout, traps included, must come back as the phone's."""
 
 import numpy as np
 import pytest
@@ -55,6 +52,10 @@ def test_a_record_that_pauses_is_two_walks(tmp_path):
         error = rotations(piece.orientation[piece.valid]) * walk.attitude(time).inv()
         assert np.degrees(error.magnitude()).max() < 0.5
         assert self_check(piece).failures == ()
+    (folder / "timeAlignment.txt").write_text("2.5")  # 3.4 s of the walk away: of another walk
+    with pytest.raises(Refusal, match=r"(stays unexplained|impossible values)") as caught:
+        tyrex.read(folder)
+    assert str(caught.value).startswith(f"{tyrex.walk_of(folder).track} and ")
 
 
 def test_an_accelerometer_that_clips_says_so(tmp_path, monkeypatch):
@@ -67,12 +68,3 @@ def test_an_accelerometer_that_clips_says_so(tmp_path, monkeypatch):
     assert 0.1 < (felt == 19.55).any(axis=1).mean() <= share < 0.6
     assert tyrex.clipped(1.2 * phone.accel.values) == 0.0  # of a phone with a wider range
     assert tyrex.clipped(0.9 * phone.accel.values) == 0.0
-
-
-def test_the_track_of_another_walk_is_refused(tmp_path):
-    folder = write(tmp_path)
-    (folder / "timeAlignment.txt").write_text("2.5")  # 3.4 s of the walk away
-    path = tyrex.walk_of(folder).track
-    with pytest.raises(Refusal, match=r"(stays unexplained|impossible values)") as caught:
-        tyrex.read(folder)
-    assert str(caught.value).startswith(f"{path} and ")

@@ -1,7 +1,4 @@
-"""The computed pedestrians obey physics, differ widely, and show in their IMU what a network shall
-learn."""
-
-import functools
+"""The computed pedestrians obey physics, differ widely, and show what a network shall learn."""
 
 import numpy as np
 import pytest
@@ -9,10 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.data.simulated import walks
-from gnio_jax.data.simulated.walker import CARRYING, MANY_PEOPLE, draw_motion
-from gnio_jax.errors import InputError
-
-RATE = 100.0
+from gnio_jax.data.simulated.walker import CARRYING
 
 
 @pytest.fixture(scope="module")
@@ -23,14 +17,6 @@ def val():
 @pytest.fixture(scope="module")
 def randomised():
     return [walks.random_walk(seed, 40.0) for seed in range(12)]
-
-
-@functools.cache
-def error_free(seed, placement):
-    rng = np.random.default_rng(seed)
-    time = np.arange(round(40.0 * RATE) + 1) / RATE
-    motion = draw_motion(rng, MANY_PEOPLE, placement, time, 1 / RATE)
-    return walks.walk_sequence(rng, "walk", motion, 1 / RATE, walks.PHONE, {}, imu_errors=False)
 
 
 def strap_down(sequence):
@@ -101,8 +87,6 @@ def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
     ]
     for values in zip(*(map(set, zip(*pairs, strict=True)) for pairs in found), strict=True):
         assert len(set.union(*values)) == sum(map(len, values))  # seeds, then people
-    with pytest.raises(InputError, match="unknown split 'dev'; known splits: train, val, test"):
-        data.load("synthetic", split="dev")
     names = [{each.name for each in walks.RANDOMISED.recordings(None, split)} for split in splits]
     assert sum(map(len, names)) == len(set.union(*names)) == 600 + 40 + 24
 
@@ -119,11 +103,6 @@ KNOWN = {
         [6570.717909661941, 43481.49970855106, 8982.95660633462],
         [2304.07557312174, 2838.0901640423767, 3220.1150007217034],
     ),
-    200005: (
-        [17.12432209650229, -16.86730792811519, -0.010144025394450723],
-        [6223.273728834688, 14162.67213369514, 17453.21575709797],
-        [530.6952463129243, 1902.1382035068507, 1480.27912035227],
-    ),
 }
 
 
@@ -138,43 +117,3 @@ def test_a_seed_is_the_walk_that_it_has_always_been(seed):
     np.testing.assert_allclose(walk.position[-1], end, rtol=1e-9)
     np.testing.assert_allclose(np.abs(walk.accel).sum(axis=0), accel, rtol=1e-9)
     np.testing.assert_allclose(np.abs(walk.gyro).sum(axis=0), gyro, rtol=1e-9)
-
-
-def surge_and_force(sequence):
-    """(velocity against the walker's own along the direction of travel, vertical force, speed), the
-    first by integrating the IMU's horizontal force over a second."""
-    force = Rotation.from_quat(sequence.orientation, scalar_first=True).apply(sequence.accel)
-    second = round(RATE)
-    travel = (sequence.position[second:] - sequence.position[:-second])[:, :2]
-    speed = np.linalg.norm(travel, axis=1)
-    surge = np.cumsum(force[:, :2], axis=0) / RATE
-    box = np.ones(second + 1) / (second + 1)
-    surge = surge - np.apply_along_axis(np.convolve, 0, surge, box, mode="same")
-    middle = slice(second // 2, -second // 2)
-    direction = travel / np.maximum(speed, 1e-6)[:, None]
-    return np.einsum("ni,ni->n", surge[middle], direction), force[middle, 2], speed
-
-
-@pytest.mark.parametrize("placement", ["handheld", "pocket"])
-def test_forward_is_told_from_backward_by_the_same_rule_for_nearly_all_walkers(placement):
-    found = []
-    for seed in range(12):
-        surge, vertical, speed = surge_and_force(error_free(seed, placement))
-        # Runs, which are told by their force, follow the opposite rule.
-        walking = (speed > 0.6) & (speed < 1.7)
-        force = np.convolve(np.abs(vertical - 9.81), np.ones(200) / 200, mode="same")
-        walking &= force < 3.0
-        if walking.sum() > 500:
-            found.append(np.corrcoef(surge[walking], vertical[walking])[0, 1])
-    assert len(found) >= 8
-    assert np.mean(np.array(found) > 0) >= 0.8 and np.mean(found) > 0.15
-
-
-def test_bounce_at_one_speed_differs_widely_between_walkers():
-    bounces = []
-    for seed in range(12):
-        _, vertical, speed = surge_and_force(error_free(seed, "handheld"))
-        walking = (speed > 0.9) & (speed < 1.3)
-        if walking.sum() > 200:
-            bounces.append(vertical[walking].std())
-    assert len(bounces) >= 5 and max(bounces) > 1.6 * min(bounces)
