@@ -26,6 +26,7 @@ from gnio_jax.filtering import (
     FilterHistory,
     FilterState,
     considered_covariance,
+    initial_state,
     over_sequences,
     run_filter,
     sensitivity,
@@ -264,12 +265,16 @@ def _repeated(
     walk: Inputs, settings: FilterSettings, config: FilterConfig
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], FilterState, Array]:
     """The run over one walk without the network, as a function of a start and displacements, with
-    the start and the displacements of the walk."""
+    the start and the displacements of the walk.
+
+    Here all three components of a raw gyro's bias are uncertain (ours). Otherwise the fit would
+    explain an unknown vertical component by noise.
+    """
     std = settings.start
-    level = std.gyro_bias
-    if settings.raw_gyro_bias is not None:  # the walk was prepared with it
-        level = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, level)
-    state = walk.start._replace(std=std, level_gyro_bias=level).state(config)
+    if settings.raw_gyro_bias is not None:
+        own = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, std.gyro_bias)
+        std = std._replace(gyro_bias=own)
+    state = initial_state(config, *walk.start[:4], std=std)
     assert walk.given is not None
     value, covariance, _ = walk.given
     fixed = config, settings.noise, walk.imu_valid, config.displacement_frame
