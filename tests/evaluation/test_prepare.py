@@ -7,6 +7,8 @@ from gnio_jax import evaluation
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
+from gnio_jax.filtering import FilterConfig
+from gnio_jax.filtering.state import GYRO_BIAS
 from gnio_jax.numerics import yaw
 from tests.support.estimators import CONFIG, RATE, ready, rotations
 
@@ -96,6 +98,12 @@ def test_a_raw_gyro_starts_with_a_wider_bias(walks, swaying, compensated):
     expected = 0.05 if compensated == "no" else own
     assert recording.start.level_gyro_bias == expected and own < 0.01
     assert recording.start.std.gyro_bias == own
+    state = recording.start.state(FilterConfig(1 / RATE, 10, 10))
+    up, covariance = np.asarray(state.rotation)[2], state.core_covariance[GYRO_BIAS, GYRO_BIAS]
+    assert 0.01 < up[2] < 0.99  # no axis of the phone is vertical
+    spreads = np.sqrt(np.linalg.eigvalsh(covariance))
+    np.testing.assert_allclose(spreads, [own, expected, expected], rtol=1e-6)
+    np.testing.assert_allclose(up @ covariance @ up, own**2, rtol=1e-6)
     assert recording.start.raw_gyro == (compensated == "no") and recording.placement == ""
     rest = resting(swaying, BIAS)._replace(attributes=attributes)
     (recording,) = ready([rest], gyro_bias="rest", raw_gyro_bias=0.05)
