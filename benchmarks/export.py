@@ -65,7 +65,7 @@ def measure(run: Any, models: driver.Models, drawn: Recording) -> dict[str, list
     apply = jax.jit(
         lambda window: network.apply(network.variables, window)._replace(diagnostics={})
     )
-    state = filtering.initial_state(setup.config, *drawn.start[:4], std=drawn.start.std)
+    state = drawn.start.state(setup.config)
     tracker = filtering.Tracker(apply, setup.config, setup.noise, state)
     arrays, dt = start_arrays(state, setup), setup.config.dt
     times: dict[str, list[float]] = defaultdict(list)

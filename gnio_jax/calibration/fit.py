@@ -242,8 +242,8 @@ def innovation_objective(
     chex.assert_equal_shape([free, start])
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> Array:
-        run, state, displacement = _repeated(walk, settings, config)
-        history = run(state, displacement)
+        run, displacement = _repeated(walk, settings, config)
+        history = run(_wide_start(walk, settings, config), displacement)
         # The padding of the walk comes after its last displacement, where the filter may diverge.
         present = jnp.isfinite(displacement).all(axis=1)
         healthy = jnp.all((history.healthy > 0) | ~present)
@@ -261,20 +261,29 @@ _value_and_gradient = jax.jit(
 )
 
 
-def _repeated(
-    walk: Inputs, settings: FilterSettings, config: FilterConfig
-) -> tuple[Callable[[FilterState, Array], FilterHistory], FilterState, Array]:
-    """The run over one walk without the network, as a function of a start and displacements, with
-    the start and the displacements of the walk.
-
-    Here all three components of a raw gyro's bias are uncertain (ours). Otherwise the fit would
-    explain an unknown vertical component by noise.
-    """
+def _wide_start(walk: Inputs, settings: FilterSettings, config: FilterConfig) -> FilterState:
+    """The start of a walk with all components of a raw gyro's bias uncertain (ours). Otherwise the
+    fit would explain an unknown vertical component by noise."""
     std = settings.start
     if settings.raw_gyro_bias is not None:
         own = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, std.gyro_bias)
         std = std._replace(gyro_bias=own)
-    state = initial_state(config, *walk.start[:4], std=std)
+    return initial_state(config, *walk.start[:4], std=std)
+
+
+def _start(walk: Inputs, settings: FilterSettings, config: FilterConfig) -> FilterState:
+    """The start of a walk as in an evaluation."""
+    level = settings.start.gyro_bias
+    if settings.raw_gyro_bias is not None:
+        level = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, level)
+    return walk.start._replace(std=settings.start, level_gyro_bias=level).state(config)
+
+
+def _repeated(
+    walk: Inputs, settings: FilterSettings, config: FilterConfig
+) -> tuple[Callable[[FilterState, Array], FilterHistory], Array]:
+    """The run over one walk without the network, as a function of a start and displacements, with
+    the displacements of the walk."""
     assert walk.given is not None
     value, covariance, _ = walk.given
     fixed = config, settings.noise, walk.imu_valid, config.displacement_frame
@@ -282,7 +291,7 @@ def _repeated(
     def run(state: FilterState, displacement: Array) -> FilterHistory:
         return run_filter(state, walk.gyro, walk.accel, displacement, covariance, *fixed)[1]
 
-    return run, state, jnp.asarray(value)
+    return run, jnp.asarray(value)
 
 
 def _prior(free: Float[Array, "u"], start: Float[Array, "u"]) -> Float[Array, ""]:
@@ -374,7 +383,8 @@ def _filtered(
     """For every walk: where the filter is healthy, its positions, their covariances and S."""
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
-        run, state, displacement = _repeated(walk, settings, config)
+        state = _start(walk, settings, config)
+        run, displacement = _repeated(walk, settings, config)
         history = run(state, displacement)
         found = sensitivity(run, state, displacement)
         assert history.covariance is not None

@@ -393,10 +393,11 @@ class FilterSettings:
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
     for weights trained that way."""
     raw_gyro_bias: NonNegative | None = None
-    """Standard deviation of the level components of the gyro's first bias if its phone subtracts no
-    bias, rad/s; the recording then has `imu_compensated: no` (ours). Gravity shows these components
-    to the filter; the vertical one keeps that of `start`. Waypoints show all three, so there it is
-    that of each axis. By default that of `start` is taken for every IMU."""
+    """Standard deviation of the gyro's first bias if its phone subtracts no bias, rad/s; the
+    recording then has `imu_compensated: no` (ours). In evaluation and tracking it is that of the
+    two components that are level at the start, and the vertical one keeps that of `start`. In
+    calibration, and for the poses of walks with waypoints, it is that of each axis. By default that
+    of `start` is taken for every IMU."""
 
 
 SHORTEST_HORIZON = 1.0

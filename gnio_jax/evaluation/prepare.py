@@ -58,8 +58,8 @@ class Start(NamedTuple):
     """First estimate, rad/s."""
     std: InitialStd
     level_gyro_bias: float
-    """Standard deviation of the level components of the gyro bias, rad/s; `std` has that of the
-    vertical one."""
+    """Standard deviation of the components of the gyro bias that are level at the start, rad/s;
+    `std` has that of the vertical one."""
     raw_gyro: bool
     """True if neither the phone nor a rest gave a first estimate of the gyro's bias."""
 

@@ -99,6 +99,14 @@ def check_number(name: str, value: Any, least: float, unit: str) -> None:
         raise ValueError(f"{name}: must be a number of at least {least:g} {unit}, found {value!r}")
 
 
+def check_std(name: str, value: Any) -> None:
+    """Refuse what is not one standard deviation."""
+    if np.shape(value) != ():
+        raise ValueError(f"{name}: must be one number, found shape {np.shape(value)}")
+    if not (isinstance(value, Tracer) or 0 <= float(value) < math.inf):
+        raise ValueError(f"{name}: must be a number of at least 0, found {float(value)}")
+
+
 def check_numbers(name: str, settings: Any) -> None:
     """Refuse a tuple of settings (`NoiseModel`, `InitialStd`, `ConsideredStd`) with a number
     outside the bounds of its field."""

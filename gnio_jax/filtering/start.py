@@ -26,7 +26,7 @@ from jaxtyping import Float
 from gnio_jax import geometry
 from gnio_jax.config import InitialStd
 from gnio_jax.config.schema import TLIO_STD
-from gnio_jax.filtering.checks import check_numbers, check_rotation, checked_array
+from gnio_jax.filtering.checks import check_numbers, check_rotation, check_std, checked_array
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState, Mean, without_clones
 from gnio_jax.numerics import finite_rows
@@ -68,10 +68,11 @@ def initial_state(
     deviations of their errors, which are independent. Raises `ValueError` naming an argument of
     wrong shape or precision.
 
-    level_gyro_bias, rad/s, is the standard deviation of the two level components of the gyro bias
-    where it is not std.gyro_bias (ours, for a raw gyro). Gravity shows these components within
-    seconds. Nothing shows the vertical one but the displacements, whose errors are temporally
-    correlated: a filter that learns it from them loses the yaw.
+    level_gyro_bias, rad/s, is the standard deviation of the two components of the gyro bias that
+    are level at the start, if it is not std.gyro_bias (ours, for a raw gyro). Gravity shows these
+    components to the filter. Without a rest and without fixes, only the displacements show the
+    vertical one, and their errors are temporally correlated: a filter that learns it from them
+    loses the yaw.
     """
     rotation = checked_array("rotation", rotation, (3, 3), config)
     check_rotation("rotation", rotation)
@@ -84,6 +85,8 @@ def initial_state(
         for name, value in given.items()
     ]
     check_numbers("std", std)
+    if level_gyro_bias is not None:
+        check_std("level_gyro_bias", level_gyro_bias)
     return without_clones(Mean(rotation, *vectors), std, config.clones, level_gyro_bias)
 
 

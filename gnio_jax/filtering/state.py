@@ -138,8 +138,8 @@ def without_clones(
     pose: Mean, std: InitialStd, clones: int, level_gyro_bias: Array | float | None = None
 ) -> FilterState:
     """The state at the start, in the precision of `pose`, with independent errors of `std`; the two
-    level components of the gyro bias have the standard deviation `level_gyro_bias`, rad/s, if it is
-    given.
+    components of the gyro bias that are level at the start have the standard deviation
+    `level_gyro_bias`, rad/s, if it is given.
 
     The whole uncertainty of the position is in the anchor, because there is no offset and no move
     yet.
@@ -152,9 +152,10 @@ def without_clones(
     core_std = jnp.repeat(each, np.array([2, 1, 3, 3, 3, 3, 3, 3]), total_repeat_length=CORE)
     covariance = jnp.diag(core_std**2)
     if level_gyro_bias is not None:
-        up = pose.rotation[2]
-        vertical, eye = up[:, None] * up[None, :], np.eye(3, dtype=dtype)
-        of_bias = level_gyro_bias**2 * (eye - vertical) + std.gyro_bias**2 * vertical
+        up = pose.rotation[2] / jnp.sqrt(jnp.sum(pose.rotation[2] ** 2))
+        eye = np.eye(3, dtype=dtype)
+        level = eye - up[:, None] * up[None, :]
+        of_bias = std.gyro_bias**2 * eye + (level_gyro_bias**2 - std.gyro_bias**2) * level
         covariance = covariance.at[GYRO_BIAS, GYRO_BIAS].set(of_bias.astype(dtype))
     return FilterState(
         rotation=pose.rotation,

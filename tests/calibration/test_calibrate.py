@@ -264,13 +264,17 @@ def test_the_gradient_is_that_of_the_likelihood():
 
 
 @pytest.mark.parametrize(("raw", "expected"), [(True, 0.05), (False, 1e-3)])
-def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(raw, expected):
+def test_noises_are_fitted_with_the_whole_bias_of_a_raw_gyro_uncertain(raw, expected):
     settings = dataclasses.replace(TRUE, raw_gyro_bias=0.05)
     walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
     walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
-    _, state, _ = fitting._repeated(walk, settings, fitting.innovation_config(DATA, settings))
-    found = np.sqrt(np.diag(state.core_covariance))[GYRO_BIAS]
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    given = walk, settings, fitting.innovation_config(DATA, settings)
+    spreads = (
+        np.sqrt(np.linalg.eigvalsh(start(*given).core_covariance[GYRO_BIAS, GYRO_BIAS]))
+        for start in (fitting._wide_start, fitting._start)
+    )
+    np.testing.assert_allclose(next(spreads), [expected] * 3, rtol=1e-9)
+    np.testing.assert_allclose(next(spreads), [1e-3, expected, expected], rtol=1e-9)
 
 
 def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told(monkeypatch):

@@ -99,6 +99,9 @@ def test_an_impossible_start_is_refused_by_name():
         ("accel_bias", np.zeros((3, 1))),
         ("std.tilt", -1.0),
         ("std.yaw", np.zeros(3)),
+        ("level_gyro_bias", -0.05),
+        ("level_gyro_bias", NAN),
+        ("level_gyro_bias", np.full(3, 0.05)),
     ):
         given = dict(zip(("rotation", "velocity", "position"), POSE, strict=True))
         name, _, part = field.partition(".")
