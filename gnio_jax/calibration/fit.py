@@ -20,13 +20,13 @@ from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flat
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate
 from gnio_jax.evaluation.estimate import Inputs
+from gnio_jax.evaluation.prepare import Start
 from gnio_jax.filtering import (
     ConsideredStd,
     FilterConfig,
     FilterHistory,
     FilterState,
     considered_covariance,
-    initial_state,
     over_sequences,
     run_filter,
     sensitivity,
@@ -243,7 +243,7 @@ def innovation_objective(
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> Array:
         run, displacement = _repeated(walk, settings, config)
-        history = run(_wide_start(walk, settings, config), displacement)
+        history = run(_wide_start(walk, settings).state(config), displacement)
         # The padding of the walk comes after its last displacement, where the filter may diverge.
         present = jnp.isfinite(displacement).all(axis=1)
         healthy = jnp.all((history.healthy > 0) | ~present)
@@ -261,22 +261,19 @@ _value_and_gradient = jax.jit(
 )
 
 
-def _wide_start(walk: Inputs, settings: FilterSettings, config: FilterConfig) -> FilterState:
-    """The start of a walk with all components of a raw gyro's bias uncertain (ours). Otherwise the
-    fit would explain an unknown vertical component by noise."""
-    std = settings.start
-    if settings.raw_gyro_bias is not None:
-        own = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, std.gyro_bias)
-        std = std._replace(gyro_bias=own)
-    return initial_state(config, *walk.start[:4], std=std)
-
-
-def _start(walk: Inputs, settings: FilterSettings, config: FilterConfig) -> FilterState:
+def _start(walk: Inputs, settings: FilterSettings) -> Start:
     """The start of a walk as in an evaluation."""
     level = settings.start.gyro_bias
     if settings.raw_gyro_bias is not None:
         level = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, level)
-    return walk.start._replace(std=settings.start, level_gyro_bias=level).state(config)
+    return walk.start._replace(std=settings.start, level_gyro_bias=level)
+
+
+def _wide_start(walk: Inputs, settings: FilterSettings) -> Start:
+    """The start with all components of a raw gyro's bias uncertain (ours). Otherwise the fit would
+    explain an unknown vertical component by noise."""
+    start = _start(walk, settings)
+    return start._replace(std=start.std._replace(gyro_bias=start.level_gyro_bias))
 
 
 def _repeated(
@@ -383,7 +380,7 @@ def _filtered(
     """For every walk: where the filter is healthy, its positions, their covariances and S."""
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
-        state = _start(walk, settings, config)
+        state = _start(walk, settings).state(config)
         run, displacement = _repeated(walk, settings, config)
         history = run(state, displacement)
         found = sensitivity(run, state, displacement)

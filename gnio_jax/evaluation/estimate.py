@@ -38,7 +38,7 @@ from gnio_jax.filtering import (
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION
 from gnio_jax.filtering.settings import FilterSetup
-from gnio_jax.filtering.state import GYRO_BIAS as CORE_GYRO_BIAS
+from gnio_jax.filtering.state import gyro_bias_covariance
 from gnio_jax.models import Network
 from gnio_jax.numerics import (
     filled_up,
@@ -286,7 +286,8 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) 
     orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
     poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
     std = np.repeat(np.array(start.std), [2, 1, 3, 3, 3, 3])
-    std[GYRO_BIAS] = np.sqrt(np.diag(start.state(ekf.config).core_covariance)[CORE_GYRO_BIAS])
+    of_bias = gyro_bias_covariance(start.rotation, start.std.gyro_bias, start.level_gyro_bias)
+    std[GYRO_BIAS] = np.sqrt(np.diag(of_bias))
     if ekf.considered is not None:
         std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], ekf.considered.gyro_bias)
     return Estimate(

@@ -8,7 +8,7 @@ Values are only known outside `jax.jit`. Inside it only shapes and precisions ar
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +19,7 @@ from jax.tree_util import keystr, tree_map_with_path
 
 from gnio_jax.config import NoiseModel
 from gnio_jax.config.files import bounds, named
+from gnio_jax.config.schema import Bound
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_error
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
@@ -99,12 +100,13 @@ def check_number(name: str, value: Any, least: float, unit: str) -> None:
         raise ValueError(f"{name}: must be a number of at least {least:g} {unit}, found {value!r}")
 
 
-def check_std(name: str, value: Any) -> None:
-    """Refuse what is not one standard deviation."""
-    if np.shape(value) != ():
-        raise ValueError(f"{name}: must be one number, found shape {np.shape(value)}")
-    if not (isinstance(value, Tracer) or 0 <= float(value) < math.inf):
-        raise ValueError(f"{name}: must be a number of at least 0, found {float(value)}")
+def check_bounds(name: str, number: Any, limits: Iterable[Bound]) -> None:
+    """Refuse what is neither None nor one number within the limits."""
+    if np.shape(number) != ():
+        raise ValueError(f"{name}: must be one number, found shape {np.shape(number)}")
+    for bound in limits:
+        if not (number is None or isinstance(number, Tracer) or bound.holds(float(number))):
+            raise ValueError(f"{name}: {bound.problem}, found {float(number)}")
 
 
 def check_numbers(name: str, settings: Any) -> None:
@@ -112,11 +114,7 @@ def check_numbers(name: str, settings: Any) -> None:
     outside the bounds of its field."""
     for field, hint, value in named(settings, f"{name}."):
         for number in value if isinstance(value, tuple | list) else (value,):
-            if np.shape(number) != ():
-                raise ValueError(f"{field}: must be one number, found shape {np.shape(number)}")
-            for bound in bounds(hint):
-                if not (number is None or isinstance(number, Tracer) or bound.holds(float(number))):
-                    raise ValueError(f"{field}: {bound.problem}, found {float(number)}")
+            check_bounds(field, number, bounds(hint))
 
 
 # The arguments of a run

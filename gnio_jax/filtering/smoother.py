@@ -163,9 +163,7 @@ class Adjoint(NamedTuple):
 def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
     """The adjoint before an update; `oldest` is the slot of the oldest clone."""
 
-    def measured(core: Array, clones: Array) -> Array:
-        return measurable_errors(correction.jacobian, core, clones, oldest)
-
+    measured = functools.partial(measurable_errors, correction.jacobian, oldest=oldest)
     rows = jnp.concatenate([correction.core, correction.clones], axis=1)
     blocks = jnp.concatenate(list(correction.jacobian.values()), axis=1).T
     transposed = jax.linear_transpose(measured, correction.core.T, correction.clones.T)

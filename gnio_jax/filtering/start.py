@@ -25,8 +25,8 @@ from jaxtyping import Float
 
 from gnio_jax import geometry
 from gnio_jax.config import InitialStd
-from gnio_jax.config.schema import TLIO_STD
-from gnio_jax.filtering.checks import check_numbers, check_rotation, check_std, checked_array
+from gnio_jax.config.schema import NOT_NEGATIVE, TLIO_STD
+from gnio_jax.filtering.checks import check_bounds, check_numbers, check_rotation, checked_array
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState, Mean, without_clones
 from gnio_jax.numerics import finite_rows
@@ -85,8 +85,7 @@ def initial_state(
         for name, value in given.items()
     ]
     check_numbers("std", std)
-    if level_gyro_bias is not None:
-        check_std("level_gyro_bias", level_gyro_bias)
+    check_bounds("level_gyro_bias", level_gyro_bias, [NOT_NEGATIVE])
     return without_clones(Mean(rotation, *vectors), std, config.clones, level_gyro_bias)
 
 

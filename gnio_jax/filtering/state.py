@@ -133,6 +133,16 @@ class FilterState(NamedTuple):
 
 
 # One program in place of thirty, which take three times as long at the first call.
+def gyro_bias_covariance(
+    rotation: Float[Array, "3 3"], vertical: Array | float, level: Array | float
+) -> Float[Array, "3 3"]:
+    """Covariance of a gyro bias in the body, by the standard deviations of its vertical component
+    and of each level one; rotation is body → world."""
+    up = rotation[2] / jnp.sqrt(jnp.sum(rotation[2] ** 2))
+    eye = np.eye(3, dtype=rotation.dtype)
+    return vertical**2 * eye + (level**2 - vertical**2) * (eye - up[:, None] * up[None, :])
+
+
 @functools.partial(jax.jit, static_argnames="clones")
 def without_clones(
     pose: Mean, std: InitialStd, clones: int, level_gyro_bias: Array | float | None = None
@@ -152,10 +162,7 @@ def without_clones(
     core_std = jnp.repeat(each, np.array([2, 1, 3, 3, 3, 3, 3, 3]), total_repeat_length=CORE)
     covariance = jnp.diag(core_std**2)
     if level_gyro_bias is not None:
-        up = pose.rotation[2] / jnp.sqrt(jnp.sum(pose.rotation[2] ** 2))
-        eye = np.eye(3, dtype=dtype)
-        level = eye - up[:, None] * up[None, :]
-        of_bias = std.gyro_bias**2 * eye + (level_gyro_bias**2 - std.gyro_bias**2) * level
+        of_bias = gyro_bias_covariance(pose.rotation, std.gyro_bias, level_gyro_bias)
         covariance = covariance.at[GYRO_BIAS, GYRO_BIAS].set(of_bias.astype(dtype))
     return FilterState(
         rotation=pose.rotation,

@@ -268,10 +268,10 @@ def test_noises_are_fitted_with_the_whole_bias_of_a_raw_gyro_uncertain(raw, expe
     settings = dataclasses.replace(TRUE, raw_gyro_bias=0.05)
     walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
     walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
-    given = walk, settings, fitting.innovation_config(DATA, settings)
+    config = fitting.innovation_config(DATA, settings)
+    states = (each(walk, settings).state(config) for each in (fitting._wide_start, fitting._start))
     spreads = (
-        np.sqrt(np.linalg.eigvalsh(start(*given).core_covariance[GYRO_BIAS, GYRO_BIAS]))
-        for start in (fitting._wide_start, fitting._start)
+        np.sqrt(np.linalg.eigvalsh(state.core_covariance[GYRO_BIAS, GYRO_BIAS])) for state in states
     )
     np.testing.assert_allclose(next(spreads), [expected] * 3, rtol=1e-9)
     np.testing.assert_allclose(next(spreads), [1e-3, expected, expected], rtol=1e-9)

@@ -237,3 +237,8 @@ def test_the_filter_starts_as_sure_as_its_options_say(walks, how):
     assert (own.yaw, own.gyro_bias) == (0.3, 0.02)
     wanted = np.repeat(np.array(own), [2, 1, 3, 3, 3, 3])
     np.testing.assert_allclose(found.states.std[0], wanted, rtol=1e-12)
+    raw = recordings[0].start._replace(level_gyro_bias=0.05)
+    (found, _) = imu_only([recordings[0]._replace(start=raw), recordings[1]])
+    up = raw.rotation[2]
+    wanted[9:12] = np.sqrt(0.05**2 * (1 - up**2) + 0.02**2 * up**2)
+    np.testing.assert_allclose(found.states.std[0], wanted, rtol=1e-9)

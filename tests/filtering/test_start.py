@@ -15,6 +15,19 @@ CONFIG = filtering.FilterConfig(DT, N, CLONES)
 level, slope_of_level = jax.jit(geometry.level), jax.jit(jax.jacrev(geometry.level))
 
 
+def test_the_bias_of_a_raw_gyro_is_uncertain_where_it_is_level():
+    """Also for a matrix that is a rotation up to the rounding of text files."""
+    rotation = (1 + 4e-4) * Rotation.from_euler("ZYX", [0.3, 0.7, 0.4]).as_matrix()
+    state = filtering.initial_state(
+        CONFIG, rotation, np.zeros(3), np.zeros(3), level_gyro_bias=0.05
+    )
+    covariance = state.core_covariance[9:12, 9:12]
+    found = np.sqrt(np.linalg.eigvalsh(covariance))
+    np.testing.assert_allclose(found, [1e-4, 0.05, 0.05], rtol=1e-6)
+    up = rotation[2] / np.linalg.norm(rotation[2])
+    np.testing.assert_allclose(covariance @ up, 1e-8 * up, atol=1e-15)
+
+
 @pytest.mark.parametrize("pitch", [0.7, -np.pi / 2])
 def test_level_state(pitch):
     """Upright, at an uncertain tilt by what the second's halves differ by and by 0.02 m/s²; less
