@@ -162,7 +162,7 @@ class DataConfig:
 @dataclass(frozen=True)
 class AugmentConfig:
     """Random changes of a training window, as in TLIO (the paper names none). Zero or false
-    switches a change off. Training through the filter uses only `yaw` (ours)."""
+    switches a change off. Training through the filter uses only `yaw` and the low-pass (ours)."""
 
     gyro_bias: NonNegative = 0.05
     """Half-width of the uniform constant gyro bias, rad/s."""
@@ -178,7 +178,7 @@ class AugmentConfig:
     """Shift a training window by up to this many samples either way, where the recording allows it
     (RoNIN, DeepILS)."""
     low_pass_share: Probability = 0.0
-    """Share of the windows whose two sensors pass a random low-pass, drawn for every window.
+    """Share of the windows, or segments, whose two sensors pass a random low-pass, drawn for each.
     Otherwise the network may recognise a phone by its bandwidth (ours, e.g. 0.5)."""
     low_pass_hertz: Annotated[tuple[Positive, Positive], FILE_ONLY] = (4.0, 25.0)
     """Lowest and highest cut-off of that low-pass, a Butterworth of order 1 to 3 that is passed
@@ -372,6 +372,9 @@ class ConsideredStd(NamedTuple):
     """Heading of the displacements, rad."""
     slope: Annotated[Number, NOT_NEGATIVE] = 0.0
     """Slope of the displacements, metres up for each metre forward."""
+    raw_gyro_bias: Annotated[Number, NOT_NEGATIVE] = 0.0
+    """Further error of the first bias of a raw gyro, along the vertical at the start, rad/s; the
+    recording has `imu_compensated: no` and no rest that shows the bias."""
 
 
 @dataclass(frozen=True)
@@ -410,7 +413,7 @@ Part = Literal["noise", "measurement", "start", "uncertainty", "head", "encoder"
 class ThroughFilter:
     """Training with the network in the filter's loop (ours), from the weights of `init_from`. The
     section `optim` counts segments of recordings instead of windows; `loss` is for windows alone,
-    and so is `augment` except its `yaw`."""
+    and so is `augment` except its `yaw` and low-pass."""
 
     learn: Annotated[tuple[Part, ...], Words("PART")] = ()
     """Parts that are trained through the filter. Without this option the network is trained on

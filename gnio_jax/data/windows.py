@@ -174,21 +174,30 @@ def shift_windows(
 
 def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: float) -> Windows:
     """Windows without the margins of `low_pass_margin`, of which a random share is low-passed
-    (ours).
+    (`random_low_pass`).
 
-    The network must not recognise a dataset by the spectrum that a phone's filter leaves.
-    Accelerometer and gyro pass the same Butterworth filter forward and back,
-    |H(f)|² = 1/(1 + (f/f_c)^2n), of order n from 1 to 3 and cut-off f_c uniform in its logarithm,
-    drawn anew for every window. Its phase is zero although a phone's filter is causal: readers
-    align the clocks of IMU and reference by their motion, which removes a constant delay, and a
-    delay of the IMU alone would shift the window relative to its displacement. The samples are
-    those of `gather`, already rotated. Attitude changes slowly compared with 4 Hz, gravity is not
-    changed, and biases, tilt and yaw may come after the filter.
+    The samples are those of `gather`, already rotated. Attitude changes slowly compared with 4 Hz,
+    gravity is not changed, and biases, tilt and yaw may come after the filter.
     """
     margin = low_pass_margin(config, rate)
     if not margin:
         return windows
-    imu = windows.imu
+    return windows._replace(imu=random_low_pass(key, windows.imu, config, rate)[:, margin:-margin])
+
+
+def random_low_pass(
+    key: PRNGKeyArray, imu: Float[jax.Array, "b n 6"], config: AugmentConfig, rate: float
+) -> Float[jax.Array, "b n 6"]:
+    """Signals of which a random share is low-passed (ours).
+
+    The network must not recognise a dataset by the spectrum that a phone's filter leaves.
+    Accelerometer and gyro pass the same Butterworth filter forward and back,
+    |H(f)|² = 1/(1 + (f/f_c)^2n), of order n from 1 to 3 and cut-off f_c uniform in its logarithm,
+    drawn anew for every signal. Its phase is zero although a phone's filter is causal: readers
+    align the clocks of IMU and reference by their motion, which removes a constant delay, and a
+    delay of the IMU alone would shift it relative to its reference. The signal is taken as
+    periodic, so it needs a margin on either side.
+    """
     count, length, _ = imu.shape
     share_key, order_key, cutoff_key = jax.random.split(key, 3)
     chosen = _uniform(share_key, (count,), 0.0, 1.0) < config.low_pass_share
@@ -199,12 +208,11 @@ def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: f
     power = (frequency[None] / cutoff[:, None]) ** (2 * order[:, None])
     spectrum = jnp.fft.rfft(imu, axis=1) / (1 + power)[:, :, None]
     smooth = jnp.fft.irfft(spectrum, length, axis=1)
-    imu = jnp.where(chosen[:, None, None], smooth, imu)
-    return windows._replace(imu=imu[:, margin:-margin])
+    return jnp.where(chosen[:, None, None], smooth, imu)
 
 
 def low_pass_margin(config: AugmentConfig, rate: float) -> int:
-    """Number of samples on either side of a window that `low_pass` needs: 0.25 s, beyond which
+    """Number of samples on either side that `random_low_pass` needs: 0.25 s, beyond which
     there are at most 2.4 % of the impulse response (of its absolute values) from 4 Hz on, and 6.6 %
     at 3 Hz. 0 without the filter."""
     return math.ceil(0.25 * rate) if config.low_pass_share else 0

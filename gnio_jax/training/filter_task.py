@@ -33,6 +33,7 @@ from gnio_jax.training.segments import (
     cut_segment,
     draw_start,
     joined,
+    low_passed,
     random_starts,
     segment_source,
     turned_segment,
@@ -89,7 +90,9 @@ class FilterTask(Task):
     def draw(
         self, key: PRNGKeyArray, source: SegmentSource, which: Int[jax.Array, "b"]
     ) -> tuple[Segment, Start]:
-        return self.segments(key, source, which, self.config.augment.yaw)
+        augment, rate = self.config.augment, self.config.data.rate
+        segments, starts = self.segments(key, source, which, augment.yaw)
+        return low_passed(jax.random.fold_in(key, 2), segments, augment, rate), starts
 
     def losses(
         self, variables: Any, batch: tuple[Segment, Start], step: Int[jax.Array, ""]

@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from gnio_jax import geometry
+from gnio_jax.config import AugmentConfig
+from gnio_jax.data.windows import low_pass_margin, random_low_pass
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import InitialStd
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, spans
@@ -172,6 +174,19 @@ def turned_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
     rotation, velocity, position = segment.truth
     truth = Path(jnp.einsum("ij,kjl->kil", turn, rotation), velocity @ turn.T, position @ turn.T)
     return segment._replace(truth=truth, waypoint=segment.waypoint @ turn[:2, :2].T)
+
+
+def low_passed(key: PRNGKeyArray, segments: Segment, config: AugmentConfig, rate: float) -> Segment:
+    """A batch of segments of which a random share is low-passed (`data.windows.random_low_pass`):
+    network and filter take the IMU of a slower sensor, in the frame of the body. Beyond its ends a
+    segment continues with its first and last sample. Jittable."""
+    margin = low_pass_margin(config, rate)
+    if not margin:
+        return segments
+    imu = jnp.concatenate([segments.accel, segments.gyro], axis=2)
+    imu = jnp.pad(imu, ((0, 0), (margin, margin), (0, 0)), "edge")
+    imu = random_low_pass(key, imu, config, rate)[:, margin:-margin]
+    return segments._replace(accel=imu[:, :, :3], gyro=imu[:, :, 3:])
 
 
 def draw_start(key: PRNGKeyArray, truth: Path, std: InitialStd, spread: float) -> Start:

@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.config import AugmentConfig
 from gnio_jax.filtering import InitialStd
 from gnio_jax.training import segments
 from gnio_jax.types import Sequence
@@ -76,6 +78,35 @@ def test_a_turned_segment_is_the_same_walk_in_a_turned_world():
     for name in ("velocity", "position"):
         expected = np.asarray(getattr(segment.truth, name)) @ turn.T
         np.testing.assert_allclose(getattr(found.truth, name), expected, atol=1e-12)
+
+
+def test_a_low_passed_segment_has_smaller_high_frequencies_and_the_same_truth():
+    """Sines of whole periods in the segment: the filter changes only their size, in both sensors
+    alike, away from the ends."""
+    rate, samples = 50.0, 200
+    source = segments.segment_source([sequence(samples + 1)], samples)
+    sine = np.sin(2 * np.pi * 5.0 * np.arange(samples + 1)[:, None] / rate)
+    source = source._replace(accel=9.81 + sine * [1.0, 2.0, 3.0], gyro=sine * [3.0, 1.0, 2.0])
+    one = segments.cut_segment(source, jnp.int32(0), 10, samples // 10)
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 60), one)
+    half = AugmentConfig(low_pass_share=0.5, low_pass_hertz=(4.0, 4.0))
+    found = segments.low_passed(jax.random.key(2), batch, half, rate)
+    assert found.gyro.dtype == found.accel.dtype == np.float64
+    others = (each._replace(gyro=0, accel=0) for each in (batch, found))
+    jax.tree.map(np.testing.assert_array_equal, *others)
+    one, found = jax.device_get((one, found))
+    inner = slice(25, -25)
+    sizes = np.einsum("bnc,nc->b", found.gyro[:, inner], one.gyro[inner])
+    sizes = sizes / np.sum(one.gyro[inner] ** 2)
+    of_orders = 1 / (1 + (5.0 / 4.0) ** (2 * np.array([0, 1, 2, 3])))
+    of_orders[0] = 1.0  # not low-passed
+    which = np.abs(sizes[:, None] - of_orders).argmin(axis=1)
+    np.testing.assert_allclose(sizes, of_orders[which], atol=0.01)
+    assert np.mean(which == 0) == pytest.approx(0.5, abs=0.2) and set(which) == {0, 1, 2, 3}
+    for signal, whole in ((found.gyro, one.gyro), (found.accel - 9.81, one.accel - 9.81)):
+        wanted = sizes[:, None, None] * whole[None, inner]
+        np.testing.assert_allclose(signal[:, inner], wanted, atol=0.03)
+    assert segments.low_passed(jax.random.key(2), batch, AugmentConfig(), rate) is batch
 
 
 def test_a_start_is_off_the_truth_by_the_priors_deviations():

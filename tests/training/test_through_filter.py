@@ -258,15 +258,15 @@ def test_a_skipped_step_does_not_shift_the_schedule(training, start):
     assert same(taken[0].variables, taken[1].variables)
 
 
-def test_training_segments_are_turned_by_any_yaw(training):
+def test_training_segments_are_turned_by_any_yaw_and_low_passed(training):
     training, source = training
     found = []
-    for yaw in (False, True):
-        augment = dataclasses.replace(training.config.augment, yaw=yaw)
+    for changes in ({"yaw": False}, {}, {"low_pass_share": 0.5}):
+        augment = dataclasses.replace(training.config.augment, **changes)
         config = dataclasses.replace(training.config, augment=augment)
         draw = jax.jit(dataclasses.replace(training, config=config).draw)
         found.append(draw(jax.random.key(0), source, jnp.zeros(64, jnp.int32)))
-    as_walked, turned = found
+    as_walked, turned, passed = found
     np.testing.assert_array_equal(as_walked[0].gyro, turned[0].gyro)
     np.testing.assert_array_equal(as_walked[1][3], turned[1][3])  # the gyro's first bias
     before, after = (np.asarray(found[0].truth.velocity[:, 0]) for found in (as_walked, turned))
@@ -274,6 +274,11 @@ def test_training_segments_are_turned_by_any_yaw(training):
     assert (before == before[0]).all()
     angle = np.arctan2(after[:, 1], after[:, 0])
     assert abs(np.exp(1j * angle).mean()) < 0.4  # all round the circle
+    jax.tree.map(
+        np.testing.assert_array_equal, (passed[1], passed[0].truth), (turned[1], turned[0].truth)
+    )
+    same_gyro = (passed[0].gyro == turned[0].gyro).all(axis=(1, 2))
+    assert 0.2 < same_gyro.mean() < 0.8
 
 
 def test_the_filter_in_training_has_a_slope_at_its_gate_is_cut_and_does_not_call_lapack(
