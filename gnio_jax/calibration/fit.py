@@ -49,7 +49,9 @@ GROUPS = {
     "window": ("noise.correlation",),
 }
 """The settings in each group of `--fit`."""
-CONSIDERED = ConsideredStd(gyro_bias=1e-3, scale=0.05, heading=math.radians(5.0), slope=0.02)
+CONSIDERED = ConsideredStd(
+    gyro_bias=1e-3, scale=0.05, heading=math.radians(5.0), slope=0.02, raw_gyro_bias=0.01
+)
 """The start of the fit of the consider covariance (ours)."""
 PHYSICAL = {
     "noise.gyro_density": (1e-6, 0.1),
@@ -315,6 +317,8 @@ class Positions(NamedTuple):
     """The filter's covariance, m²."""
     sensitivity: Float[np.ndarray, "k 3 6"]
     """S of the position."""
+    raw_axis: Float[np.ndarray, "k 3"]
+    """As `considered_covariance` takes it."""
 
 
 def fit_considered(
@@ -323,18 +327,22 @@ def fit_considered(
     """The standard deviations of the errors that the filter does not estimate which make the errors
     of its positions most likely; there is a position every `stride_seconds`.
 
-    The search always begins at `CONSIDERED`. Raises `InputError` if no position has a reference, or
-    if there is no likelihood.
+    The search always begins at `CONSIDERED`. The error of raw gyros remains 0 if no recording has
+    one. Raises `InputError` if no position has a reference, or if there is no likelihood.
     """
     if not len(positions.error):
         raise InputError("the filter", "is not healthy where these recordings have a reference")
-    settings = dataclasses.replace(settings, considered=CONSIDERED)
+    considered = CONSIDERED
+    if not positions.raw_axis.any():
+        considered = considered._replace(raw_gyro_bias=0.0)
+    settings = dataclasses.replace(settings, considered=considered)
     free = free_parameters(settings, ["considered"])
     names, start = tuple(free), np.array(list(free.values()))
     independent = len(positions.error) * stride_seconds / INDEPENDENT_SECONDS
 
     def covariance(std: ConsideredStd) -> Array:
-        return positions.covariance + considered_covariance(positions.sensitivity, std)
+        added = considered_covariance(positions.sensitivity, std, positions.raw_axis)
+        return positions.covariance + added
 
     def objective(free: Float[Array, "u"]) -> Array:
         std = with_free_parameters(settings, dict(zip(names, free, strict=True))).considered
@@ -359,33 +367,32 @@ def filtered_positions(
 ) -> Positions:
     """The positions of a filter over the walks, where it is healthy.
 
-    `truth` has the true positions after each stride, m; NaN where there is none. Walks with a raw
-    gyro are left out, unless all have one: the yaw of such a gyro drifts, which would be attributed
-    to the network's headings (ours).
+    `truth` has the true positions after each stride, m; NaN where there is none.
     """
-    healthy, position, covariance, of_position = jax.device_get(
+    healthy, position, *parts = jax.device_get(
         _filtered(walks, settings, config=filter_config(windows, settings))
     )
     error = truth - position
-    raw = np.asarray(walks.start.raw_gyro)
-    shown = ~raw | raw.all()
-    known = np.isfinite(error).all(axis=2) & (healthy > 0) & shown[:, None]
-    return Positions(error[known], covariance[known], of_position[known])
+    known = np.isfinite(error).all(axis=2) & (healthy > 0)
+    return Positions(*(part[known] for part in (error, *parts)))
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def _filtered(
     walks: Inputs, settings: FilterSettings, *, config: FilterConfig
-) -> tuple[Array, Array, Array, Array]:
-    """For every walk: where the filter is healthy, its positions, their covariances and S."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """For every walk: where the filter is healthy, its positions, their covariances and S, and the
+    axis of a raw gyro."""
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
-        state = _start(walk, settings).state(config)
+        start = _start(walk, settings)
+        state = start.state(config)
         run, displacement = _repeated(walk, settings, config)
         history = run(state, displacement)
         found = sensitivity(run, state, displacement)
         assert history.covariance is not None
         covariance = history.covariance[:, POSITION, POSITION]
-        return history.healthy, history.position, covariance, found[:, POSITION]
+        axis = jnp.tile(start.raw_axis[None], (len(covariance), 1))
+        return history.healthy, history.position, covariance, found[:, POSITION], axis
 
     return over_sequences(of_walk, shared=1)(settings, walks)

@@ -60,8 +60,7 @@ def calibrate(
     deviations those of its errors, which are compared with the reference window by window. Then the
     settings of `config.fit` are chosen so that the innovations of the filter are most likely; here
     the reference gives only the start. Last, the consider covariance is chosen so that the errors
-    of the filter's positions are most likely; it changes no trajectory. Recordings with a raw gyro
-    are not used in this step, unless all have one.
+    of the filter's positions are most likely; it changes no trajectory.
 
     The recordings are those of the validation split, or those of the training split, each with the
     displacements of a network that was not trained on it. Raises `InputError` for another split,

@@ -150,7 +150,7 @@ def perfect(ekf: FilterSetup) -> FilterSetup:
     """The filter for true displacements: without the settings that were calibrated for a
     network."""
     noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), measurement_scale=1.0, correlation=None)
-    considered = ekf.considered and ConsideredStd(gyro_bias=ekf.considered.gyro_bias)
+    considered = ekf.considered and ekf.considered._replace(scale=0.0, heading=0.0, slope=0.0)
     return ekf._replace(noise=noise, considered=considered)
 
 
@@ -262,7 +262,8 @@ def _run(
                 return run_filter(state, *signals, displacement, covariance, *fixed, frame)[1]
 
             found = sensitivity(repeated, state, displacement)
-            added = considered_covariance(found, considered)
+            axis = jnp.tile(own.start.raw_axis[None], (len(found), 1))
+            added = considered_covariance(found, considered, axis)
             diagonal = diagonal + jnp.diagonal(added, axis1=1, axis2=2)
             position = position + added[:, POSITION, POSITION]
         return history._replace(covariance_diagonal=diagonal, covariance=position)
@@ -288,8 +289,9 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) 
     std = np.repeat(np.array(start.std), [2, 1, 3, 3, 3, 3])
     of_bias = gyro_bias_covariance(start.rotation, start.std.gyro_bias, start.level_gyro_bias)
     std[GYRO_BIAS] = np.sqrt(np.diag(of_bias))
-    if ekf.considered is not None:
-        std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], ekf.considered.gyro_bias)
+    if (considered := ekf.considered) is not None:
+        std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], considered.gyro_bias)
+        std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], considered.raw_gyro_bias * start.raw_axis)
     return Estimate(
         recording.name,
         Trajectory(recording.time, *poses),

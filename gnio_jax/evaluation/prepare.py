@@ -26,7 +26,7 @@ from gnio_jax.numerics import (
     rotations,
     yaw_rotation,
 )
-from gnio_jax.types import Sequence, Waypoints
+from gnio_jax.types import Array, Sequence, Waypoints
 from gnio_jax.windows import true_displacement, window_starts
 
 REFERENCE_BIAS_SECONDS = 10.0
@@ -62,6 +62,12 @@ class Start(NamedTuple):
     `std` has that of the vertical one."""
     raw_gyro: bool
     """True if neither the phone nor a rest gave a first estimate of the gyro's bias."""
+
+    @property
+    def raw_axis(self) -> Float[Array, "3"]:
+        """Axis of the body along which the bias of a raw gyro is not estimated, the vertical at the
+        start; zero if the gyro is not raw."""
+        return self.raw_gyro * self.rotation[2]
 
     def state(self, config: FilterConfig) -> FilterState:
         """The start as a state of the filter."""

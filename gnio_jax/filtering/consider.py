@@ -16,6 +16,9 @@ The estimate, its gains and its innovations do not change. c has the error of th
 with the logarithm s of their scale, their heading ψ (rad) and their slope γ. S is the forward-mode
 derivative of the whole estimator, through every update that it made: of a whole run
 (`sensitivity`), or step by step while the filter runs (`step_with_tangents`).
+
+The bias of a raw gyro has a further error along one axis of the body, the vertical at the start: a
+filter that estimated it would learn it from the displacements' errors (`start.initial_state`).
 """
 
 from __future__ import annotations
@@ -49,14 +52,22 @@ point."""
 
 
 def considered_covariance(
-    sensitivity: Float[Array, "k d 6"], std: ConsideredStd
+    sensitivity: Float[Array, "k d 6"],
+    std: ConsideredStd,
+    raw_axis: Float[Array, "k 3"] | None = None,
 ) -> Float[jax.Array, "k d d"]:
-    """S C Sᵀ, to be added to P, for the given rows of S. Raises `ValueError` for a standard
-    deviation that is negative or not finite."""
+    """S C Sᵀ, to be added to P, for the given rows of S.
+
+    raw_axis has the axis of the body along which the bias of a raw gyro has the further standard
+    deviation `std.raw_gyro_bias`, and zeros where the gyro is not raw. None: no gyro is raw. Raises
+    `ValueError` for a standard deviation that is negative or not finite.
+    """
     check_numbers("considered", std)
-    bias, *others = std
-    each = jnp.stack([jnp.asarray(value) for value in (bias, bias, bias, *others)])
-    root = sensitivity * each[None, None]
+    each = (std.gyro_bias, std.gyro_bias, std.gyro_bias, std.scale, std.heading, std.slope)
+    root = sensitivity * jnp.stack([jnp.asarray(value) for value in each])[None, None]
+    if raw_axis is not None:
+        along = jnp.einsum("kdi,ki->kd", sensitivity[:, :, OF_BIAS], raw_axis)
+        root = jnp.concatenate([root, std.raw_gyro_bias * along[:, :, None]], axis=2)
     return jnp.einsum("kic,kjc->kij", root, root)
 
 

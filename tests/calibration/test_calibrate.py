@@ -397,12 +397,24 @@ def test_what_the_errors_were_drawn_with_is_found():
     wanted = np.array([2e-3, 2e-3, 2e-3, 0.1, np.deg2rad(8.0), 0.01])
     drawn = np.einsum("kij,kj->ki", root, rng.standard_normal((rows, 3)))
     error = drawn + np.einsum("kic,kc->ki", sensitivity, wanted * rng.standard_normal((rows, 6)))
-    positions = fitting.Positions(error, covariance, sensitivity)
-    options = changed(considered={"scale": 0.7})  # of an earlier calibration
+    positions = fitting.Positions(error, covariance, sensitivity, np.zeros((rows, 3)))
+    options = changed(considered={"scale": 0.7, "raw_gyro_bias": 0.3})  # of an earlier calibration
     found = fitting.fit_considered(positions, 0.1, options)
     assert found.before > 2 and found.after == pytest.approx(1, abs=0.05)
     np.testing.assert_allclose(
-        found.settings.considered, [2e-3, 0.1, np.deg2rad(8.0), 0.01], rtol=0.1
+        found.settings.considered, [2e-3, 0.1, np.deg2rad(8.0), 0.01, 0.0], rtol=0.1
+    )
+
+    axis = rng.standard_normal((rows, 3))
+    axis *= np.arange(rows)[:, None] % 2 / np.linalg.norm(axis, axis=1, keepdims=True)
+    bias = 0.02 * axis * rng.standard_normal((rows, 1))  # of every second row
+    error = error + np.einsum("kib,kb->ki", sensitivity[:, :, :3], bias)
+    found = fitting.fit_considered(
+        positions._replace(error=error, raw_axis=axis), 0.1, FilterSettings()
+    )
+    assert found.after == pytest.approx(1, abs=0.05)
+    np.testing.assert_allclose(
+        found.settings.considered, [2e-3, 0.1, np.deg2rad(8.0), 0.01, 0.02], rtol=0.1
     )
 
 
@@ -415,7 +427,9 @@ def test_the_prior_counts_as_many_independent_errors_as_there_are():
     covariance, sensitivity = np.tile(1e-4 * np.eye(3), (rows, 1, 1)), np.zeros((rows, 3, 6))
     sensitivity[:, 0, 5] = 1.0  # the slope alone, in metres for a unit
     found = fitting.fit_considered(
-        fitting.Positions(error, covariance, sensitivity), stride, FilterSettings()
+        fitting.Positions(error, covariance, sensitivity, np.zeros((rows, 3))),
+        stride,
+        FilterSettings(),
     )
     for name in ("gyro_bias", "scale", "heading"):
         assert getattr(found.settings.considered, name) == pytest.approx(
@@ -440,8 +454,8 @@ def nees(found):
 
 def test_positions_are_compared_with_the_truth_of_their_time():
     """Of simulated walks that are as the filter has them: their errors are those it reports, but
-    against the truth of a stride later they are not. A filter that fails is left out, and so is a
-    walk with a raw gyro, unless all are alike."""
+    against the truth of a stride later they are not. A filter that fails is left out, and a raw
+    gyro has the axis of its walk's start."""
     walks, truth = walks_and_truth()
     truth = truth.copy()
     options = changed(TRUE, noise={"measurement_scale": 9.0})  # σ is three times what is said
@@ -456,15 +470,21 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     accel[1, 100:] += 1e4
     marked = walks._replace(start=walks.start._replace(raw_gyro=raw), accel=accel)
     some = fitting.filtered_positions(marked, truth, DATA, options)
-    assert 0 < len(some.error) < 50 and np.abs(some.error).max() < 50
-    marked = walks._replace(start=walks.start._replace(raw_gyro=raw | True))
-    assert len(fitting.filtered_positions(marked, truth, DATA, options).error) == len(found.error)
+    assert np.isfinite(truth[0]).all(1).sum() < len(some.error) < len(found.error) - 100
+    assert np.abs(some.error).max() < 50
+    axes = np.where(raw[:, None], walks.start.rotation[:, 2], 0.0)
+    known = np.isfinite(truth).all(2)
+    np.testing.assert_allclose(
+        some.raw_axis[: known[0].sum()], np.tile(axes[0], (known[0].sum(), 1))
+    )
+    assert not some.raw_axis[known[0].sum() :].any() and not found.raw_axis.any()
 
 
 def test_no_positions_and_no_likelihood_are_named():
-    none = fitting.Positions(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 6)))
+    none = fitting.Positions(*(np.zeros((0, 3, *more)) for more in ((), (3,), (6,), ())))
     with pytest.raises(InputError, match="not healthy where these recordings have a reference"):
         fitting.fit_considered(none, 0.1, FilterSettings())
-    lost = fitting.Positions(np.ones((9, 3)), np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)))
+    ones = np.ones((9, 3))
+    lost = fitting.Positions(ones, np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)), ones)
     with pytest.raises(InputError, match="no positive definite covariance"):
         fitting.fit_considered(lost, 0.1, FilterSettings())

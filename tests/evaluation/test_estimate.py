@@ -118,38 +118,52 @@ def test_true_displacements_lack_nothing_that_was_calibrated(walks):
         np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
         std = found.displacements.std[-1]
         np.testing.assert_allclose(std, PERFECT_STD, rtol=1e-12)
-    considered = changed(calibrated, considered={"gyro_bias": 1e-3, "scale": 0.1})
-    left = perfect(filter_setup(CONFIG, considered)).considered
-    assert left == ConsideredStd(gyro_bias=1e-3)
+    of_gyro = {"gyro_bias": 1e-3, "raw_gyro_bias": 0.02}
+    considered = changed(
+        calibrated, considered={**of_gyro, "scale": 0.1, "heading": 0.1, "slope": 0.1}
+    )
+    assert perfect(filter_setup(CONFIG, considered)).considered == ConsideredStd(**of_gyro)
 
 
 def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks):
-    """By ∂p/∂b_g of the filter, here of a run whose gyro is off by a little, and whose network does
-    not look at its windows."""
+    """By ∂p/∂b_g of the filter, here of runs whose gyro is off by a little, and whose network does
+    not look at its windows. Of a raw gyro there is more along the vertical of the start."""
     recordings = ready(walks[:2], gyro_bias="reference")
+    raw = recordings[1].start._replace(raw_gyro=True)
+    recordings = [recordings[0], recordings[1]._replace(start=raw)]
     alike = network(0.0, -2.0, log_std_gain=0.0, constant=(0.9, 0.2, 0.02))
 
     def run(recordings, options):
         return tight(recordings, alike, options=options)
 
-    options = changed(OPTIONS, considered={"gyro_bias": 1e-3})
-    (plain, _), (found, _) = (run(recordings, each) for each in (OPTIONS, options))
-    np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
-    moved = []
-    for axis in 1e-5 * np.eye(3):
-        ahead, behind = (
-            run([with_gyro_bias(each, off) for each in recordings], OPTIONS)
-            for off in (axis, -axis)
+    options = changed(OPTIONS, considered={"gyro_bias": 1e-3, "raw_gyro_bias": 5e-3})
+    both = run(recordings, OPTIONS), run(recordings, options)
+    ahead, behind = (
+        [run([with_gyro_bias(each, off) for each in recordings], OPTIONS) for off in axes]
+        for axes in (1e-5 * np.eye(3), -1e-5 * np.eye(3))
+    )
+    for row, (plain, found) in enumerate(zip(*both, strict=True)):
+        np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
+        moved = np.stack(
+            [
+                (a[row].trajectory.position - b[row].trajectory.position) / 2e-5
+                for a, b in zip(ahead, behind, strict=True)
+            ],
+            axis=2,
         )
-        moved.append((ahead[0].trajectory.position - behind[0].trajectory.position) / 2e-5)
-    added = 1e-6 * sum(m[:, :, None] * m[:, None, :] for m in moved)
-    wanted = plain.filtered.covariance + added
-    assert added[-1].max() > 1e-6
-    np.testing.assert_allclose(found.filtered.covariance, wanted, rtol=1e-2, atol=1e-7)
-    std = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
-    np.testing.assert_allclose(found.states.std[:, 6:9], std, rtol=1e-2)
-    at_start = np.hypot(plain.states.std[0, 9:12], 1e-3)  # a constant bias is there from the start
-    np.testing.assert_allclose(found.states.std[0, 9:12], at_start, rtol=1e-12)
+        variance = 1e-6 * np.eye(3)
+        if row == 1:
+            up = raw.rotation[2]
+            variance = variance + 25e-6 * np.outer(up, up)
+        added = moved @ variance @ moved.swapaxes(1, 2)
+        wanted = plain.filtered.covariance + added
+        assert added[-1].max() > 1e-6
+        np.testing.assert_allclose(found.filtered.covariance, wanted, rtol=1e-2, atol=1e-6)
+        std = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
+        np.testing.assert_allclose(found.states.std[:, 6:9], std, rtol=1e-2)
+        # A constant bias is there from the start.
+        at_start = np.sqrt(plain.states.std[0, 9:12] ** 2 + np.diag(variance))
+        np.testing.assert_allclose(found.states.std[0, 9:12], at_start, rtol=1e-12)
 
 
 def with_gyro_bias(recording, off):

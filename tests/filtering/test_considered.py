@@ -22,7 +22,7 @@ NOISE = filtering.NoiseModel(
 )
 START = filtering.InitialStd(gyro_bias=1e-4, velocity=0.1)
 STD = filtering.ConsideredStd(gyro_bias=0.02, scale=0.1, heading=0.08, slope=0.05)
-SPREAD = np.array([*[STD.gyro_bias] * 3, *STD[1:]])
+SPREAD = np.array([*[STD.gyro_bias] * 3, *STD[1:4]])
 
 
 @functools.cache
@@ -129,9 +129,24 @@ def test_nothing_considered_adds_nothing_and_a_negative_size_is_refused():
     assert not np.any(filtering.considered_covariance(ones, filtering.ConsideredStd()))
     only = filtering.considered_covariance(ones, filtering.ConsideredStd(slope=2.0))
     np.testing.assert_array_equal(only, np.full((2, 15, 15), 4.0))
-    for name, wrong in (("scale", -1.0), ("slope", np.nan)):
+    for name, wrong in (("scale", -1.0), ("slope", np.nan), ("raw_gyro_bias", -0.1)):
         with pytest.raises(ValueError, match=rf"^considered\.{name}: must be finite and not neg"):
             filtering.considered_covariance(ones, STD._replace(**{name: wrong}))
+
+
+def test_the_bias_of_a_raw_gyro_is_considered_along_its_axis():
+    """Where the axis is zero, the gyro is not raw."""
+    rng = np.random.default_rng(3)
+    found, axis = rng.standard_normal((4, 15, 6)), rng.standard_normal((4, 3))
+    axis[1] = 0.0
+    plain = filtering.considered_covariance(found, STD)
+    raw = filtering.considered_covariance(found, STD._replace(raw_gyro_bias=0.3), axis)
+    for row in range(4):
+        along = 0.3 * found[row, :, :3] @ axis[row]
+        np.testing.assert_allclose(raw[row] - plain[row], np.outer(along, along), atol=1e-12)
+    np.testing.assert_array_equal(
+        filtering.considered_covariance(found, STD._replace(raw_gyro_bias=0.3)), plain
+    )
 
 
 class Told:
