@@ -153,10 +153,11 @@ def prepare(
         own_init, reference_note = init, ""
         if whole.waypoints is not None:
             own_init, reference_note = "static", OF_WAYPOINTS
-        start, start_note = _start(whole, measured, windows, bias, std, own_init)
-        if raw:
-            level = std.gyro_bias if raw_gyro_bias is None else raw_gyro_bias
-            start = start._replace(raw_gyro=True, level_gyro_bias=level)
+        rotation, velocity, position, own_std, start_note = _start(
+            whole, measured, windows, std, own_init
+        )
+        level = raw_gyro_bias if raw and raw_gyro_bias is not None else std.gyro_bias
+        start = Start(rotation, velocity, position, bias, own_std, level, raw)
         trusted, mask = whole.valid[:, None], whole.imu_valid
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
@@ -223,17 +224,15 @@ def _start(
     sequence: Sequence,
     measured: Int[np.ndarray, "m"],
     windows: DataConfig,
-    gyro_bias: Float[np.ndarray, "3"],
     std: InitialStd,
     init: Init,
-) -> tuple[Start, str]:
-    """The start, and a note about it."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, InitialStd, str]:
+    """Rotation, velocity and position at the start, their uncertainty, and a note about them."""
     if init == "reference":
         velocity = sequence.velocity[0]
         velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
         rotation = matrix_from_quaternion(sequence.orientation[0])
-        start = rotation, velocity, sequence.position[0], gyro_bias
-        return Start(*start, std, std.gyro_bias, False), ""
+        return rotation, velocity, sequence.position[0], std, ""
     second = measured[measured < round(windows.rate)]
     if 2 * len(second) < round(windows.rate):  # most of the first second was not measured
         second = measured[: round(windows.rate)]
@@ -241,14 +240,12 @@ def _start(
     level = level_state(config, sequence.gyro[second], sequence.accel[second], std)
     found = np.sqrt(np.diag(level.core_covariance))
     tilt_std, velocity_std = float(found[0]), float(found[3])
-    std = std._replace(tilt=tilt_std, velocity=velocity_std)
-    still = np.asarray(level.rotation), np.zeros(3), np.zeros(3), gyro_bias
-    start = Start(*still, std, std.gyro_bias, False)
-    if velocity_std <= ROUGH_START:
-        return start, ""
-    tilt = float(f"{np.degrees(tilt_std):.1g}")  # rounded, so that few different notes are made
-    sigma = f"one sigma: velocity {velocity_std:.1f} m/s, tilt {tilt:g}°"
-    return start, f"start: it moves, so the start is uncertain ({sigma})"
+    std, note = std._replace(tilt=tilt_std, velocity=velocity_std), ""
+    if velocity_std > ROUGH_START:
+        tilt = float(f"{np.degrees(tilt_std):.1g}")  # rounded, so that few different notes are made
+        sigma = f"one sigma: velocity {velocity_std:.1f} m/s, tilt {tilt:g}°"
+        note = f"start: it moves, so the start is uncertain ({sigma})"
+    return np.asarray(level.rotation), np.zeros(3), np.zeros(3), std, note
 
 
 def _gyro_bias(
