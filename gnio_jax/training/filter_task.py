@@ -173,8 +173,9 @@ class FilterTask(Task):
             "val_rmse": math.sqrt(found.window),
             "val_innovation": float(found.innovation),
             "val_state": float(found.state),
-            "val_waypoint_error": math.sqrt(found.waypoints),
         }
+        if held_out.tapped.any():
+            row["val_waypoint_error"] = math.sqrt(found.waypoints)
         # Roots of the squared errors of each horizon: relative to the distance, and in rad per
         # metre.
         for name in ("displacement", "yaw"):

@@ -149,13 +149,17 @@ class Task(ABC):
         self, state: TrainState, held_out: dict[str, Any], key: PRNGKeyArray
     ) -> tuple[TrainState, Row]:
         """The state that is kept, calibrated, and its figures on the validation split. For several
-        datasets these are means over the datasets, and the losses and errors of each are added."""
+        datasets these are means over the datasets that have them, and the losses and errors of each
+        are added."""
         state = self.calibrated(state, held_out)
         rows = {name: self.figures_of(state, each, key) for name, each in held_out.items()}
         first, *others = rows.values()
         if not others:
             return state, first
-        row: Row = {name: sum(each[name] for each in rows.values()) / len(rows) for name in first}
+        row: Row = {}
+        for figure in dict.fromkeys(itertools.chain(*rows.values())):
+            found = [each[figure] for each in rows.values() if figure in each]
+            row[figure] = sum(found) / len(found)
         for figure in ("val_loss", "val_mse", "val_rmse"):
             row |= {f"{figure}/{name}": each[figure] for name, each in rows.items()}
         return state, row

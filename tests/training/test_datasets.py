@@ -4,6 +4,7 @@ import dataclasses
 import signal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
@@ -18,6 +19,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import resolve
 from gnio_jax.training import checkpoint, loop, segments
 from gnio_jax.training.filter_task import FilterTask
+from gnio_jax.training.task import TrainState
 from gnio_jax.training.window_task import WindowTask
 from tests.support import tiny_run
 from tests.support.tiny_network import Tiny
@@ -121,6 +123,22 @@ def test_segments_are_visited_by_weight_too_each_in_its_share():
     inside = (order >= source.earliest[:, None]) & (order <= source.latest[:, None])
     assert list(inside.sum(axis=1)) == [1] * counts[0] + [2] * counts[1]
     np.testing.assert_array_equal(source.position[600:], walks[1].position)
+
+
+def test_the_mean_is_over_the_datasets_that_have_a_figure(run):
+    """Only walks with waypoints have an error at them."""
+
+    class Figures(WindowTask):
+        def figures_of(self, state, held_out, key):
+            return {**dict.fromkeys(("val_loss", "val_mse", "val_rmse"), 1.0), **held_out}
+
+        def calibrated(self, state, held_out):
+            return state
+
+    task = Figures(Tiny(), both(run), 1)
+    held_out = {"a": {"val_loss": 3.0}, "b": {"val_waypoint_error": 0.2}, "c": {}}
+    _, row = task.validate(TrainState(jnp.int32(0), {}, None), held_out, jax.random.key(0))
+    assert row["val_waypoint_error"] == 0.2 and row["val_loss"] == pytest.approx(5 / 3)
 
 
 def test_an_evaluation_says_of_which_dataset(run):

@@ -30,7 +30,8 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import resolve
 from gnio_jax.filtering.settings import with_free_parameters
 from gnio_jax.reporting import Silence
-from gnio_jax.training import checkpoint, loop, optimizer, task
+from gnio_jax.training import checkpoint, filter_task, loop, optimizer, task
+from gnio_jax.training.filter_losses import FilterLosses
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.recordings import set_up
 from gnio_jax.training.task import TrainState
@@ -101,6 +102,7 @@ def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished)
         assert row["skipped"] == 0
         assert row["val_rmse"] == pytest.approx(row["val_mse"] ** 0.5)
         assert row["val_nis"] > 0 and row["val_nees"] > 0
+        assert "val_waypoint_error" not in row  # these walks have none
         assert (
             row["gradient_norm/head/bias"] > 0
             and row["gradient_norm/filter/noise.gyro_density"] > 0
@@ -279,6 +281,17 @@ def test_training_segments_are_turned_by_any_yaw_and_low_passed(training):
     )
     same_gyro = (passed[0].gyro == turned[0].gyro).all(axis=(1, 2))
     assert 0.2 < same_gyro.mean() < 0.8
+
+
+def test_the_error_at_waypoints_is_logged_where_walks_have_them(training, start, monkeypatch):
+    training, source = training
+    horizons = np.ones(3)
+    found = FilterLosses(1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.09, 1.0, 1.0, True)
+    monkeypatch.setattr(filter_task, "validate", lambda *_, **__: found)
+    for tapped in (False, True):
+        walks = source._replace(tapped=np.arange(len(source.tapped)) < 7 * tapped)
+        row = training.figures_of(begun(training, start), walks, KEY)
+        assert row.get("val_waypoint_error") == (pytest.approx(0.3) if tapped else None)
 
 
 def test_the_filter_in_training_has_a_slope_at_its_gate_is_cut_and_does_not_call_lapack(
