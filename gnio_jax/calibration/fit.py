@@ -327,26 +327,49 @@ def fit_considered(
     """The standard deviations of the errors that the filter does not estimate which make the errors
     of its positions most likely; there is a position every `stride_seconds`.
 
-    The search always begins at `CONSIDERED`. The error of raw gyros remains 0 if no recording has
-    one. Raises `InputError` if no position has a reference, or if there is no likelihood.
+    The search always begins at `CONSIDERED`. Recordings with a raw gyro determine only the further
+    error of raw gyros, because the yaw that they lose would be attributed to the displacements. If
+    all have one, they determine the other errors, and that one is 0 (ours). Raises `InputError` if
+    no position has a reference, or if there is no likelihood.
     """
     if not len(positions.error):
         raise InputError("the filter", "is not healthy where these recordings have a reference")
-    considered = CONSIDERED
-    if not positions.raw_axis.any():
-        considered = considered._replace(raw_gyro_bias=0.0)
-    settings = dataclasses.replace(settings, considered=considered)
-    free = free_parameters(settings, ["considered"])
+    raw = positions.raw_axis.any(axis=1)
+    mixed = raw.any() and not raw.all()
+    begins = CONSIDERED._replace(raw_gyro_bias=0.0)
+    fitted = _most_likely_considered(
+        Positions(*(part[~raw] for part in positions)) if mixed else positions,
+        stride_seconds,
+        dataclasses.replace(settings, considered=begins),
+        "considered",
+    )
+    if mixed:
+        begins = fitted.considered._replace(raw_gyro_bias=CONSIDERED.raw_gyro_bias)
+        fitted = _most_likely_considered(
+            Positions(*(part[raw] for part in positions)),
+            stride_seconds,
+            dataclasses.replace(settings, considered=begins),
+            "considered.raw_gyro_bias",
+        )
+    before, after = (
+        float(jnp.mean(normalised_squares(positions.error, each))) / 3
+        for each in (positions.covariance, _reported(positions, fitted.considered))
+    )
+    return Considered(fitted, before, after)
+
+
+def _most_likely_considered(
+    positions: Positions, stride_seconds: float, settings: FilterSettings, path: str
+) -> FilterSettings:
+    """The settings with the most likely numbers of this path, from `settings`."""
+    free = free_parameters(settings, [path])
     names, start = tuple(free), np.array(list(free.values()))
     independent = len(positions.error) * stride_seconds / INDEPENDENT_SECONDS
 
-    def covariance(std: ConsideredStd) -> Array:
-        added = considered_covariance(positions.sensitivity, std, positions.raw_axis)
-        return positions.covariance + added
-
     def objective(free: Float[Array, "u"]) -> Array:
         std = with_free_parameters(settings, dict(zip(names, free, strict=True))).considered
-        return gaussian_nll(positions.error, covariance(std)) + _prior(free, start) / independent
+        likelihood = gaussian_nll(positions.error, _reported(positions, std))
+        return likelihood + _prior(free, start) / independent
 
     compiled = jax.jit(jax.value_and_grad(objective))
     found = minimize(
@@ -354,12 +377,13 @@ def fit_considered(
     )
     if not np.isfinite(found.fun):
         raise InputError("the filter", "has no positive definite covariance on these recordings")
-    fitted = with_written_parameters(settings, dict(zip(names, found.x, strict=True)), DIGITS)
-    before, after = (
-        float(jnp.mean(normalised_squares(positions.error, each))) / 3
-        for each in (positions.covariance, covariance(fitted.considered))
-    )
-    return Considered(fitted, before, after)
+    return with_written_parameters(settings, dict(zip(names, found.x, strict=True)), DIGITS)
+
+
+def _reported(positions: Positions, std: ConsideredStd) -> Array:
+    """The covariances of the positions, with the consider covariance."""
+    added = considered_covariance(positions.sensitivity, std, positions.raw_axis)
+    return positions.covariance + added
 
 
 def filtered_positions(

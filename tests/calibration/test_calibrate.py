@@ -406,16 +406,22 @@ def test_what_the_errors_were_drawn_with_is_found():
     )
 
     axis = rng.standard_normal((rows, 3))
-    axis *= np.arange(rows)[:, None] % 2 / np.linalg.norm(axis, axis=1, keepdims=True)
-    bias = 0.02 * axis * rng.standard_normal((rows, 1))  # of every second row
-    error = error + np.einsum("kib,kb->ki", sensitivity[:, :, :3], bias)
-    found = fitting.fit_considered(
-        positions._replace(error=error, raw_axis=axis), 0.1, FilterSettings()
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    bias = 0.02 * axis * rng.standard_normal((rows, 1))
+    with_bias = error + np.einsum("kib,kb->ki", sensitivity[:, :, :3], bias)
+    # The errors of scale are larger in the raw ones, which must not change the others.
+    with_bias += 0.15 * sensitivity[:, :, 3] * rng.standard_normal((rows, 1))
+    both = fitting.Positions(
+        np.concatenate([error, with_bias]),
+        *(np.concatenate([each, each]) for each in (covariance, sensitivity)),
+        np.concatenate([0 * axis, axis]),
     )
-    assert found.after == pytest.approx(1, abs=0.05)
-    np.testing.assert_allclose(
-        found.settings.considered, [2e-3, 0.1, np.deg2rad(8.0), 0.01, 0.02], rtol=0.1
-    )
+    mixed = fitting.fit_considered(both, 0.1, FilterSettings()).settings.considered
+    assert mixed[:4] == found.settings.considered[:4]
+    assert mixed.raw_gyro_bias == pytest.approx(0.02, rel=0.1)
+    alone = positions._replace(error=with_bias, raw_axis=axis)
+    every = fitting.fit_considered(alone, 0.1, FilterSettings()).settings.considered
+    assert every.raw_gyro_bias == 0.0 and every.gyro_bias > 5e-3 and every.scale > 0.15
 
 
 def test_the_prior_counts_as_many_independent_errors_as_there_are():
