@@ -18,7 +18,7 @@ from gnio_jax import config as configuration
 from gnio_jax.apps import export, rerun
 from gnio_jax.apps.importing import GAPS, Imported
 from gnio_jax.apps.packages import Weights
-from gnio_jax.config import TrainConfig
+from gnio_jax.config import ConsideredStd, TrainConfig
 from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
@@ -211,7 +211,10 @@ def summarise(
     error = float(np.sqrt(np.trace(filtered.covariance[rows - 1, :2, :2])))
     share = f" ({error / length:.1%} of the path)" if length >= 1.0 else ""
     counted = "with consider covariance"
-    if ekf.considered is None:
+    considered = ekf.considered or ConsideredStd()
+    if not ready.start.raw_gyro:
+        considered = considered._replace(raw_gyro_bias=0.0)
+    if not any(considered):
         counted = "without consider covariance (gnio calibrate fits it), "
         counted += "so the real error is probably larger"
     summary = Summary(

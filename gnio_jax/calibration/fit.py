@@ -329,8 +329,8 @@ def fit_considered(
 
     The search always begins at `CONSIDERED`. Recordings with a raw gyro determine only the further
     error of raw gyros, because the yaw that they lose would be attributed to the displacements. If
-    all have one, they determine the other errors, and that one is 0 (ours). Raises `InputError` if
-    no position has a reference, or if there is no likelihood.
+    every recording has one, they determine the other errors, and `raw_gyro_bias` is 0 (ours).
+    Raises `InputError` if no position has a reference, or if there is no likelihood.
     """
     if not len(positions.error):
         raise InputError("the filter", "is not healthy where these recordings have a reference")
@@ -346,7 +346,7 @@ def fit_considered(
     if mixed:
         begins = fitted.considered._replace(raw_gyro_bias=CONSIDERED.raw_gyro_bias)
         fitted = _most_likely_considered(
-            Positions(*(part[raw] for part in positions)),
+            positions,
             stride_seconds,
             dataclasses.replace(settings, considered=begins),
             "considered.raw_gyro_bias",
@@ -361,7 +361,7 @@ def fit_considered(
 def _most_likely_considered(
     positions: Positions, stride_seconds: float, settings: FilterSettings, path: str
 ) -> FilterSettings:
-    """The settings with the most likely numbers of this path, from `settings`."""
+    """`settings` with the most likely values of the numbers below `path`."""
     free = free_parameters(settings, [path])
     names, start = tuple(free), np.array(list(free.values()))
     independent = len(positions.error) * stride_seconds / INDEPENDENT_SECONDS

@@ -178,8 +178,9 @@ class AugmentConfig:
     """Shift a training window by up to this many samples either way, where the recording allows it
     (RoNIN, DeepILS)."""
     low_pass_share: Probability = 0.0
-    """Share of the windows, or segments, whose two sensors pass a random low-pass, drawn for each.
-    Otherwise the network may recognise a phone by its bandwidth (ours, e.g. 0.5)."""
+    """Share of the windows, or segments, that pass a random low-pass. It is drawn for each of them
+    and is the same for both sensors. Otherwise the network may recognise a phone by its bandwidth
+    (ours, e.g. 0.5)."""
     low_pass_hertz: Annotated[tuple[Positive, Positive], FILE_ONLY] = (4.0, 25.0)
     """Lowest and highest cut-off of that low-pass, a Butterworth of order 1 to 3 that is passed
     forward and back, Hz."""
@@ -373,8 +374,8 @@ class ConsideredStd(NamedTuple):
     slope: Annotated[Number, NOT_NEGATIVE] = 0.0
     """Slope of the displacements, metres up for each metre forward."""
     raw_gyro_bias: Annotated[Number, NOT_NEGATIVE] = 0.0
-    """Further error of the first bias of a raw gyro, along the vertical at the start, rad/s; the
-    recording has `imu_compensated: no` and no rest that shows the bias."""
+    """Further error of a raw gyro's first bias along the vertical at the start, rad/s. A gyro is
+    raw if its recording has `imu_compensated: no` and its bias starts from zero."""
 
 
 @dataclass(frozen=True)

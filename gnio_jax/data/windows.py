@@ -173,8 +173,8 @@ def shift_windows(
 
 
 def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: float) -> Windows:
-    """Windows without the margins of `low_pass_margin`, of which a random share is low-passed
-    (`random_low_pass`).
+    """Windows, a random share of them low-passed (`random_low_pass`), without the margins of
+    `low_pass_margin`.
 
     The samples are those of `gather`, already rotated. Attitude changes slowly compared with 4 Hz,
     gravity is not changed, and biases, tilt and yaw may come after the filter.
@@ -195,7 +195,7 @@ def random_low_pass(
     |H(f)|² = 1/(1 + (f/f_c)^2n), of order n from 1 to 3 and cut-off f_c uniform in its logarithm,
     drawn anew for every signal. Its phase is zero although a phone's filter is causal: readers
     align the clocks of IMU and reference by their motion, which removes a constant delay, and a
-    delay of the IMU alone would shift it relative to its reference. The signal is taken as
+    delay of the IMU alone would shift the IMU relative to the reference. The signal is taken as
     periodic, so it needs a margin on either side.
     """
     count, length, _ = imu.shape

@@ -65,8 +65,8 @@ class Start(NamedTuple):
 
     @property
     def raw_axis(self) -> Float[Array, "3"]:
-        """Axis of the body along which the bias of a raw gyro is not estimated, the vertical at the
-        start; zero if the gyro is not raw."""
+        """The vertical at the start, in the body, if the gyro is raw, otherwise zero. The bias
+        along it is considered."""
         return self.raw_gyro * self.rotation[2]
 
     def state(self, config: FilterConfig) -> FilterState:

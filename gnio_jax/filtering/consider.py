@@ -17,8 +17,9 @@ with the logarithm s of their scale, their heading ψ (rad) and their slope γ. 
 derivative of the whole estimator, through every update that it made: of a whole run
 (`sensitivity`), or step by step while the filter runs (`step_with_tangents`).
 
-The bias of a raw gyro has a further error along one axis of the body, the vertical at the start: a
-filter that estimated it would learn it from the displacements' errors (`start.initial_state`).
+The bias of a raw gyro has a further error along the vertical at the start, an axis of the body. A
+filter that estimates this component learns it from the errors of the displacements
+(`start.initial_state`).
 """
 
 from __future__ import annotations

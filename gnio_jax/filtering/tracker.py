@@ -111,7 +111,8 @@ class Tracker:
       as in `data.resample`, and poses come later by `delay`. The rate could be estimated from the
       stamps, but then there would be no pose before, and the delay would depend on jitter.
     - considered: errors that the filter does not estimate, constant since the start, whose consider
-      covariance is added to that of the poses (see `consider`). None: there are none.
+      covariance is added to that of the poses (see `consider`). None: there are none. A tracker
+      takes no gyro as raw, so `raw_gyro_bias` has no effect.
 
     The constructor compiles everything, so that no sample waits for a compiler. Poses are new
     arrays, which later samples do not change. A tracker must not be used by several threads at

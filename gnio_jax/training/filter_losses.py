@@ -48,7 +48,7 @@ class FilterLosses(NamedTuple):
     window: Float[Array, ""]
     """`window_error`, m²."""
     waypoints: Float[Array, ""]
-    """`waypoint_error`."""
+    """`waypoint_error`; 0 for a segment with fewer than two waypoints."""
     nis: Float[Array, ""]
     """Mean normalised innovation squared over its degrees of freedom; no part of the total."""
     nees: Float[Array, ""]

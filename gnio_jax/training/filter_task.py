@@ -91,8 +91,9 @@ class FilterTask(Task):
         self, key: PRNGKeyArray, source: SegmentSource, which: Int[jax.Array, "b"]
     ) -> tuple[Segment, Start]:
         augment, rate = self.config.augment, self.config.data.rate
-        segments, starts = self.segments(key, source, which, augment.yaw)
-        return low_passed(jax.random.fold_in(key, 2), segments, augment, rate), starts
+        segment_key, pass_key = jax.random.split(key)
+        segments, starts = self.segments(segment_key, source, which, augment.yaw)
+        return low_passed(pass_key, segments, augment, rate), starts
 
     def losses(
         self, variables: Any, batch: tuple[Segment, Start], step: Int[jax.Array, ""]
@@ -121,14 +122,13 @@ class FilterTask(Task):
         network sees windows of another heading."""
         count, stride = intervals(self.config), self.config.data.stride
         segments = jax.vmap(lambda row: cut_segment(source, row, count, stride))(rows)
-        keys = jax.random.split(key, rows.shape[0])
+        turn_key, start_key = jax.random.split(key)
         if turned:
-            key = jax.random.fold_in(key, 1)
-            angles = jax.random.uniform(key, rows.shape, jnp.float64, -jnp.pi, jnp.pi)
+            angles = jax.random.uniform(turn_key, rows.shape, jnp.float64, -jnp.pi, jnp.pi)
             segments = jax.vmap(turned_segment)(segments, angles)
         std = self.config.filter.start
         start = jax.vmap(lambda key, truth: draw_start(key, truth, std, START_SPREAD))
-        return segments, start(keys, segments.truth)
+        return segments, start(jax.random.split(start_key, rows.shape[0]), segments.truth)
 
     def filtered(
         self, variables: Any, segments: Segment, starts: Start, ekf: FilterConfig

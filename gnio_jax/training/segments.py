@@ -177,9 +177,11 @@ def turned_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
 
 
 def low_passed(key: PRNGKeyArray, segments: Segment, config: AugmentConfig, rate: float) -> Segment:
-    """A batch of segments of which a random share is low-passed (`data.windows.random_low_pass`):
-    network and filter take the IMU of a slower sensor, in the frame of the body. Beyond its ends a
-    segment continues with its first and last sample. Jittable."""
+    """A batch of segments of which a random share is low-passed (`data.windows.random_low_pass`).
+
+    Network and filter see a slower sensor; the low-pass is in the body's frame. Beyond its ends a
+    segment continues with its first and last sample. Jittable.
+    """
     margin = low_pass_margin(config, rate)
     if not margin:
         return segments

@@ -416,9 +416,11 @@ def test_what_the_errors_were_drawn_with_is_found():
         *(np.concatenate([each, each]) for each in (covariance, sensitivity)),
         np.concatenate([0 * axis, axis]),
     )
-    mixed = fitting.fit_considered(both, 0.1, FilterSettings()).settings.considered
+    fit = fitting.fit_considered(both, 0.1, FilterSettings())
+    mixed = fit.settings.considered
     assert mixed[:4] == found.settings.considered[:4]
     assert mixed.raw_gyro_bias == pytest.approx(0.02, rel=0.1)
+    assert fit.before > 4 and fit.after == pytest.approx(1.2, abs=0.15)
     alone = positions._replace(error=with_bias, raw_axis=axis)
     every = fitting.fit_considered(alone, 0.1, FilterSettings()).settings.considered
     assert every.raw_gyro_bias == 0.0 and every.gyro_bias > 5e-3 and every.scale > 0.15

@@ -127,7 +127,7 @@ def test_true_displacements_lack_nothing_that_was_calibrated(walks):
 
 def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks):
     """By ∂p/∂b_g of the filter, here of runs whose gyro is off by a little, and whose network does
-    not look at its windows. Of a raw gyro there is more along the vertical of the start."""
+    not look at its windows. That of a raw gyro is larger along the vertical at the start."""
     recordings = ready(walks[:2], gyro_bias="reference")
     raw = recordings[1].start._replace(raw_gyro=True)
     recordings = [recordings[0], recordings[1]._replace(start=raw)]

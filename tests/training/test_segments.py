@@ -108,6 +108,12 @@ def test_a_low_passed_segment_has_smaller_high_frequencies_and_the_same_truth():
         np.testing.assert_allclose(signal[:, inner], wanted, atol=0.03)
     assert segments.low_passed(jax.random.key(2), batch, AugmentConfig(), rate) is batch
 
+    ramp = np.linspace(-1.0, 1.0, samples)[:, None] * np.ones(3)  # the ends are no neighbours
+    batch = batch._replace(gyro=batch.gyro * 0 + ramp[None], accel=batch.accel * 0 + 9.81)
+    found = segments.low_passed(jax.random.key(2), batch, half, rate)
+    np.testing.assert_allclose(found.accel, 9.81, atol=1e-9)
+    np.testing.assert_allclose(found.gyro, np.tile(ramp, (60, 1, 1)), atol=0.1)
+
 
 def test_a_start_is_off_the_truth_by_the_priors_deviations():
     std = InitialStd(0.001, 0.002, 0.3, 0.4, 0.5, 0.6)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from gnio_jax import config as configuration
 from gnio_jax import parallel
@@ -262,13 +263,16 @@ def test_a_skipped_step_does_not_shift_the_schedule(training, start):
 
 def test_training_segments_are_turned_by_any_yaw_and_low_passed(training):
     training, source = training
-    found = []
-    for changes in ({"yaw": False}, {}, {"low_pass_share": 0.5}):
+    rows, key = jnp.zeros(64, jnp.int32), jax.random.key(0)
+
+    def changed_task(**changes):
         augment = dataclasses.replace(training.config.augment, **changes)
         config = dataclasses.replace(training.config, augment=augment)
-        draw = jax.jit(dataclasses.replace(training, config=config).draw)
-        found.append(draw(jax.random.key(0), source, jnp.zeros(64, jnp.int32)))
-    as_walked, turned, passed = found
+        return dataclasses.replace(training, config=config)
+
+    as_walked, turned = (
+        jax.jit(changed_task(yaw=yaw).draw)(key, source, rows) for yaw in (False, True)
+    )
     np.testing.assert_array_equal(as_walked[0].gyro, turned[0].gyro)
     np.testing.assert_array_equal(as_walked[1][3], turned[1][3])  # the gyro's first bias
     before, after = (np.asarray(found[0].truth.velocity[:, 0]) for found in (as_walked, turned))
@@ -276,11 +280,48 @@ def test_training_segments_are_turned_by_any_yaw_and_low_passed(training):
     assert (before == before[0]).all()
     angle = np.arctan2(after[:, 1], after[:, 0])
     assert abs(np.exp(1j * angle).mean()) < 0.4  # all round the circle
-    jax.tree.map(
-        np.testing.assert_array_equal, (passed[1], passed[0].truth), (turned[1], turned[0].truth)
-    )
-    same_gyro = (passed[0].gyro == turned[0].gyro).all(axis=(1, 2))
-    assert 0.2 < same_gyro.mean() < 0.8
+
+    half = changed_task(low_pass_share=0.5)
+    draw, untouched = jax.jit(half.draw), []
+    for number in (0, 1):
+        (plain, starts), (passed, same_starts) = (
+            each(jax.random.key(number), source, rows) for each in (jax.jit(training.draw), draw)
+        )
+        jax.tree.map(
+            np.testing.assert_array_equal, (same_starts, passed.truth), (starts, plain.truth)
+        )
+        untouched.append((passed.gyro == plain.gyro).all(axis=(1, 2)))
+        assert 0.2 < untouched[-1].mean() < 0.8
+    assert (untouched[0] != untouched[1]).any()
+    # Those of validation never pass it.
+    every = changed_task(low_pass_share=1.0)
+    found = (jax.jit(each.segments, static_argnums=3) for each in (training, every))
+    jax.tree.map(np.testing.assert_array_equal, *(each(key, source, rows, False) for each in found))
+
+
+def test_the_low_pass_of_segments_is_at_the_rate_of_the_data(training, monkeypatch):
+    training, source = training
+    told = []
+
+    def noted(key, segments, augment, rate):
+        told.append((augment, rate))
+        return segments
+
+    monkeypatch.setattr(filter_task, "low_passed", noted)
+    training.draw(jax.random.key(0), source, source.earliest[:1])
+    assert told == [(training.config.augment, 50.0)]
+
+
+def test_the_errors_of_the_starts_do_not_depend_on_the_yaws(training):
+    training, source = training
+    rows = jnp.zeros(16, jnp.int32)
+    draw = jax.jit(jax.vmap(lambda key: training.draw(key, source, rows)))
+    segments, starts = draw(jax.random.split(jax.random.key(3), 200))
+    velocity = np.asarray(segments.truth.velocity[:, :, 0])
+    angles = np.arctan2(velocity[..., 1], velocity[..., 0])
+    errors = np.asarray(starts[3]).reshape(200, -1)
+    found = stats.spearmanr(angles, errors).statistic[:16, 16:]
+    assert found.shape == (16, 48) and np.abs(found).max() < 0.4
 
 
 def test_the_error_at_waypoints_is_logged_where_walks_have_them(training, start, monkeypatch):
