@@ -30,7 +30,8 @@ def runs(tmp_path_factory):
     """`walker` says something of each window, `mute` nothing: zero, give or take a metre."""
     folder = tmp_path_factory.mktemp("home") / "runs"
     with tiny_run.known():
-        tiny_run.save(folder / "mute", CONFIG, size=0.0)
+        of_raw_gyros = changed(considered={"raw_gyro_bias": 0.02})
+        tiny_run.save(folder / "mute", dataclasses.replace(CONFIG, filter=of_raw_gyros), size=0.0)
         tiny_run.save(folder / "walker", CONFIG)
         yield folder
 
@@ -124,6 +125,7 @@ def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
     assert turned < np.radians(0.5)  # the bias, 1.5° in this time, is that of the rest
     assert "warning: rest: it lies still" in told and "it moves" not in told
     assert "gyro bias: mean of 5 s of rest" in told
+    assert "without consider covariance" in told  # its gyro does not count as raw
 
 
 def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_path, monkeypatch):
