@@ -18,7 +18,7 @@ from gnio_jax import config as configuration
 from gnio_jax.apps import export, rerun
 from gnio_jax.apps.importing import GAPS, Imported
 from gnio_jax.apps.packages import Weights
-from gnio_jax.config import ConsideredStd, TrainConfig
+from gnio_jax.config import TrainConfig
 from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
@@ -153,6 +153,9 @@ def track(
     )
     if not ready:
         raise InputError(sequence.name, left_out[sequence.name], "record for longer")
+    if ekf.considered is not None and not ready[0].start.raw_gyro:
+        considered = ekf.considered._replace(raw_gyro_bias=0.0)
+        ekf = ekf._replace(considered=considered if any(considered) else None)
     network = Network.of(weights.run.model, weights.run.variables)
     (found,) = estimate(ready, network, config.data, ekf, 1, progress)
     compared = np.isfinite(found.reference.position).any() or found.waypoints is not None
@@ -211,10 +214,7 @@ def summarise(
     error = float(np.sqrt(np.trace(filtered.covariance[rows - 1, :2, :2])))
     share = f" ({error / length:.1%} of the path)" if length >= 1.0 else ""
     counted = "with consider covariance"
-    considered = ekf.considered or ConsideredStd()
-    if not ready.start.raw_gyro:
-        considered = considered._replace(raw_gyro_bias=0.0)
-    if not any(considered):
+    if ekf.considered is None:
         counted = "without consider covariance (gnio calibrate fits it), "
         counted += "so the real error is probably larger"
     summary = Summary(

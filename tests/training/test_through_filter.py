@@ -281,11 +281,11 @@ def test_training_segments_are_turned_by_any_yaw_and_low_passed(training):
     angle = np.arctan2(after[:, 1], after[:, 0])
     assert abs(np.exp(1j * angle).mean()) < 0.4  # all round the circle
 
-    half = changed_task(low_pass_share=0.5)
-    draw, untouched = jax.jit(half.draw), []
+    half, untouched = changed_task(low_pass_share=0.5), []
+    draws = [jax.jit(each.draw) for each in (training, half)]
     for number in (0, 1):
         (plain, starts), (passed, same_starts) = (
-            each(jax.random.key(number), source, rows) for each in (jax.jit(training.draw), draw)
+            draw(jax.random.key(number), source, rows) for draw in draws
         )
         jax.tree.map(
             np.testing.assert_array_equal, (same_starts, passed.truth), (starts, plain.truth)
@@ -308,7 +308,7 @@ def test_the_low_pass_of_segments_is_at_the_rate_of_the_data(training, monkeypat
         return segments
 
     monkeypatch.setattr(filter_task, "low_passed", noted)
-    training.draw(jax.random.key(0), source, source.earliest[:1])
+    jax.eval_shape(training.draw, jax.random.key(0), source, source.earliest[:1])
     assert told == [(training.config.augment, 50.0)]
 
 
