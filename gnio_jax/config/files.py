@@ -409,6 +409,7 @@ def _yaml(content: str, source: str) -> Any:
 _MOVED: dict[str, str] = {
     **{name: f"noise.{name}" for name in NoiseModel._fields},
     **{f"{name}_std": f"start.{name}" for name in InitialStd._fields},
+    # The first four; no version wrote raw_gyro_bias in this form.
     **{f"considered_{name}_std": f"considered.{name}" for name in ConsideredStd._fields[:4]},
 }
 """Settings of the filter, which was a flat section with angles in degrees."""
