@@ -27,8 +27,8 @@ from gnio_jax.apps import packages  # noqa: E402
 from gnio_jax.apps.onnx import driver, export_run  # noqa: E402
 from gnio_jax.apps.onnx.programs import start_arrays  # noqa: E402
 from gnio_jax.apps.onnx.run import draw_walk  # noqa: E402
-from gnio_jax.apps.track import tracking_filter  # noqa: E402
 from gnio_jax.evaluation import Recording  # noqa: E402
+from gnio_jax.filtering.settings import filter_setup  # noqa: E402
 from gnio_jax.models import Network  # noqa: E402
 
 
@@ -44,7 +44,7 @@ def main() -> None:
         out = Path(folder) / "models"
         export_run(arguments.run, out)
         models = driver.open_models(out, arguments.threads)
-        setup = tracking_filter(run)
+        setup = filter_setup(run.config.data, run.config.filter)
         drawn = draw_walk(run.config.data, setup, arguments.seconds)
         times = measure(run, models, drawn)
     period = 1e3 * setup.config.clone_seconds
@@ -60,7 +60,7 @@ def main() -> None:
 
 def measure(run: Any, models: driver.Models, drawn: Recording) -> dict[str, list[float]]:
     """Seconds of each part of each clone interval that has a window."""
-    setup = tracking_filter(run)
+    setup = filter_setup(run.config.data, run.config.filter)
     network = Network.of(run.model, run.variables)
     apply = jax.jit(
         lambda window: network.apply(network.variables, window)._replace(diagnostics={})

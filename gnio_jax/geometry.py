@@ -235,6 +235,16 @@ def right_jacobian(phi: Vector) -> Matrix:
     return _polynomial(phi, squared, -versine, excess)
 
 
+@jax.jit
+def left_jacobian_product(phi: Vector, x: Vector) -> Vector:
+    """J_l(φ) x, where exp(φ + δ) ≈ exp(J_l(φ) δ) exp(φ): x + (1 − cos θ)/θ² φ × x + (θ − sin θ)/θ³
+    φ × (φ × x)."""
+    _, versine, excess = _series(jnp.sum(phi * phi))
+    turn = hat(phi)
+    once = matmul(turn, x[:, None])
+    return x + (versine * once + excess * matmul(turn, once))[:, 0]
+
+
 def direction(
     x: Float[jax.Array, "*k"], y: Float[jax.Array, "*k"]
 ) -> tuple[Float[jax.Array, "*k"], Float[jax.Array, "*k"]]:

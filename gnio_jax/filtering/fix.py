@@ -60,7 +60,7 @@ class Fix(NamedTuple):
             position=by_position,
             velocity=-self.before_end * by_position,
         )
-        return measure(state, linear, step, self.threshold)
+        return measure(state, linear, step, self.threshold, frame="world")
 
 
 def fixes_on_intervals(

@@ -25,7 +25,14 @@ from gnio_jax.filtering.propagation import (
     propagate,
 )
 from gnio_jax.filtering.settings import FilterConfig, YawFrame
-from gnio_jax.filtering.state import FilterState, core_covariance, move_anchor, unroll_clones
+from gnio_jax.filtering.state import (
+    FilterState,
+    core_covariance,
+    invariant_clones,
+    move_anchor,
+    move_pivot,
+    unroll_clones,
+)
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
 from gnio_jax.types import Array
@@ -139,7 +146,7 @@ def _run(
     )
     history = finished_history(records, age, inputs.state.healthy, config)
     state = state._replace(healthy=history.healthy[-1] > 0)
-    return unroll_clones(state, len(age) % config.clones), history
+    return unroll_clones(state, len(age) % config.clones, config), history
 
 
 def as_given(_: Array, __: Imu, given: Displacement, *___: Any) -> tuple[Displacement, dict]:
@@ -177,9 +184,8 @@ def clone_steps(
         return taken[0], keep(slot, *taken)
 
     rows = jnp.arange(len(age)), by_interval, given, inputs.measurements
-    state, kept = blocked_scan(
-        step, inputs.state, rows, config.checkpoint_every, config.truncate_every
-    )
+    start = invariant_clones(inputs.state) if config.invariant else inputs.state
+    state, kept = blocked_scan(step, start, rows, config.checkpoint_every, config.truncate_every)
     return state._replace(imu=memory._replace(quiet=state.imu.quiet)), kept, age
 
 
@@ -217,7 +223,12 @@ def clone_step(
     state = move_anchor(state, anchored)
     interval = _integrate(state.mean._replace(position=state.offset), imu, noise, config.dt)
     decay = correlation_decay(noise.correlation, config.clone_seconds, dtype)
-    transition = core_transition(interval, decay, anchored)
+    lever = pivot_lever = None
+    if config.invariant:
+        if dtype == jnp.float32:
+            state, pivot_lever = move_pivot(state, anchored)
+        lever = state.anchor + interval.position - state.pivot
+    transition = core_transition(interval, decay, anchored, lever, pivot_lever)
     state = _propagate(state, interval, transition, slot)
 
     displacement, diagnostics = measure(state, oldest)
@@ -234,7 +245,7 @@ def clone_step(
         state, outcome, correction = update(measurement, state)
         outcomes, corrections = (*outcomes, outcome), (*corrections, correction)
 
-    covariance = core_covariance(state.core_covariance)
+    covariance = core_covariance(state.core_covariance, config)
     if config.history == "diagonal":
         covariance = jnp.diagonal(covariance)
     record = StepRecord(state.mean, covariance, displacement, outcomes, diagnostics)

@@ -18,7 +18,6 @@ from gnio_jax.apps import packages
 from gnio_jax.apps.onnx import conversion, driver
 from gnio_jax.apps.onnx.driver import Walked
 from gnio_jax.apps.onnx.programs import programs, start_arrays
-from gnio_jax.apps.track import tracking_filter
 from gnio_jax.config import DataConfig
 from gnio_jax.config.files import plain
 from gnio_jax.data.simulated.walks import pedestrian
@@ -26,7 +25,7 @@ from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
 from gnio_jax.evaluation.metrics import ate
 from gnio_jax.files import fingerprint, replacing_folder
-from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.filtering.settings import FilterSetup, filter_setup
 from gnio_jax.models import Network
 
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
@@ -86,7 +85,8 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     require_packages("gnio export", "onnx", *PACKAGES)
     place = packages.find(which)
     run = packages.load_pretrained(place)
-    network, setup = Network.of(run.model, run.variables), tracking_filter(run)
+    network = Network.of(run.model, run.variables)
+    setup = filter_setup(run.config.data, run.config.filter)
     with replacing_folder(out) as folder, ExitStack() as at_end:
         at_end.callback(logging.disable, logging.root.manager.disable)
         logging.disable(logging.WARNING)  # Converters write a log line for almost every node.
