@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from gnio_jax.cores import usable_cores
-from gnio_jax.data.dataset import Dataset, Recording, Refusal, find_root, get
+from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.hdf5 import Reading, cache_entry, read_reading, write_hdf5, write_reading
+from gnio_jax.data.registry import find_root, get
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.self_check import SelfCheck, check_sequence
 from gnio_jax.data.splits import parse_fold

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data import hdf5
+from gnio_jax.data import hdf5, registry
 from gnio_jax.data.dataset import Recording, Refusal
 from gnio_jax.data.loading import (
     check_recording,
@@ -458,6 +458,19 @@ def test_the_root_is_the_argument_then_the_environment_then_the_working_folder(
     assert data.find_root("tlio", str(here)) == here
     with pytest.raises(InputError, match=r"nowhere: no folder of dataset 'tlio'"):
         data.find_root("tlio", tmp_path / "nowhere")
+
+
+def test_a_dataset_of_ones_own_is_loaded_by_its_name(monkeypatch, tmp_path):
+    monkeypatch.setattr(registry, "DATASETS", dict(DATASETS))
+    monday = dataset(single("monday", walk, "monday"))
+    mine = dataclasses.replace(monday, name="mine", licence="as I like")
+    for _ in range(2):  # a cell of a notebook that runs again
+        data.register(mine)
+    assert "mine" in data.names() and data.get("mine") is mine
+    [sequence] = data.load("mine", tmp_path)
+    assert (sequence.name, sequence.attributes["licence"]) == ("monday", "as I like")
+    with pytest.raises(InputError, match="dataset 'tlio': is a dataset of gnio-jax"):
+        data.register(dataset())
 
 
 def test_a_split_without_a_sequence_or_with_two_of_one_name_is_an_error(tmp_path, monkeypatch):
