@@ -32,9 +32,9 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.alignment.body import (
     TooLittle,
     hat_functions,
-    laid_on,
     near_any,
     uniform_knots,
+    with_tracker_poses,
     without_jumps,
 )
 from gnio_jax.data.alignment.positions import align_positions
@@ -295,7 +295,7 @@ def build(walk: Walk, kind: str) -> list[Sequence]:
         else:
             limits = {"lag": (LONGEST_LAG[kind], "s")} | LIMITS
             track = read_vicon(truth_path, kind, phone.start)
-            phone = laid_on(
+            phone = with_tracker_poses(
                 phone, track, limits, LAG_KNOTS[kind], closest_runner_up=CLOSEST_RUNNER_UP
             )
         (sequence,) = assemble(phone, RATE)

@@ -37,7 +37,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.alignment.body import laid_on, without_jumps
+from gnio_jax.data.alignment.body import with_tracker_poses, without_jumps
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text, shortened, text_of
@@ -169,7 +169,9 @@ def read(folder: Path) -> list[Sequence]:
         "accel_clipped": clipped(phone.accel.values),
     }
     phone, track = phone._replace(attributes=about), track._replace(source=both)
-    return assemble(laid_on(phone, track, LIMITS, LAG_KNOTS, LAG_SEARCH), RATE, divide=True)
+    return assemble(
+        with_tracker_poses(phone, track, LIMITS, LAG_KNOTS, LAG_SEARCH), RATE, divide=True
+    )
 
 
 def clipped(accel: Float[np.ndarray, "n 3"]) -> float:
