@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks import baseline
 from gnio_jax import data
-from gnio_jax.data.dataset import Recording
+from gnio_jax.data.dataset import RecordingSource
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.data.loading import read_recording
 from gnio_jax.data.parsing.tables import read_text
@@ -58,7 +58,7 @@ def best(
     return min(seconds)
 
 
-def find(layout: str, folder: Path, minutes: float, most: int) -> tuple[list[Recording], str]:
+def find(layout: str, folder: Path, minutes: float, most: int) -> tuple[list[RecordingSource], str]:
     """(recordings, "real" or "written") of a layout. Written files go to `folder`."""
     dataset = data.get(LAYOUTS[layout].dataset)
     base, (name, split) = os.environ.get("GNIO_DATA"), REAL.get(layout, ("", ""))

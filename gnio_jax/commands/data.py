@@ -159,7 +159,7 @@ _FIGURES: dict[str, Callable[[Any], str]] = {
 
 
 def _json(row: Any) -> dict[str, Any]:
-    """A `loading.Checked` for a JSON file, which has no arrays and no NaN."""
+    """A `loading.CheckResult` for a JSON file, which has no arrays and no NaN."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Iterable) and not isinstance(value, str):

@@ -20,7 +20,7 @@ class Refusal(InputError):
         super().__init__(where, problem, remedy)
 
 
-class Recording(NamedTuple):
+class RecordingSource(NamedTuple):
     """One recording that was found, but not yet read. It can be sent to another process."""
 
     name: str
@@ -37,7 +37,7 @@ class Recording(NamedTuple):
     """Attributes from lists and splits, which are added to those of its sequences."""
     form: str = ""
     """Name of this form in messages, if the recording has several."""
-    fallback: Recording | None = None
+    fallback: RecordingSource | None = None
     """Another form of the same recording, which is read if this one is refused."""
 
 
@@ -47,7 +47,7 @@ class Dataset:
 
     name: str
     """The name of `--dataset`."""
-    recordings: Callable[[Path, str], list[Recording]]
+    recordings: Callable[[Path, str], list[RecordingSource]]
     """(root, split) -> recordings, not yet read. The split must be a possible one. The result is
     empty if there is nothing of the dataset; `InputError` is raised if only the split is
     missing."""
@@ -80,7 +80,7 @@ class Dataset:
         """The splits that may be asked for at this root."""
         return self.list_splits(root) if self.list_splits else self.splits
 
-    def described(self, sequence: Sequence) -> Sequence:
+    def with_origin(self, sequence: Sequence) -> Sequence:
         """A sequence with the name and licence of its dataset; a converted one keeps its own."""
-        about = {"dataset": self.name, "licence": self.licence}
-        return sequence._replace(attributes=about | sequence.attributes)
+        attributes = {"dataset": self.name, "licence": self.licence}
+        return sequence._replace(attributes=attributes | sequence.attributes)

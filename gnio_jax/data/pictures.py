@@ -106,14 +106,14 @@ def _gyro(axes: Axes, sequence: Sequence) -> None:
 
 def _plan(axes: Axes, sequence: Sequence) -> None:
     """The trajectory from above."""
-    place = np.where(sequence.valid[:, None], sequence.position, np.nan)[:, :2]
-    known = place[finite_rows(place)]
-    if len(known):
-        every = max(len(place) // POINTS, 1)
-        axes.plot(place[::every, 0], place[::every, 1], color=BLUE, lw=0.9)
+    position = np.where(sequence.valid[:, None], sequence.position, np.nan)[:, :2]
+    finite = position[finite_rows(position)]
+    if len(finite):
+        every = max(len(position) // POINTS, 1)
+        axes.plot(position[::every, 0], position[::every, 1], color=BLUE, lw=0.9)
         marks: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 4}
-        axes.plot(*known[0], "o", mfc="white", ms=8, mew=1.8, label="start", **marks)
-        axes.plot(*known[-1], "s", ms=7, label="end", **marks)
+        axes.plot(*finite[0], "o", mfc="white", ms=8, mew=1.8, label="start", **marks)
+        axes.plot(*finite[-1], "s", ms=7, label="end", **marks)
         axes.legend(loc="best", fontsize=8, framealpha=0.9)
         axes.margins(0.08)
     else:

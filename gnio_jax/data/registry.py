@@ -36,9 +36,9 @@ def names() -> list[str]:
 def get(name: str) -> Dataset:
     """The dataset of that name; raises `InputError` that lists the known ones."""
     if name not in DATASETS:
-        known = f"known datasets: {', '.join(names())}"
+        remedy = f"known datasets: {', '.join(names())}"
         raise InputError(
-            "dataset", f"unknown name '{name}'", f"{did_you_mean(name, names())}{known}"
+            "dataset", f"unknown name '{name}'", f"{did_you_mean(name, names())}{remedy}"
         )
     return DATASETS[name]
 

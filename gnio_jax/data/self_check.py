@@ -113,10 +113,10 @@ def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
     The attributes `check_pedestrian` and `check_correlation` of a converted recording have
     priority, because they are those of its original dataset.
     """
-    about = sequence.attributes
-    pedestrian = bool(about.get("check_pedestrian", dataset.pedestrian))
+    attributes = sequence.attributes
+    pedestrian = bool(attributes.get("check_pedestrian", dataset.pedestrian))
     check = self_check(
-        sequence, pedestrian, bool(about.get("check_correlation", dataset.correlates))
+        sequence, pedestrian, bool(attributes.get("check_correlation", dataset.correlates))
     )
     needed = dataset.needs_reference or sequence.valid.any()
     return check if needed else check._replace(failures=())
@@ -135,11 +135,11 @@ def _with_reference(
     gained = (velocity[stop - 1] - velocity[first]).sum(axis=0)
     starts, gyro_errors = gyro_windows(sequence)
     # Windows that all overlap count as one window, and one bias can explain any single window.
-    apart = starts.size > 0 and float(np.ptp(starts)) > WINDOW_SECONDS - 0.5 * step
+    independent = starts.size > 0 and float(np.ptp(starts)) > WINDOW_SECONDS - 0.5 * step
     correlation, strength = _accel_correlation(sequence, force, step)
     check = check._replace(
         gravity_mean=force[valid].mean(axis=0) - gained / max(seconds, step),
-        gyro_consistency_degrees=float(np.median(gyro_errors)) if apart else np.nan,
+        gyro_consistency_degrees=float(np.median(gyro_errors)) if independent else np.nan,
         median_speed=float(np.median(np.linalg.norm(velocity[valid], axis=1))),
         accel_correlation_horizontal=correlation,
         share_valid=float(valid.mean()),

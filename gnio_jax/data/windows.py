@@ -69,26 +69,26 @@ def window_source(
     (biases zero). Differences of positions are taken in float64, before they are stored in float32.
     Raises `InputError` if no window fits.
     """
-    found: list[WindowSource] = []
+    parts: list[WindowSource] = []
     for sequence in sequences:
         if sequence.waypoints is not None and not sequence.valid.any():
             problem = "has waypoints, no poses"
             raise InputError(sequence.name, problem, "windows need a pose at every sample")
         part = _recording_windows(sequence, config, stride, 1 if shift else stride)
         if part.start.size:
-            found.append(part)
-    if not found:
+            parts.append(part)
+    if not parts:
         length = f"{config.context_seconds + config.window_seconds:g} s"
         raise InputError("data", f"no window of {length} with a valid reference in any sequence")
-    return joined(found)
+    return joined(parts)
 
 
 def joined(sources: list[WindowSource]) -> WindowSource:
     """The recordings of all sources, one source after the other, as host arrays."""
-    found: list[WindowSource] = []
+    parts: list[WindowSource] = []
     rows = windows = 0
     for source in sources:
-        found.append(
+        parts.append(
             source._replace(
                 start=source.start + np.int32(rows),
                 stretch=source.stretch + np.int32(rows),
@@ -97,7 +97,7 @@ def joined(sources: list[WindowSource]) -> WindowSource:
         )
         rows += len(source.imu)
         windows += len(source.start)
-    return WindowSource(*(np.concatenate(field) for field in zip(*found, strict=True)))
+    return WindowSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
 def _recording_windows(

@@ -34,10 +34,10 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import fminbound, least_squares
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.assembly import Samples, Streams, ordered
+from gnio_jax.data.assembly import Samples, Streams, sort_streams
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.reference import LOST_POSES, Poses, longest_trusted, one_sign
-from gnio_jax.data.resampling import known_at, splined
+from gnio_jax.data.resampling import covered_at, interpolate_splines
 from gnio_jax.numerics import (
     hat,
     interpolate,
@@ -202,7 +202,7 @@ def align(
     `search_seconds`. Raises `TooLittle` if too little of the track is usable, and `InputError` for
     damaged stamps. `check_fit` decides whether the best fit is good enough.
     """
-    imu = ordered(imu._replace(poses=track))
+    imu = sort_streams(imu._replace(poses=track))
     assert imu.poses is not None
     track = imu.poses
     check_lengths(SHORTEST_OVERLAP, imu.gyro, imu.accel, track)
@@ -354,12 +354,14 @@ class _InertialSignals(NamedTuple):
 def _tracker_signals(track: Poses) -> _TrackerSignals:
     clock, steps = np.arange(track.time[0], track.time[-1], 1.0 / RATE), np.diff(track.time)
     longest, sigma = LOST_POSES * float(np.median(steps)), FILTER_SECONDS * RATE
-    present = known_at(track.time, clock, longest)
+    present = covered_at(track.time, clock, longest)
     rows = np.flatnonzero(~within(~present, int(np.ceil(3 * sigma))))[:: round(ROW_SECONDS * RATE)]
     if len(rows) * ROW_SECONDS < SHORTEST_OVERLAP:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track hold poses in a row")
     poses = np.concatenate([one_sign(quaternions(track.attitude)), track.position], axis=1)
-    wxyz, position = np.split(splined(track.time, poses, clock, steps > longest), [4], axis=1)
+    wxyz, position = np.split(
+        interpolate_splines(track.time, poses, clock, steps > longest), [4], axis=1
+    )
     attitude = rotations(wxyz)
     turning, matrices = turns_between(attitude) * RATE, attitude.as_matrix()
     to_body = matrices.transpose(0, 2, 1)
@@ -377,7 +379,7 @@ def _inertial_signals(imu: Streams) -> _InertialSignals:
     splines, unknown = [], []
     for time, values, _ in (imu.gyro, imu.accel):
         clock, broken = np.arange(time[0], time[-1], 1.0 / RATE), gaps(time)
-        filtered = smooth(splined(time, values, clock, broken), FILTER_SECONDS * RATE)
+        filtered = smooth(interpolate_splines(time, values, clock, broken), FILTER_SECONDS * RATE)
         splines.append(CubicSpline(clock, filtered, axis=0))
         gap_starts = np.concatenate([[-np.inf], time[:-1][broken], time[-1:]])
         unknown.append((gap_starts, np.concatenate([time[:1], time[1:][broken], [np.inf]])))

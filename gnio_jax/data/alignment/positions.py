@@ -33,10 +33,10 @@ from gnio_jax.data.alignment.body import (
     smooth,
     uniform_knots,
 )
-from gnio_jax.data.assembly import Samples, Streams, ordered
+from gnio_jax.data.assembly import Samples, Streams, sort_streams
 from gnio_jax.data.parsing.stamps import in_order
 from gnio_jax.data.reference import Poses, longest_trusted, smooth_positions
-from gnio_jax.data.resampling import known_at, slerped, splined
+from gnio_jax.data.resampling import covered_at, interpolate_attitudes, interpolate_splines
 from gnio_jax.numerics import (
     about_z,
     integrate_gyro,
@@ -130,7 +130,7 @@ def align_positions(imu: Streams, track: Samples) -> PositionsFit:
     of tilt, and its yaw drifts. Over minutes, however, it finds the gyro's bias in tilt from
     gravity. Raises `TooLittle` if both share less than 20 s.
     """
-    imu = ordered(imu)
+    imu = sort_streams(imu)
     rows, _ = in_order(track.time, track.values, track.source)
     stamps, values = track.time[rows], track.values[rows]
     assert imu.device is not None
@@ -144,13 +144,14 @@ def align_positions(imu: Streams, track: Samples) -> PositionsFit:
         raise TooLittle(f"gyro, accelerometer and attitude share less than {SHORTEST_OVERLAP:g} s")
     clock = np.arange(first, last, 1.0 / RATE)
     gyro, accel = (
-        splined(stream.time, stream.values, clock, gaps(stream.time)) for stream in streams[:2]
+        interpolate_splines(stream.time, stream.values, clock, gaps(stream.time))
+        for stream in streams[:2]
     )
-    device = rotations(slerped(imu.device.time, imu.device.values, clock))
+    device = rotations(interpolate_attitudes(imu.device.time, imu.device.values, clock))
 
     grid = np.arange(stamps[0], stamps[-1], 1.0 / RATE)
-    position = splined(stamps, values, grid, gaps(stamps))
-    present = known_at(stamps, grid, longest_trusted(stamps))
+    position = interpolate_splines(stamps, values, grid, gaps(stamps))
+    present = covered_at(stamps, grid, longest_trusted(stamps))
     tracked = second_difference(position, 1.0 / RATE)
     # Accelerations beyond those of a pedestrian are jumps.
     strength = np.linalg.norm(smooth(tracked, STEP_FILTER_SECONDS * RATE), axis=1)
@@ -175,7 +176,7 @@ def align_positions(imu: Streams, track: Samples) -> PositionsFit:
     tracker_time = clock - np.interp(clock, lag_knots, lags)
     shared = np.flatnonzero((tracker_time >= grid[0]) & (tracker_time <= grid[-1]))
     smoothed, velocity, used = smooth_positions(
-        splined(grid, position, tracker_time[shared], gaps(grid)),
+        interpolate_splines(grid, position, tracker_time[shared], gaps(grid)),
         np.interp(tracker_time[shared], grid, (present & ~jumps).astype(float)) > 0.99,
         1.0 / RATE,
         CUTOFF,

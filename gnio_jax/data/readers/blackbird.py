@@ -22,9 +22,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import damaged, read_hdf5_fields, read_text
-from gnio_jax.data.splits import listed
+from gnio_jax.data.splits import read_list
 from gnio_jax.data.validation import FASTEST, check_unit_norm
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
 from gnio_jax.types import Sequence
@@ -35,9 +35,9 @@ _TABLE = "data.hdf5"
 _TRUTH = "stamped_groundtruth_imu.txt"
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split's list that are present."""
-    folders = listed(
+    folders = read_list(
         root / f"{split}.txt",
         lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
         root,
@@ -45,7 +45,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
     )
     names = ["_".join(folder.relative_to(root).parts) for folder in folders]
     return [
-        Recording(name, partial(read, folder, name))
+        RecordingSource(name, partial(read, folder, name))
         for name, folder in zip(names, folders, strict=True)
     ]
 

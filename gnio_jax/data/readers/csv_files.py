@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.hdf5 import read_hdf5
 from gnio_jax.data.parsing.stamps import check_seconds, rounded_rate
 from gnio_jax.data.parsing.tables import Table, read_text, shortened
 from gnio_jax.data.resampling import resample
-from gnio_jax.data.splits import listed
+from gnio_jax.data.splits import read_list
 from gnio_jax.data.validation import check_gaps, check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.files import HDF5
@@ -46,7 +46,7 @@ _FILES = (".csv", *HDF5)
 # --- which recordings there are
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split, in the order of their names: those that <root>/<split>.txt lists,
     or all as `test` if there is no list.
 
@@ -57,7 +57,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
         raise InputError(root, f"unknown split '{split}'", known)
     layout = f"expected layout: {DATASET.layout}"
     if split not in SPLITS or any((root / f"{name}.txt").is_file() for name in SPLITS):
-        paths = listed(root / f"{split}.txt", partial(_find, root), root, DATASET.layout)
+        paths = read_list(root / f"{split}.txt", partial(_find, root), root, DATASET.layout)
     else:
         paths = files_of(root)
         if paths and split != "test":
@@ -67,7 +67,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
     for path in paths:
         if (other := named.setdefault(path.stem, path)) != path:
             raise InputError(path, f"has the name of {other}", "rename or remove one of them")
-    return [Recording(name, partial(read, path)) for name, path in sorted(named.items())]
+    return [RecordingSource(name, partial(read, path)) for name, path in sorted(named.items())]
 
 
 def files_of(root: Path) -> list[Path]:

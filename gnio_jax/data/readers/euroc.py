@@ -37,7 +37,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text
 from gnio_jax.data.reference import LONGEST_BRIDGE, SHORTEST_RUN
 from gnio_jax.errors import InputError
@@ -82,7 +82,7 @@ _SHORT = {
 """Other names of columns → the authors' names, both without unit and in small letters."""
 
 
-def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording]:
+def recordings(root: Path, split: str, dataset: str = "euroc") -> list[RecordingSource]:
     """The recordings of a split."""
     known = EUROC_SPLITS if dataset == "euroc" else TUMVI_SPLITS
     split_of = {name: own for own, names in known.items() for name in names}
@@ -94,11 +94,11 @@ def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording
     return [_recording(folder, dataset) for folder in chosen]
 
 
-def _recording(folder: Path, dataset: str) -> Recording:
+def _recording(folder: Path, dataset: str) -> RecordingSource:
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *REFERENCES)]
     files = tuple(each / name for each in sensors for name in ("data.csv", "sensor.yaml"))
     read_it = partial(read, folder, dataset)
-    return Recording(short_name(folder.name), read_it, files, slow=True, form=dataset)
+    return RecordingSource(short_name(folder.name), read_it, files, slow=True, form=dataset)
 
 
 def find_sequences(root: Path) -> dict[str, Path]:

@@ -30,11 +30,11 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.alignment.body import LONGEST_POSE_LAG, pose_lag
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording, Refusal
+from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.parsing.stamps import distinct
 from gnio_jax.data.parsing.tables import Table, damaged, json_object, read_feather, shortened
 from gnio_jax.data.reference import LONGEST_BRIDGE
-from gnio_jax.data.splits import drawn
+from gnio_jax.data.splits import draw_share
 from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE, WINDOW_SECONDS
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, levelling, stretches
@@ -65,13 +65,13 @@ _SPLITS = {
 _BUILDINGS = ("building1", "building2", "building3")
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The walks of a split."""
     chosen = find_walks(root, _SPLITS[split])
     if split not in ("train", "val"):
         return chosen
     people = {walk.attributes["subject"] for walk in chosen}
-    held = {person for person in people if drawn(SEED, person) < HELD_OUT}
+    held = {person for person in people if draw_share(SEED, person) < HELD_OUT}
     chosen = [w for w in chosen if (w.attributes["subject"] in held) == (split == "val")]
     if people and not chosen:
         problem = f"{len(held)} of {len(people)} people are held out"
@@ -81,10 +81,10 @@ def recordings(root: Path, split: str) -> list[Recording]:
     return [walk._replace(attributes=walk.attributes | note) for walk in chosen]
 
 
-def find_walks(root: Path, folder: str) -> list[Recording]:
+def find_walks(root: Path, folder: str) -> list[RecordingSource]:
     """The recordings in `folder` ("train", "known", "unknown") of every building; the buildings may
     be a folder or two deeper."""
-    walks: list[Recording] = []
+    walks: list[RecordingSource] = []
     nameless: list[Path] = []
     for building in _BUILDINGS:
         depths = ("", "*/", "*/*/")
@@ -104,7 +104,9 @@ def find_walks(root: Path, folder: str) -> list[Recording]:
                 known = {"calibration": shortened(entry.get("calibration", "unknown"))}
                 known |= {"subject": subject, "group": subject}
                 walks.append(
-                    Recording(_name(path), partial(read, path), (path,), True, attributes=known)
+                    RecordingSource(
+                        _name(path), partial(read, path), (path,), True, attributes=known
+                    )
                 )
     if nameless:
         problem = f"metadata.json does not name the subject of {len(nameless)} recordings"

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from gnio_jax.data.assembly import Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording, Refusal
+from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.parsing.tables import Table, damaged, shortened, text_of
 from gnio_jax.data.validation import FARTHEST, FEWEST_WAYPOINTS
 from gnio_jax.errors import InputError
@@ -48,7 +48,7 @@ _MERGED = re.compile(r"(?<!^)(?=\d{13}\tTYPE_)")
 year 2286."""
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split: whole floors. `all` is every walk below the root."""
     paths = sorted(root.glob("**/path_data_files/*.txt"), key=lambda path: path.parts[-3:])
     chosen = [path for path in paths if split in ("all", FLOORS.get(_floor(path)))]
@@ -57,7 +57,8 @@ def recordings(root: Path, split: str) -> list[Recording]:
         problem = f"holds no walk of split '{split}'"
         raise InputError(root, problem, f"it consists of the floors {floors}; complete the data")
     return [
-        Recording(_name(path), partial(read, path), files=(path,), slow=True) for path in chosen
+        RecordingSource(_name(path), partial(read, path), files=(path,), slow=True)
+        for path in chosen
     ]
 
 

@@ -39,10 +39,10 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.stamps import in_order
 from gnio_jax.data.parsing.tables import damaged, read_npz, shortened, text_of
-from gnio_jax.data.splits import drawn
+from gnio_jax.data.splits import draw_share
 from gnio_jax.data.validation import FASTEST
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import stretches
@@ -82,14 +82,16 @@ used."""
 # --- the drives
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The drives of a split, or their pieces if these are separate files."""
     found, drives = [], find_drives(root)
     for drive, paths in drives.items():
         if share_of(drive) == split and paths[0].is_dir():
-            found.append(Recording(drive, partial(read_packets, paths[0])))
+            found.append(RecordingSource(drive, partial(read_packets, paths[0])))
         elif share_of(drive) == split:
-            found += [Recording(_piece_name(path), partial(read_piece, path)) for path in paths]
+            found += [
+                RecordingSource(_piece_name(path), partial(read_piece, path)) for path in paths
+            ]
     if drives and not found:
         problem = f"none of its drives falls into split '{split}'"
         raise InputError(root, problem, "take another split or more drives")
@@ -98,7 +100,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
 def share_of(drive: str) -> str:
     """The split of a drive, which depends only on its name."""
-    place = drawn(SEED, drive)
+    place = draw_share(SEED, drive)
     return "train" if place < 0.7 else "val" if place < 0.8 else "test"
 
 

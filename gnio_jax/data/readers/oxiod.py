@@ -39,7 +39,7 @@ from gnio_jax.data.alignment.body import (
 )
 from gnio_jax.data.alignment.positions import align_positions
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording, Refusal
+from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.parsing.tables import Table, damaged, read_text, shortened
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import quaternions
@@ -196,7 +196,7 @@ def _placements(scene: str, folder: Path) -> Callable[[int], str]:
 # --- splits
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The walks of `split` below `root`.
 
     `train`, `test` (also called `seen`)
@@ -219,13 +219,13 @@ def recordings(root: Path, split: str) -> list[Recording]:
     return [recording_of(walk) for walk in chosen]
 
 
-def recording_of(walk: Walk) -> Recording:
+def recording_of(walk: Walk) -> RecordingSource:
     """The recording of a walk: `raw` first, and `syn` if `raw` is refused."""
     found = None
     for kind in ("syn", "raw"):
         if kind in walk.files:
             read, files = partial(build, walk, kind), walk.files[kind]
-            found = Recording(walk.name, read, files, slow=True, form=kind, fallback=found)
+            found = RecordingSource(walk.name, read, files, slow=True, form=kind, fallback=found)
     assert found is not None
     return found
 

@@ -26,9 +26,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import Table, read_text
-from gnio_jax.data.splits import find_folders, find_list, held_out, listed
+from gnio_jax.data.splits import find_folders, find_list, hold_out, read_list
 from gnio_jax.data.validation import FASTEST_WALKER
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import quaternions, rotations
@@ -49,7 +49,7 @@ _LISTS = {
 _PLACEMENTS = {"handheld": "handheld", "leg": "pocket", "bag": "bag", "body": "body"}
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split that are present, anywhere below the root; `seen` is `test`.
 
     `unseen` is the authors' cross-subject list. Recordings in no list are only in `all`, which is
@@ -59,7 +59,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
     if split == "all":
         return [_recording(folder, {}) for _, folder in sorted(folders.items())]
     path = find_list(root, _LISTS[split])
-    chosen = listed(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
+    chosen = read_list(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
     if split not in ("train", "val"):
         return [_recording(folder, {}) for folder in chosen]
     held = held_out_of_train(path)
@@ -71,16 +71,16 @@ def recordings(root: Path, split: str) -> list[Recording]:
     return [_recording(folder, {"held_out": subjects}) for folder in chosen]
 
 
-def _recording(folder: Path, attributes: dict[str, str]) -> Recording:
+def _recording(folder: Path, attributes: dict[str, str]) -> RecordingSource:
     files = tuple(folder / name for name in (_TABLE, *_TEXT_FILES))
-    return Recording(folder.name, partial(read, folder), files, True, attributes)
+    return RecordingSource(folder.name, partial(read, folder), files, True, attributes)
 
 
 def held_out_of_train(path: Path) -> set[str]:
     """Names in the training list for validation: whole people, about a tenth of the list, the same
     in every copy of the data."""
-    folders = listed(path, lambda entry: Path(_name(entry)), path.parent, DATASET.layout)
-    return held_out({folder.name: _subject(folder.name) for folder in folders})
+    folders = read_list(path, lambda entry: Path(_name(entry)), path.parent, DATASET.layout)
+    return hold_out({folder.name: _subject(folder.name) for folder in folders})
 
 
 def _is_recording(folder: Path) -> bool:

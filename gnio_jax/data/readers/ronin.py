@@ -24,9 +24,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import damaged, json_object, read_hdf5_fields, shortened
-from gnio_jax.data.splits import find_folders, find_list, listed
+from gnio_jax.data.splits import find_folders, find_list, read_list
 from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE
 from gnio_jax.numerics import integrate_gyro, quaternions, rotations
 from gnio_jax.types import Sequence
@@ -55,13 +55,13 @@ _ERRORS = {
 }
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split's list that are present, anywhere below the root; `test` is
     `seen`."""
     folders = find_folders(root, lambda folder: (folder / _TABLE).is_file())
-    chosen = listed(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
+    chosen = read_list(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
     choose = split in ("train", "val")
-    return [Recording(folder.name, partial(read, folder, choose)) for folder in chosen]
+    return [RecordingSource(folder.name, partial(read, folder, choose)) for folder in chosen]
 
 
 def read(folder: Path, choose: bool = False) -> list[Sequence]:

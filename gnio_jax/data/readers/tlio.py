@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import json_object, read_npy, shortened
-from gnio_jax.data.splits import listed
+from gnio_jax.data.splits import read_list
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
@@ -31,15 +31,15 @@ _WIDTHS = {_STAMPS: 1, _GYRO: 3, _ACCEL: 3, _ATTITUDE: 4, _POSITION: 3, _VELOCIT
 _LISTS = {"train": "train_list.txt", "val": "val_list.txt", "test": "test_list.txt"}
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split's list that are present."""
-    folders = listed(
+    folders = read_list(
         root / _LISTS[split],
         lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
         root,
         DATASET.layout,
     )
-    return [Recording(folder.name, partial(read, folder)) for folder in folders]
+    return [RecordingSource(folder.name, partial(read, folder)) for folder in folders]
 
 
 def read(folder: Path) -> list[Sequence]:

@@ -39,7 +39,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.alignment.body import with_tracker_poses, without_jumps
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text, shortened, text_of
 from gnio_jax.data.splits import find_folders
 from gnio_jax.errors import InputError
@@ -118,7 +118,7 @@ def walk_of(folder: Path) -> Walk | None:
     return Walk(folder, person, DEVICES[device], magnets == "Dist", way)
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split that are present, anywhere below the root.
 
     `train` has the walks of one person. `val` has those of the other person with magnets beside the
@@ -140,9 +140,9 @@ def _split(walk: Walk) -> str:
     return "val" if walk.magnets else "test"
 
 
-def _recording(walk: Walk) -> Recording:
+def _recording(walk: Walk) -> RecordingSource:
     files = *(walk.folder / name for name in _TEXT_FILES), walk.track
-    return Recording(walk.folder.name, partial(read, walk.folder), files, slow=True)
+    return RecordingSource(walk.folder.name, partial(read, walk.folder), files, slow=True)
 
 
 # --- one walk

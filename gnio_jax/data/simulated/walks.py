@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.simulated.walker import (
     CARRYING,
     FEW_PEOPLE,
@@ -187,7 +187,7 @@ _FEW = {
 _MANY = {"train": (100_000, 600, 60.0), "val": (200_000, 40, 60.0), "test": (300_000, 24, 120.0)}
 
 
-def _few_recordings(_: Path | None, split: str) -> list[Recording]:
+def _few_recordings(_: Path | None, split: str) -> list[RecordingSource]:
     """The walks of few people, not yet computed."""
     seed, first_person, people, count, seconds = _FEW[split]
     placements, walks = list(CARRYING), []
@@ -197,15 +197,15 @@ def _few_recordings(_: Path | None, split: str) -> list[Recording]:
         # one place only.
         where = placements[(index + index // people) % len(placements)]
         computed = partial(_alone, pedestrian, seed + index, who, where, seconds)
-        walks.append(Recording(f"synthetic_{seed + index}_{where}", computed))
+        walks.append(RecordingSource(f"synthetic_{seed + index}_{where}", computed))
     return walks
 
 
-def _many_recordings(_: Path | None, split: str) -> list[Recording]:
+def _many_recordings(_: Path | None, split: str) -> list[RecordingSource]:
     """The walks of many people, not yet computed."""
     first, count, seconds = _MANY[split]
     return [
-        Recording(f"randomised_{seed}", partial(_alone, random_walk, seed, seconds))
+        RecordingSource(f"randomised_{seed}", partial(_alone, random_walk, seed, seconds))
         for seed in range(first, first + count)
     ]
 
