@@ -62,7 +62,7 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
 
     upside_down = attitude.apply(accel).mean(axis=0)[2] < 0
     turn = Rotation.from_rotvec([np.pi if upside_down else 0.0, 0.0, 0.0])
-    about = {
+    attributes = {
         "group": folder.parent.name,
         "session": "/".join(folder.parts[-4:-1]),
         "placement": "quadrotor",
@@ -74,7 +74,7 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
     velocity = velocity if velocity is None else turn.apply(velocity)
     poses = Poses(time, turn * attitude, turn.apply(pose[:, :3]), velocity, source=str(path))
     streams = Streams.of_imu(name or folder.name, path, time, gyro, accel)
-    streams = streams._replace(attributes=about, start=start, poses=poses)
+    streams = streams._replace(attributes=attributes, start=start, poses=poses)
     return assemble(streams, RATE)
 
 
@@ -89,9 +89,9 @@ def _velocity(
     table = read_text(path, separator=" ", header=False, widths=(8, 11))
     if table.width() == 8:
         return None
-    own, velocity = table.take(0), table.take(8, 9, 10)
-    if len(own) != len(time) or np.abs(own - start - time).max() > 1e-3:
-        rows = f"{len(own)} and {len(time)} rows"
+    stamps, velocity = table.take(0), table.take(8, 9, 10)
+    if len(stamps) != len(time) or np.abs(stamps - start - time).max() > 1e-3:
+        rows = f"{len(stamps)} and {len(time)} rows"
         raise damaged(path, f"field 'ts' is not that of {_TABLE} beside it ({rows})")
     if np.abs(velocity).max() > FASTEST:
         raise damaged(path, f"field 'velocity' is beyond {FASTEST:g} m/s")

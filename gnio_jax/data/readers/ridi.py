@@ -62,7 +62,7 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
     chosen = read_list(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
     if split not in ("train", "val"):
         return [_recording(folder, {}) for folder in chosen]
-    held = held_out_of_train(path)
+    held = hold_out_of_train(path)
     chosen = [folder for folder in chosen if (folder.name in held) == (split == "val")]
     if not chosen:
         problem = f"split '{split}' would be empty: {len(held)} sequences of this list are held out"
@@ -76,7 +76,7 @@ def _recording(folder: Path, attributes: dict[str, str]) -> RecordingSource:
     return RecordingSource(folder.name, partial(read, folder), files, True, attributes)
 
 
-def held_out_of_train(path: Path) -> set[str]:
+def hold_out_of_train(path: Path) -> set[str]:
     """Names in the training list for validation: whole people, about a tenth of the list, the same
     in every copy of the data."""
     folders = read_list(path, lambda entry: Path(_name(entry)), path.parent, DATASET.layout)
@@ -111,7 +111,7 @@ def read(folder: Path) -> list[Sequence]:
     table, arcore = (folder / _TABLE).is_file(), (folder / _ARCORE).is_file()
     streams = _from_table(folder) if table else _from_text_files(folder, arcore)
     words = re.findall("|".join(_PLACEMENTS), folder.name)
-    about = {
+    attributes = {
         "group": _subject(folder.name),
         "subject": _subject(folder.name),
         "device": "Android phone" if arcore and not table else "Tango phone",
@@ -119,12 +119,12 @@ def read(folder: Path) -> list[Sequence]:
         "truth": f"{'ARCore' if arcore and not table else 'Tango'} VIO of the phone itself",
         "imu_compensated": "Android's gyro bias" if arcore and not table else "no",
     }
-    streams = streams._replace(attributes=about)
+    streams = streams._replace(attributes=attributes)
     pieces = assemble(streams, RATE, divide=True, max_speed=FASTEST_WALKER)
     for number, piece in enumerate(pieces):
         if piece.device_orientation is not None:
-            own, first = rotations(piece.device_orientation), int(np.argmax(piece.valid))
-            turned = rotations(piece.orientation[first]) * own[first].inv() * own
+            device, first = rotations(piece.device_orientation), int(np.argmax(piece.valid))
+            turned = rotations(piece.orientation[first]) * device[first].inv() * device
             pieces[number] = piece._replace(device_orientation=quaternions(turned))
     return pieces
 
@@ -155,23 +155,23 @@ def _from_text_files(folder: Path, arcore: bool) -> Streams:
     start = gyro.clock(0, "ns", repeats="kept")[1]
 
     def samples(table: Table) -> Samples:
-        time, _, own = table.clock(0, "ns", start, "dropped")
-        return Samples(time, table.take(1, 2, 3)[own], str(table.path))
+        time, _, rows = table.clock(0, "ns", start, "dropped")
+        return Samples(time, table.take(1, 2, 3)[rows], str(table.path))
 
     upright = Rotation.from_euler("x", 90.0 if arcore else 0.0, degrees=True)  # of a y-up world
-    time, _, own = pose.clock(0, "ns", start, "dropped")
+    time, _, rows = pose.clock(0, "ns", start, "dropped")
     poses = Poses(
         time,
-        upright * pose.rotations(4, 5, 6, 7, scalar_first=False)[own],
-        upright.apply(pose.take(1, 2, 3)[own]),
+        upright * pose.rotations(4, 5, 6, 7, scalar_first=False)[rows],
+        upright.apply(pose.take(1, 2, 3)[rows]),
         ends_pieces=True,
         source=str(pose.path),
     )
     device = None
     if (folder / "orientation.txt").is_file():
         game = text("orientation.txt")
-        time, _, own = game.clock(0, "ns", start, "dropped")
-        attitude = game.rotations(1, 2, 3, 4, scalar_first=False)[own]
+        time, _, rows = game.clock(0, "ns", start, "dropped")
+        attitude = game.rotations(1, 2, 3, 4, scalar_first=False)[rows]
         device = Samples(time, quaternions(attitude), str(game.path))
     streams = Streams(folder.name, str(folder), samples(gyro), samples(accel))
     return streams._replace(start=start * 1e-9, poses=poses, device=device)

@@ -52,7 +52,7 @@ def read(folder: Path) -> list[Sequence]:
         table.take(name, width=3) for name in (_GYRO, _ACCEL, _POSITION, _VELOCITY)
     )
     gyro, accel = (attitude.inv().apply(values) for values in (gyro, accel))
-    about = {
+    attributes = {
         "group": folder.name,
         "placement": "head",
         "truth": "visual-inertial (VIO or motion capture)",
@@ -60,7 +60,7 @@ def read(folder: Path) -> list[Sequence]:
     }
     poses = Poses(time, attitude, position, velocity, source=str(path))
     streams = Streams.of_imu(folder.name, path, time, gyro, accel)
-    streams = streams._replace(attributes=about, start=start * 1e-6, poses=poses)
+    streams = streams._replace(attributes=attributes, start=start * 1e-6, poses=poses)
     return assemble(streams, RATE)
 
 
@@ -79,8 +79,8 @@ def _columns(path: Path) -> tuple[dict[str, slice], int]:
         start += int(match[2])
     for name, expected in _WIDTHS.items():
         if name not in columns:
-            known = shortened(", ".join(columns), 600)
-            raise InputError(path, f"column '{name}' is missing", f"found: {known}")
+            names = shortened(", ".join(columns), 600)
+            raise InputError(path, f"column '{name}' is missing", f"found: {names}")
         width = columns[name].stop - columns[name].start
         if width != expected:
             raise InputError(path, f"column '{name}' has width {width}, expected {expected}")

@@ -265,7 +265,7 @@ def test_splits_by_names_are_disjoint_and_what_is_unseen_is_of_another_room():
     rooms = {split: {name[:2] for name in names} for split, names in euroc.EUROC_SPLITS.items()}
     assert not rooms.pop("unseen") & set.union(*rooms.values())
     drives = [f"2011_{month:02d}_26_drive_{n:04d}" for month in (9, 10) for n in range(500)]
-    shares = [kitti.share_of(drive) for drive in drives]
+    shares = [kitti.split_of(drive) for drive in drives]
     for split, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
         assert shares.count(split) / len(drives) == pytest.approx(share, abs=0.04)
 
@@ -276,7 +276,7 @@ def test_splits_by_names_are_disjoint_and_what_is_unseen_is_of_another_room():
 def walks(*names):
     """Walks without files, by their "scene/session/number"."""
     parts = [name.split("/") for name in names]
-    return [oxiod.Walk(scene, folder, int(number), {}, "") for scene, folder, number in parts]
+    return [oxiod.WalkFiles(scene, folder, int(number), {}, "") for scene, folder, number in parts]
 
 
 ROOM = walks(
