@@ -13,7 +13,7 @@ android_sensor_pose.txt has the poses of the IMU; it is used if it exists, turne
 rates depend on the phone.
 
 Sequences have 200 Hz. The lists name train and test; for validation whole people are held out of
-train (`held_out_of_train`).
+train (`hold_out_of_train`).
 """
 
 from __future__ import annotations
