@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.decimation import decimation_factor, low_pass
-from gnio_jax.numerics import convolved, finite_rows, quaternions, rotations, stretches
+from gnio_jax.numerics import convolve, finite_rows, quaternions, rotations, stretches
 from gnio_jax.types import Sequence
 
 SPLINE_INTERVALS = 3.5
@@ -67,7 +67,7 @@ def resample_imu(
     taps = low_pass(factor)
     half = len(taps) // 2
     padded = np.pad(fine, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
-    return convolved(padded, taps)[::factor], measured
+    return convolve(padded, taps)[::factor], measured
 
 
 def resample(sequence: Sequence, rate: float) -> Sequence:

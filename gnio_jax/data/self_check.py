@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset
 from gnio_jax.numerics import (
-    convolved,
+    convolve,
     integrate_gyro,
     last_true,
     midpoints,
@@ -252,7 +252,7 @@ def _accel_correlation(sequence: Sequence, force: np.ndarray, step: float) -> tu
     position = sequence.position[:, :2]
     geometric = (position[2 * h :] - 2.0 * position[h:-h] + position[: -2 * h]) / (h * step) ** 2
     triangle = 1.0 - np.abs(np.arange(-h, h + 1)) / h
-    inertial = convolved(force[:, :2], triangle / triangle.sum())
+    inertial = convolve(force[:, :2], triangle / triangle.sum())
     broken = np.concatenate([[0], np.cumsum(~sequence.valid)])
     whole = broken[2 * h + 1 :] == broken[: -2 * h - 1]
     if whole.sum() < 2 * h:

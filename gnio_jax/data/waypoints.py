@@ -112,7 +112,7 @@ def with_poses(sequence: Sequence) -> Sequence:
         position=position,
         velocity=velocity,
         attributes=sequence.attributes | {"yaw_residual_degrees": legs.residual},
-    ).known_where(valid)
+    ).with_reference_where(valid)
 
 
 def level_attitude(

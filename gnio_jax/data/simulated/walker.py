@@ -24,7 +24,7 @@ from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.numerics import about_z, convolved
+from gnio_jax.numerics import about_z, convolve
 
 Range = tuple[float, float]
 Ranges = tuple[Range, Range, Range]
@@ -453,7 +453,7 @@ def smooth_steps(values: np.ndarray, seconds: float, dt: float) -> np.ndarray:
     """Steps smoothed to ramps of `seconds` with three continuous derivatives."""
     half = round(seconds / dt / 2)
     kernel = np.hanning(2 * half + 3)[1:-1] ** 2
-    return convolved(np.pad(values, half, mode="edge"), kernel / kernel.sum())
+    return convolve(np.pad(values, half, mode="edge"), kernel / kernel.sum())
 
 
 def integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:
