@@ -58,7 +58,7 @@ class Call(NamedTuple):
 
 
 Command = Callable[[Any, Call], None]
-"""A function of `asked`, a dataclass of options, and of the call; its docstring is the help."""
+"""A function of a dataclass of options and of the call; its docstring is the help."""
 
 
 class Option(NamedTuple):
@@ -106,8 +106,8 @@ def function(command: str) -> Command:
 
 
 def options_type(command: Command) -> type:
-    """The dataclass of the options that a command takes."""
-    return typing.get_type_hints(command, include_extras=True)["asked"]
+    """The dataclass of the options that a command takes: the type of its first argument."""
+    return next(iter(typing.get_type_hints(command, include_extras=True).values()))
 
 
 def options_of(kind: type, path: tuple[str, ...] = (), prefix: str = "--") -> Iterator[Option]:
