@@ -69,7 +69,7 @@ def track(request: TrackOptions, call: options.Call) -> None:
     console.say(_table(result.summary))
     for warning in result.summary.warnings:
         console.say(f"warning: {warning}")
-    console.say(f"weights: {weights.name}, trained on {weights.about}")
+    console.say(f"weights: {weights.name}, trained on {weights.trained_on}")
     console.say(result.summary.limits)
     console.say(f"results: {result.folder} (look at track.png, report.html)")
 

@@ -74,7 +74,7 @@ def weights(request: WeightsOptions, _call: options.Call) -> None:
     grid = console.columns(*headings, box=box.SIMPLE_HEAD)
     for name, path in packages.packages().items():
         try:
-            manifest = packages.read_about(path)
+            manifest = packages.read_manifest(path)
         except InputError as error:
             damaged.append(str(error))
             continue
