@@ -83,7 +83,7 @@ def measure(
             sequence for recording in recordings for sequence in read_recording(recording).sequences
         ]
 
-    cold = best(read, repeats, before=lambda: shutil.rmtree(cache, ignore_errors=True))
+    cold = best(read, repeats, prepare=lambda: shutil.rmtree(cache, ignore_errors=True))
     cached = best(read, repeats) if cache.is_dir() else None
     paths = [folder / f"{number}.h5" for number in range(len(sequences))]
     for path, sequence in zip(paths, sequences, strict=True):

@@ -34,7 +34,8 @@ def walk_of(seconds: float) -> tuple[tuple, np.ndarray, np.ndarray, np.ndarray]:
     """The true start, the IMU's signals (n, 6), displacements (k, 3), true positions (k, 3)."""
     walk = data.resample(data.load("synthetic", split="test")[0], 100.0)
     ends = np.arange(1, round(seconds * 10) + 1) * N
-    rotation = geometry.matrix_from_quaternion(jnp.asarray(walk.orientation[::N]))
+    quaternions = jnp.asarray(walk.orientation[::N])
+    rotation = jax.vmap(geometry.matrix_from_quaternion)(quaternions)
     forward = np.asarray(jax.vmap(geometry.yaw_rotation)(rotation))  # yaw frame → world
     displacement = np.full((len(ends), 3), np.nan)
     starts = np.arange(len(ends) - CLONES + 1)
