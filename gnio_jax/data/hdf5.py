@@ -81,8 +81,8 @@ _StoredGroup = tuple[dict[str, Any], dict[str, np.ndarray | None], dict[str, Any
 def _read_group(group: h5py.Group, path: Path) -> _StoredGroup:
     """Read a group, and check only its size: a failure here is due to the file."""
     header, names = dict(group.attrs), (*_FIELDS, *_OPTIONAL_FIELDS, *_WAYPOINTS)
-    ours = header.get("format") == _FORMAT
-    fields = {name: hdf5_field(group, name, path) for name in names if ours}
+    is_ours = header.get("format") == _FORMAT
+    fields = {name: hdf5_field(group, name, path) for name in names if is_ours}
     inner = hdf5_node(group, "attributes", path)
     return header, fields, {} if inner is None else dict(inner.attrs)
 

@@ -154,9 +154,9 @@ def _read_all(
         if workers > 1 and recording.slow and not _entry(recording).is_file()
     ]
     readings = in_processes(read_recording, [(recording,) for recording in slow], workers, progress)
-    sent, died = {id(recording) for recording in slow}, False
+    in_pool, died = {id(recording) for recording in slow}, False
     for recording in recordings:
-        if id(recording) in sent and not died:
+        if id(recording) in in_pool and not died:
             try:
                 reading = next(readings)
                 if reading.damage is not None:  # an error ends the work

@@ -122,8 +122,8 @@ def _spline_reference(
     parts = [one_sign(quaternions(poses.attitude)), poses.position]
     if poses.velocity is not None:
         parts.append(poses.velocity)
-        moved = midpoints(poses.velocity) * steps[:, None]
-        contradiction = np.linalg.norm(np.diff(poses.position, axis=0) - moved, axis=1)
+        integrated = midpoints(poses.velocity) * steps[:, None]
+        contradiction = np.linalg.norm(np.diff(poses.position, axis=0) - integrated, axis=1)
         # Over long steps the trapezoidal rule is only a rough integral of the velocity.
         broken |= contradiction > LARGEST_JUMP + 2.0 * steps**2
     # Attitudes are interpolated by splines too: at 30 Hz the shorter arc between two of them has an
@@ -156,11 +156,11 @@ def _drifts(
     """True in every second in which position and integrated velocity differ by more than `most`
     (m), for example where a satellite receiver corrects itself by jumps."""
     second = round(1.0 / step)
-    moved = np.cumsum(midpoints(velocity) * step, axis=0)
-    error = position - np.concatenate([np.zeros((1, 3)), moved])
-    far = np.linalg.norm(error[second:] - error[:-second], axis=1) > most
+    integrated = np.cumsum(midpoints(velocity) * step, axis=0)
+    error = position - np.concatenate([np.zeros((1, 3)), integrated])
+    drifting = np.linalg.norm(error[second:] - error[:-second], axis=1) > most
     middle = np.zeros(len(position), dtype=bool)
-    middle[second // 2 : second // 2 + len(far)] = far
+    middle[second // 2 : second // 2 + len(drifting)] = drifting
     return within(middle, second // 2)
 
 

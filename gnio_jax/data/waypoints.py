@@ -156,13 +156,13 @@ def match_legs(reckoning: Reckoning, waypoints: Waypoints) -> Legs:
     The yaw is that of the legs that were walked, weighted by their lengths, and with smaller
     weights for legs that differ more (Cauchy's weights about the weighted median).
     """
-    walked, distance = (
+    reckoned, distance = (
         np.diff(reckoning.at(waypoints.time, path)) for path in (reckoning.way, reckoning.length)
     )
     chord = np.diff(_plane(waypoints.position))
-    on_foot = (np.abs(chord) >= SHORTEST_LEG) & (np.abs(walked) > LEAST_STRAIGHT * distance)
-    on_foot &= (np.abs(chord) <= FASTEST_LEG * np.diff(waypoints.time)) & (np.abs(walked) > 1e-3)
-    ratio = np.divide(chord, walked, out=np.ones_like(chord), where=on_foot)
+    on_foot = (np.abs(chord) >= SHORTEST_LEG) & (np.abs(reckoned) > LEAST_STRAIGHT * distance)
+    on_foot &= (np.abs(chord) <= FASTEST_LEG * np.diff(waypoints.time)) & (np.abs(reckoned) > 1e-3)
+    ratio = np.divide(chord, reckoned, out=np.ones_like(chord), where=on_foot)
     if not on_foot.any():
         return Legs(on_foot, 0.0, np.inf)
     turn, weight = np.angle(ratio[on_foot]), np.abs(chord[on_foot])

@@ -136,40 +136,40 @@ def _recording_windows(
 
 
 def gather(
-    source: WindowSource, which: Int[jax.Array, "b"], length: int, margin: int = 0
+    source: WindowSource, indices: Int[jax.Array, "b"], length: int, margin: int = 0
 ) -> Windows:
-    """Windows number `which` of `source`, each `length` samples, in their own frames. Jittable.
+    """Windows number `indices` of `source`, each `length` samples, in their own frames. Jittable.
 
     `imu` has `margin` more samples on either side, for `low_pass`; where the valid samples end, the
     last one is repeated.
     """
-    start = source.start[which]
+    start = source.start[indices]
     rows = window_rows(start - margin, margin + length + margin)
-    first, last = source.stretch[which].T[:, :, None]
+    first, last = source.stretch[indices].T[:, :, None]
     imu = source.imu[jnp.clip(rows, first, last) if margin else rows]
-    cosine, sine = source.unyaw[which][:, :, None].swapaxes(0, 1)
+    cosine, sine = source.unyaw[indices][:, :, None].swapaxes(0, 1)
     # The compiler removes the steps if they are not used.
     x, y, z = jnp.moveaxis(source.step[window_rows(start, length)], -1, 0)
     return Windows(
-        imu=rotate_channels(source.rotation[which], imu),
-        displacement=source.displacement[which],
+        imu=rotate_channels(source.rotation[indices], imu),
+        displacement=source.displacement[indices],
         steps=jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1),
     )
 
 
 def shift_windows(
-    key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"], samples: int
+    key: PRNGKeyArray, source: WindowSource, indices: Int[jax.Array, "b"], samples: int
 ) -> Int[jax.Array, "b"]:
-    """Numbers of the windows up to `samples` later or earlier than `which`.
+    """Numbers of the windows up to `samples` later or earlier than `indices`.
 
     A window stays where the recording has none at the drawn distance.
     """
     if samples == 0:
-        return which
-    shift = jax.random.randint(key, which.shape, -samples, samples + 1, jnp.int32)
-    candidate = jnp.clip(which + shift, 0, source.start.shape[0] - 1)
-    in_recording = source.start[candidate] - source.start[which] == shift
-    return jnp.where(in_recording, candidate, which)
+        return indices
+    shift = jax.random.randint(key, indices.shape, -samples, samples + 1, jnp.int32)
+    candidate = jnp.clip(indices + shift, 0, source.start.shape[0] - 1)
+    in_recording = source.start[candidate] - source.start[indices] == shift
+    return jnp.where(in_recording, candidate, indices)
 
 
 def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: float) -> Windows:

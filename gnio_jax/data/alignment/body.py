@@ -709,8 +709,8 @@ def near_any(
 ) -> Bool[np.ndarray, " n"]:
     """Whether a time is within an interval from one of `starts` to its end, extended by `around`.
     Starts and ends increase."""
-    begun = np.searchsorted(starts, time + margin, side="right")
-    return begun != np.searchsorted(ends, time - margin)
+    started = np.searchsorted(starts, time + margin, side="right")
+    return started != np.searchsorted(ends, time - margin)
 
 
 def smooth(values: np.ndarray, sigma: float) -> np.ndarray:

@@ -290,9 +290,9 @@ def _fit(
 
         def errors(change: Float[np.ndarray, " u"]) -> list[np.ndarray]:
             turns, lag = change[: 3 * count].reshape(count, 3), lags + change[3 * count :]
-            felt = Rotation.from_rotvec(turn_hats @ turns).apply(force) - UPWARD
+            inertial = Rotation.from_rotvec(turn_hats @ turns).apply(force) - UPWARD
             of_steps = rises(clock[at_steps] - step_hats @ lag) - inertial_rises
-            return [of_steps, tracked(clock[at_slow] - slow_hats @ lag) - felt]
+            return [of_steps, tracked(clock[at_slow] - slow_hats @ lag) - inertial]
 
         start = np.zeros(3 * count + len(lags))
         scales = [max(robust_std(error), 1e-3) for error in errors(start)]

@@ -202,7 +202,7 @@ def _gravity(
     are medians over a second of displacements over a second, which no single pose can change.
     """
     mean, second = force.mean(axis=0), round(RATE)
-    gained, seconds = np.zeros(3), 0.0
+    velocity_gain, seconds = np.zeros(3), 0.0
     for run in stretches(np.diff(time) > LONGEST_BRIDGE):
         if run.stop - run.start >= 3 * second:
             run_time, difference = time[run], force[run] - mean
@@ -213,9 +213,9 @@ def _gravity(
             speed = (difference[second:] - difference[:-second]) / duration[:, None]
             middle = run_time[:-second] + duration / 2.0
             first, last = slice(second), slice(-second, None)
-            gained += np.median(speed[last], axis=0) - np.median(speed[first], axis=0)
+            velocity_gain += np.median(speed[last], axis=0) - np.median(speed[first], axis=0)
             seconds += float(np.median(middle[last]) - np.median(middle[first]))
-    return mean - gained / max(seconds, 1.0)
+    return mean - velocity_gain / max(seconds, 1.0)
 
 
 def _device(table: Table, time: Float[np.ndarray, " n"], rows: np.ndarray) -> Samples | None:

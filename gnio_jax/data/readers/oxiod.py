@@ -169,8 +169,8 @@ def _walks_of(scene: str, folder: Path) -> list[WalkFiles]:
     for kind in ("syn",) if scene == LARGE_SCALE else ("raw", "syn"):
         for imu in sorted((folder / kind).glob("imu*.csv")):
             if match := re.fullmatch(r"imu(\d+)\.csv", imu.name):
-                beside = (imu.with_name(f"{name}{match[1]}.csv") for name in _TRUTHS)
-                if truth := next((path for path in beside if path.is_file()), None):
+                truths = (imu.with_name(f"{name}{match[1]}.csv") for name in _TRUTHS)
+                if truth := next((path for path in truths if path.is_file()), None):
                     files.setdefault(int(match[1]), {})[kind] = (imu, truth)
                 else:
                     problem = "has no vi, hand or tango file beside it; left out"
