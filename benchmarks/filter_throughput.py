@@ -131,7 +131,7 @@ def measure_numpy(config: filtering.FilterConfig, seconds: float) -> float:
 
 
 class GradientCost(NamedTuple):
-    """What value and gradient of a number of pieces cost."""
+    """The cost of value and gradient of a number of pieces."""
 
     ratio: float
     """Their time over that of the value alone."""

@@ -40,10 +40,10 @@ STEPS = 8
 
 
 class Cluster(NamedTuple):
-    """What the GPUs are assumed to be."""
+    """Assumptions about the GPUs and the network between them."""
 
     flops: float = 0.35 * 989e12
-    """Of one GPU, bfloat16: the wished share of an H100's peak."""
+    """Operations per second of one GPU, bfloat16: the wished share of an H100's peak."""
     inside: float = 300e9
     """Bytes per second between GPUs of a machine of eight (NVLink)."""
     between: float = 40e9

@@ -45,7 +45,7 @@ class AlignedRecording(NamedTuple):
     imu: Float[Array, "t 6"]
     """[accel m/s², gyro rad/s]: in the world for `per_sample`, in the body for `single`."""
     rotation: Float[Array, "m 3 3"]
-    """From the frame of `imu` to the gravity-aligned frame of each window."""
+    """Rotation from the frame of `imu` to the gravity-aligned frame of each window."""
 
 
 def window_starts(samples: int, length: int, stride: int) -> Starts:

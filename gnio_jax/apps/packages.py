@@ -376,7 +376,7 @@ def _has_manifest(path: Path) -> bool:
 
 
 def _figures(workdir: Path) -> dict[str, Report]:
-    """Every evaluation of a run, by its folder's name. Raises `InputError`."""
+    """Read every evaluation of a run, by its folder's name. Raises `InputError`."""
     folders = sorted(path.parent for path in workdir.glob("eval/*/metrics.json"))
     return {folder.name: report.read(folder) for folder in folders}
 

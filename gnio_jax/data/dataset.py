@@ -21,7 +21,7 @@ class Refusal(InputError):
 
 
 class RecordingSource(NamedTuple):
-    """One recording that was found, but not yet read. It can be sent to another process."""
+    """A recording that a reader has found, but not yet read. It can be sent to another process."""
 
     name: str
     """Name that is unique within a dataset, and that of its sequence, if there is only one."""
@@ -43,7 +43,7 @@ class RecordingSource(NamedTuple):
 
 @dataclass(frozen=True)
 class Dataset:
-    """One dataset."""
+    """The description of a dataset, with the function that finds its recordings."""
 
     name: str
     """The name of `--dataset`."""

@@ -126,7 +126,7 @@ class Fold(NamedTuple):
 
     split: str
     number: int
-    """From 0 to `count` − 1."""
+    """Number of the fold, from 0 to `count` − 1."""
     count: int
     left_out: bool
 

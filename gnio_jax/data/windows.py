@@ -41,8 +41,8 @@ class WindowSource(NamedTuple):
     start: Int[Array, "m"]
     """Row of `imu` at which each window begins, with its context."""
     rotation: Float[Array, "m 3 3"]
-    """From the frame of `imu` to the gravity-aligned frame in which the window's start, after the
-    context, has zero yaw."""
+    """Rotation from the frame of `imu` to the gravity-aligned frame in which the window's start,
+    after the context, has zero yaw."""
     displacement: Float[Array, "m 3"]
     """Target in that frame, m: from the stamp of the first sample after the context to one interval
     after the last (paper eq. 1)."""

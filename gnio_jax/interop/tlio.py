@@ -23,7 +23,7 @@ from gnio_jax.errors import InputError, require_packages
 from gnio_jax.files import replacing_folder
 
 _CHANNELS = np.array([3, 4, 5, 0, 1, 2])
-"""Where our channels, [accel, gyro], are among TLIO's, [gyro, accel]."""
+"""Index of each of our channels, [accel, gyro], among TLIO's, [gyro, accel]."""
 _STEM = "input_block.0.weight"
 _FLATTENED = "output_block1.fc1.weight"
 _PREP_CHANNELS = 128

@@ -66,7 +66,7 @@ class GnioOdometry(Node):
             self._send_transform(odometry)
 
     def _send_transform(self, odometry: Odometry) -> None:
-        """From the IMU's frame to `odom`."""
+        """Send the transform from the IMU's frame to `odom`."""
         transform = TransformStamped()
         transform.header, transform.child_frame_id = odometry.header, odometry.child_frame_id
         position, move = odometry.pose.pose.position, transform.transform.translation

@@ -134,7 +134,8 @@ class BodyFit(NamedTuple):
     """Power of the filtered angular rate's error over that of the tracker's angular rate: 0 for a
     perfect fit, 1 for one that explains nothing."""
     accel_unexplained: float
-    """The same for the acceleration, without gravity."""
+    """Power of the filtered acceleration's error over that of the tracker's acceleration, without
+    gravity."""
     runner_up: float
     """The unexplained share of this fit over that of the best fit with another lag; 0 if there is
     no other, 1 if both are equally good."""
@@ -375,7 +376,7 @@ def _tracker_signals(track: Poses) -> _TrackerSignals:
 
 
 def _inertial_signals(imu: Streams) -> _InertialSignals:
-    """Both sensors filtered on uniform clocks."""
+    """Filter both sensors on uniform clocks."""
     splines, unknown = [], []
     for time, values, _ in (imu.gyro, imu.accel):
         clock, broken = np.arange(time[0], time[-1], 1.0 / RATE), gaps(time)
@@ -448,7 +449,7 @@ class _Fit(NamedTuple):
     accel: Float[np.ndarray, "n 3"]
     """Errors of the acceleration, m/s²."""
     turn_std: float
-    """As in `BodyFit`."""
+    """`BodyFit.turn_std`."""
 
     @property
     def unexplained(self) -> float:

@@ -107,7 +107,7 @@ class _Signals(NamedTuple):
     """False near positions that are missing, and where the tracker relocalised."""
 
     def filtered(self, seconds: float) -> _Signals:
-        """Both accelerations after a Gaussian filter."""
+        """The signals with both accelerations passed through a Gaussian filter."""
         inertial, tracked = (
             smooth(acceleration, seconds * RATE) for acceleration in (self.inertial, self.tracked)
         )

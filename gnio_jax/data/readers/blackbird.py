@@ -51,7 +51,7 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
 
 
 def read(folder: Path, name: str | None = None) -> list[Sequence]:
-    """One sequence of its folder, in a z-up world. Raises `InputError` naming file and field."""
+    """Read the sequence of a folder, in a z-up world. Raises `InputError` naming file and field."""
     path = folder / _TABLE
     table = read_hdf5_fields(path, ("ts", "gyro_calib", "accel_calib", "traj_target"))
     time, start, _ = table.clock("ts", "s")

@@ -105,8 +105,8 @@ def _find(root: Path, entry: str) -> Path | None:
 
 
 def read(path: Path) -> list[Sequence]:
-    """One recording, on a uniform clock of its own rate, named after its file. Raises `InputError`
-    naming file and field."""
+    """Read a recording, on a uniform clock of its own rate, named after its file. Raises
+    `InputError` naming file and field."""
     if path.suffix.lower() not in HDF5:
         return assemble(_streams(read_text(path)), whole=True)
     sequence = read_hdf5(path)._replace(name=path.stem)

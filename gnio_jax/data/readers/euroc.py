@@ -128,7 +128,7 @@ def short_name(folder: str) -> str:
 
 
 def read(folder: Path, dataset: str = "euroc") -> list[Sequence]:
-    """One sequence from its folder (the one with `mav0`). Raises `InputError` naming file and
+    """Read the sequence of a folder (the one with `mav0`). Raises `InputError` naming file and
     field."""
     mav, name = folder / "mav0", short_name(folder.name)
     path = mav / "imu0" / "data.csv"

@@ -123,7 +123,7 @@ def _name(path: Path) -> str:
 
 
 def read(path: Path) -> list[Sequence]:
-    """One walk at 100 Hz: levelled, with the reference turned to the phone and shifted to its
+    """Read a walk at 100 Hz: levelled, with the reference turned to the phone and shifted to its
     clock.
 
     Level and lag are those of the whole walk, which is divided at gaps longer than a window. Raises

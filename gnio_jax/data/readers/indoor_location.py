@@ -74,7 +74,7 @@ def _name(path: Path) -> str:
 
 
 def read(path: Path) -> list[Sequence]:
-    """One walk from its file, at 50 Hz, with waypoints instead of poses.
+    """Read a walk from its file, at 50 Hz, with waypoints instead of poses.
 
     Raises `InputError` naming file and field, and `Refusal` for a walk with too few waypoints.
     """

@@ -109,7 +109,7 @@ _TRUTHS = ("vi", "hand", "tango")
 
 
 class WalkFiles(NamedTuple):
-    """One walk: the files of one recording."""
+    """The files of one walk, which is one recording."""
 
     scene: str
     folder: str
@@ -147,7 +147,7 @@ class WalkFiles(NamedTuple):
 
 
 def find_walks(root: Path) -> list[WalkFiles]:
-    """Every walk below `root`, whose scenes may be some folders deeper."""
+    """Find every walk below `root`, whose scenes may be some folders deeper."""
     return [
         walk
         for scene in (*SINGLE_USER, *UNSEEN, LARGE_SCALE)
@@ -285,8 +285,8 @@ def _read_lists(walks: list[WalkFiles], name: str, root: Path) -> list[WalkFiles
 
 
 def build(walk: WalkFiles, kind: str) -> list[Sequence]:
-    """One walk at 100 Hz. Raises `Refusal` if its files are damaged, or if they or the fit of phone
-    and tracker cannot be used: another form of the walk may be usable."""
+    """Read a walk at 100 Hz. Raises `Refusal` if its files are damaged, or if they or the fit of
+    phone and tracker cannot be used: another form of the walk may be usable."""
     imu_path, truth_path = walk.files[kind]
     try:
         # The syn files of the large scale still have the phone's stamps.

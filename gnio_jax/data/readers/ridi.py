@@ -102,7 +102,7 @@ def _subject(name: str) -> str:
 
 
 def read(folder: Path) -> list[Sequence]:
-    """One recording from its folder, at 200 Hz, from its table or else from the recorder's text
+    """Read a recording from its folder, at 200 Hz, from its table or else from the recorder's text
     files, divided at gaps of IMU or odometry that are longer than a window.
 
     `device_orientation` is the game rotation vector, turned to begin at the reference's attitude,

@@ -65,7 +65,7 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
 
 
 def read(folder: Path, choose: bool = False) -> list[Sequence]:
-    """One recording of its folder, from its `start_frame` on.
+    """Read the recording of a folder, from its `start_frame` on.
 
     With `choose` the source of the orientation is chosen by its errors against the truth, as in
     training; without it the source is the game rotation vector. `device_orientation` is the game

@@ -43,7 +43,7 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
 
 
 def read(folder: Path) -> list[Sequence]:
-    """One sequence of its folder. Raises `InputError` naming file and field."""
+    """Read the sequence of a folder. Raises `InputError` naming file and field."""
     path = folder / _TABLE
     table = read_npy(path, *_columns(folder / _DESCRIPTION))
     time, start, _ = table.clock(_STAMPS, "us")

@@ -95,7 +95,7 @@ _NAME = re.compile(rf"(\w+?)_({'|'.join(DEVICES)})_(Dist|NoDist)_(\w+)")
 
 
 class WalkFolder(NamedTuple):
-    """One walk: the folder of its phone, and the parts of its name."""
+    """The folder of the phone of one walk, and the parts of its name."""
 
     folder: Path
     person: str
@@ -152,8 +152,8 @@ def _recording(walk: WalkFolder) -> RecordingSource:
 
 
 def read(folder: Path) -> list[Sequence]:
-    """One walk from its phone's folder. Raises `InputError` naming file and field, and `Refusal` if
-    phone and tracker do not have the same motion."""
+    """Read a walk from its phone's folder. Raises `InputError` naming file and field, and `Refusal`
+    if phone and tracker do not have the same motion."""
     walk = walk_of(folder)
     if walk is None:
         problem = "is not named <Person>_<Device>_<Dist|NoDist>_<Way>"
@@ -188,7 +188,8 @@ def clipped_share(accel: Float[np.ndarray, "n 3"]) -> float:
 
 
 def read_phone(walk: WalkFolder) -> Streams:
-    """Both sensors, in s of the record, as SI units in the phone's axes. Raises `InputError`."""
+    """Read both sensors: SI units, the phone's axes, time in s of the record. Raises
+    `InputError`."""
     apple = walk.device.startswith("iPhone")
     start = _boot_time(walk.folder / "description.txt") if apple else 0.0
     sensors = []

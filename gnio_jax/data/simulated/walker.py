@@ -64,7 +64,7 @@ class Carrying(NamedTuple):
     roll: float
     """Standard deviation of the rotation about the phone's y axis, rad."""
     lever: Ranges
-    """From the walker's axis to the phone, m; left is the side of the phone."""
+    """Vector from the walker's axis to the phone, m; left is the side of the phone."""
 
 
 CARRYING = {
