@@ -68,7 +68,7 @@ class Sequence(NamedTuple):
     """The origin: dataset, session, group, subject, device, placement, truth, licence, ...
     (str, float or bool)."""
 
-    def known_where(self, valid: Bool[np.ndarray, "n"]) -> Sequence:
+    def with_reference_where(self, valid: Bool[np.ndarray, "n"]) -> Sequence:
         """The sequence with its reference where `valid` is True, and none elsewhere."""
         poses = (self.orientation, self.position, self.velocity)
         orientation, position, velocity = (np.where(valid[:, None], x, np.nan) for x in poses)

@@ -199,7 +199,7 @@ def summarise(
     summary = Summary(
         recording=sequence.name,
         weights=weights.name,
-        trained_on=weights.about,
+        trained_on=weights.trained_on,
         start_time=float(sequence.attributes.get("start_time", 0.0)),
         seconds=seconds,
         path_length=length,

@@ -23,11 +23,11 @@ def test_a_calibration_is_of_the_best_checkpoint(tmp_path, monkeypatch):
     monkeypatch.setattr(runs.calibration, "calibrate", calibrate)
     (run / "checkpoints" / "best" / "7").mkdir(parents=True)
     for _ in range(2):
-        assert runs.calibrated(run, Lines()) == tmp_path / "gnio_s0_calibrated"
+        assert runs.calibrate_run(run, Lines()) == tmp_path / "gnio_s0_calibrated"
     assert made == [CalibrateConfig(str(run), out=str(tmp_path / "gnio_s0_calibrated"))]
     # The run goes on and finds a better checkpoint: what was fitted to the old one is replaced.
     (run / "checkpoints" / "best" / "7").rename(run / "checkpoints" / "best" / "9")
-    runs.calibrated(run, Lines())
+    runs.calibrate_run(run, Lines())
     (kept,) = (tmp_path / "gnio_s0_calibrated" / "checkpoints" / "best").iterdir()
     assert len(made) == 2 and kept.name == "9"
 
