@@ -34,7 +34,7 @@ from gnio_jax.training import checkpoint
 
 MOST_STEPS = 60
 """Largest number of steps of the search for the settings (L-BFGS)."""
-ABOUT = "calibration.json"
+RECORD = "calibration.json"
 """File that records the fit and its data, by which a calibrated run is recognised."""
 
 
@@ -72,26 +72,26 @@ def calibrate(
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
     run = load_run(workdir, config)
     folder = _folder(config, workdir)
-    split, asked = sources(run, config)
+    split, networks = sources(run, config)
     windows = run.config.data
     noise = run.config.filter.noise._replace(measurement_scale=1.0, std_factor=(1.0, 1.0, 1.0))
-    nothing = ConsideredStd()  # it changes no estimate, and is fitted last
-    uncalibrated = dataclasses.replace(run.config.filter, noise=noise, considered=nothing)
+    # Consider covariance changes no estimate, and is fitted last.
+    uncalibrated = dataclasses.replace(run.config.filter, noise=noise, considered=ConsideredStd())
     start_of_fit(uncalibrated, paths)  # finds mistakes before reading data
-    recordings, estimates = gather(split, asked, config, uncalibrated, progress, workers)
+    recordings, estimates = gather(split, networks, config, uncalibrated, progress, workers)
     try:
-        factors = std_factors(estimates, [each.displacement for each in recordings])
+        factors = std_factors(estimates, [recording.displacement for recording in recordings])
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
     x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as written to the settings
     noise = noise._replace(std_factor=(x, y, z))
     settings = start_of_fit(dataclasses.replace(uncalibrated, noise=noise), paths)
-    strides = max(each.strides for each in recordings)
+    strides = max(recording.strides for recording in recordings)
     # The first row of an estimate is its start. That of a network has displacements.
-    predicted = [each.displacements for each in estimates if each.displacements is not None]
-    given = [Displacements(*(x[1:] for x in each[:2])) for each in predicted]
-    walks = filter_inputs(recordings, given, strides, filter_config(windows, settings))
-    found = fit_innovations(
+    rows = [estimate.displacements for estimate in estimates if estimate.displacements is not None]
+    displacements = [Displacements(value[1:], covariance[1:]) for value, covariance, _ in rows]
+    walks = filter_inputs(recordings, displacements, strides, filter_config(windows, settings))
+    fit = fit_innovations(
         walks,
         windows,
         settings,
@@ -100,18 +100,18 @@ def calibrate(
         MOST_STEPS,
     )
     progress("considering", 0.0)
-    references = (each.reference.position[1:] for each in recordings)
-    truth = np.stack([filled_up(each, strides, np.nan) for each in references])
-    positions = filtered_positions(walks, truth, windows, found.settings)
-    considered = fit_considered(positions, windows.stride_seconds, found.settings)
+    references = (recording.reference.position[1:] for recording in recordings)
+    truth = np.stack([filled_up(reference, strides, np.nan) for reference in references])
+    positions = filtered_positions(walks, truth, windows, fit.settings)
+    considered = fit_considered(positions, windows.stride_seconds, fit.settings)
     progress("considering", 1.0)
-    calibration = Calibration(run.config.filter, found, considered, len(recordings), folder)
+    calibration = Calibration(run.config.filter, fit, considered, len(recordings), folder)
     _write(calibration, workdir, run, config, split)
     return calibration
 
 
 def _folder(config: CalibrateConfig, workdir: Path) -> Path:
-    if (workdir / ABOUT).exists():
+    if (workdir / RECORD).exists():
         remedy = "calibrate the run that it was made from"
         raise InputError(workdir, "is a calibrated run", remedy)
     absolute = workdir.resolve()
@@ -129,17 +129,17 @@ def _write(
     split: str,
 ) -> None:
     """The run with its new settings, its checkpoint, and what was fitted."""
-    found, settings = calibration.fit, calibration.considered.settings
-    about: dict[str, Any] = {
+    fit, settings = calibration.fit, calibration.considered.settings
+    record: dict[str, Any] = {
         "run": str(workdir),
         "split": split,
         "out_of_fold": list(config.out_of_fold),
         "average_headings": config.average_headings,
         "recordings": calibration.recordings,
         "fitted": list(config.fit),
-        "negative_log_likelihood_per_innovation": {"before": found.before, "after": found.after},
-        "steps": found.steps,
-        "warnings": list(found.warnings),
+        "negative_log_likelihood_per_innovation": {"before": fit.before, "after": fit.after},
+        "steps": fit.steps,
+        "warnings": list(fit.warnings),
         "position_nees_per_axis": {
             "before": calibration.considered.before,
             "after": calibration.considered.after,
@@ -152,7 +152,7 @@ def _write(
         )
         configuration.validate(experiment, "the calibrated run")
         configuration.save(new / "config.yaml", experiment)
-        write_text(new / ABOUT, json.dumps(about, indent=2) + "\n")
+        write_text(new / RECORD, json.dumps(record, indent=2) + "\n")
         checkpoint.write_best(new, trained._replace(config=experiment))
         for name in ("splits.yaml", "metrics.jsonl"):
             if (workdir / name).exists():

@@ -33,28 +33,30 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
 
     console.prepare_filter()
     with console.terminal() as terminal:
-        found = calibration.calibrate(asked, terminal.progress, usable_cores())
-    table, before = Table("filter", "before", "calibrated"), configuration.flat(found.before)
-    for name, value in configuration.flat(found.considered.settings).items():
+        result = calibration.calibrate(asked, terminal.progress, usable_cores())
+    table, before = Table("filter", "before", "calibrated"), configuration.flat(result.before)
+    for name, value in configuration.flat(result.considered.settings).items():
         if value != before.get(name):
             table.add_row(name, _spelled(before.get(name)), _spelled(value))
     console.say(table)
     console.say(
-        f"negative log-likelihood of an innovation: {found.fit.before:.4f} after the factors of "
-        f"the axes, {found.fit.after:.4f} after the fit ({found.recordings} recordings, "
-        f"{found.fit.steps} steps)"
+        f"negative log-likelihood of an innovation: {result.fit.before:.4f} after the factors of "
+        f"the axes, {result.fit.after:.4f} after the fit ({result.recordings} recordings, "
+        f"{result.fit.steps} steps)"
     )
     console.say(
         "squared error of the position over the variance that the filter reports, per axis: "
-        f"{found.considered.before:.2f} -> {found.considered.after:.2f} with consider covariance"
+        f"{result.considered.before:.2f} -> {result.considered.after:.2f} with consider covariance"
     )
-    for warning in found.fit.warnings:
+    for warning in result.fit.warnings:
         console.warn(warning)
-    console.say(f"look at it with: gnio evaluate --workdir {found.folder}")
+    console.say(f"look at it with: gnio evaluate --workdir {result.folder}")
 
 
 def _spelled(value: Any) -> str:
     """The text of a setting in a cell: one number, several, or none if it is switched off."""
     if value is None:
         return "none"
-    return ", ".join(f"{each:.4g}" for each in (value if isinstance(value, tuple) else (value,)))
+    return ", ".join(
+        f"{number:.4g}" for number in (value if isinstance(value, tuple) else (value,))
+    )
