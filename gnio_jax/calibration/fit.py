@@ -263,18 +263,19 @@ _value_and_gradient = jax.jit(
 )
 
 
-def _start(walk: Inputs, settings: FilterSettings) -> Start:
-    """The start of a walk as in an evaluation."""
+def evaluated_start(start: Start, settings: FilterSettings) -> Start:
+    """The start as an evaluation with the settings has it, of a recording that starts from its
+    reference."""
     level = settings.start.gyro_bias
     if settings.raw_gyro_bias is not None:
-        level = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, level)
-    return walk.start._replace(std=settings.start, level_gyro_bias=level)
+        level = jnp.where(start.raw_gyro, settings.raw_gyro_bias, level)
+    return start._replace(std=settings.start, level_gyro_bias=level)
 
 
 def _wide_start(walk: Inputs, settings: FilterSettings) -> Start:
     """The start with all components of a raw gyro's bias uncertain (ours). Otherwise the fit would
     explain an unknown vertical component by noise."""
-    start = _start(walk, settings)
+    start = evaluated_start(walk.start, settings)
     return start._replace(std=start.std._replace(gyro_bias=start.level_gyro_bias))
 
 
@@ -409,7 +410,7 @@ def _filtered(
     axis of a raw gyro."""
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
-        start = _start(walk, settings)
+        start = evaluated_start(walk.start, settings)
         state = start.state(config)
         run, displacement = _repeated(walk, settings, config)
         history = run(state, displacement)

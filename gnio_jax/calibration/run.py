@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gnio_jax import config as configuration
+from gnio_jax.calibration.comparison import Effect, compare_filters
 from gnio_jax.calibration.evidence import OnStage, gather, load_run, sources
 from gnio_jax.calibration.fit import (
     DIGITS,
@@ -36,6 +37,8 @@ MOST_STEPS = 60
 """Largest number of steps of the search for the settings (L-BFGS)."""
 RECORD = "calibration.json"
 """File that records the fit and its data, by which a calibrated run is recognised."""
+LEAST_RECORDINGS = 5
+"""Number of recordings below which a fit to them is doubtful (ours)."""
 
 
 class Calibration(NamedTuple):
@@ -45,8 +48,25 @@ class Calibration(NamedTuple):
     fit: Fit
     considered: Considered
     """The fit, with the settings of the calibrated run."""
+    effect: Effect
+    """What it does to the trajectories of its recordings."""
     recordings: int
+    raw_gyros: int
+    """Number of recordings with a raw gyro."""
     folder: Path
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons not to trust the calibration, each in one sentence."""
+        others = self.recordings - self.raw_gyros
+        groups = {"with a raw gyro": self.raw_gyros, "without a raw gyro": others}
+        few = (
+            f"only {count} recording{'s' * (count > 1)} {group}: fewer than {LEAST_RECORDINGS} "
+            "hardly determine the settings that are fitted to them"
+            for group, count in groups.items()
+            if 0 < count < LEAST_RECORDINGS
+        )
+        return (*self.fit.warnings, *self.effect.warnings, *few)
 
 
 def calibrate(
@@ -60,7 +80,8 @@ def calibrate(
     deviations those of its errors, which are compared with the reference window by window. Then the
     settings of `config.fit` are chosen so that the innovations of the filter are most likely; here
     the reference gives only the start. Last, the consider covariance is chosen so that the errors
-    of the filter's positions are most likely; it changes no trajectory.
+    of the filter's positions are most likely; it changes no trajectory. Likely innovations are not
+    always good trajectories, so the errors of these are compared with those of the run's filter.
 
     The recordings are those of the validation split, or those of the training split, each with the
     displacements of a network that was not trained on it. Raises `InputError` for another split,
@@ -104,8 +125,12 @@ def calibrate(
     truth = np.stack([filled_up(reference, strides, np.nan) for reference in references])
     positions = filtered_positions(walks, truth, windows, fit.settings)
     considered = fit_considered(positions, windows.stride_seconds, fit.settings)
-    progress("considering", 1.0)
-    calibration = Calibration(run.config.filter, fit, considered, len(recordings), folder)
+    progress("comparing", 0.0)
+    before = run.config.filter
+    effect = compare_filters(recordings, displacements, windows, before, considered.settings)
+    progress("comparing", 1.0)
+    raw = sum(bool(recording.start.raw_gyro) for recording in recordings)
+    calibration = Calibration(before, fit, considered, effect, len(recordings), raw, folder)
     _write(calibration, workdir, run, config, split)
     return calibration
 
@@ -129,20 +154,26 @@ def _write(
     split: str,
 ) -> None:
     """The run with its new settings, its checkpoint, and what was fitted."""
-    fit, settings = calibration.fit, calibration.considered.settings
+    fit, effect = calibration.fit, calibration.effect
+    settings = calibration.considered.settings
     record: dict[str, Any] = {
         "run": str(workdir),
         "split": split,
         "out_of_fold": list(config.out_of_fold),
         "average_headings": config.average_headings,
         "recordings": calibration.recordings,
+        "recordings_with_raw_gyro": calibration.raw_gyros,
         "fitted": list(config.fit),
         "negative_log_likelihood_per_innovation": {"before": fit.before, "after": fit.after},
         "steps": fit.steps,
-        "warnings": list(fit.warnings),
+        "warnings": list(calibration.warnings),
         "position_nees_per_axis": {
             "before": calibration.considered.before,
             "after": calibration.considered.after,
+        },
+        "trajectories": {
+            **{metric: change._asdict() for metric, change in effect.errors.items()},
+            "diverged": effect.diverged._asdict(),
         },
         "filter": configuration.plain(settings),
     }

@@ -77,6 +77,8 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     app.main([*words, "--fit", "measurement", "noise", "window"])
     told, warned = capsys.readouterr()
     assert "warning: the fit stopped after 2 steps" in warned
+    assert f"warning: only {WALKS} recordings without a raw gyro: fewer than 5" in warned
+    assert f"recordings: 0 with a raw gyro, {WALKS} without" in told
     assert "noise.std_factor" in told and f"gnio evaluate --workdir {out}" in told
     assert splits_read == ["val"]
     before, after = (checkpoint.load_run(folder) for folder in (run, out))
@@ -94,6 +96,11 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     nees = about["position_nees_per_axis"]
     assert abs(np.log(nees["after"])) < abs(np.log(nees["before"]))
     assert about["split"] == "val" and about["filter"] == plain(found)
+    assert about["recordings"] == WALKS and about["recordings_with_raw_gyro"] == 0
+    assert [f"warning: {line}" for line in about["warnings"]] == warned.splitlines()
+    change = about["trajectories"]["ate"]
+    assert f"ATE (m) │ {change['before']:.2f} │ {change['after']:.2f}" in re.sub(" +", " ", told)
+    assert change["before"] != change["after"] and "diverged" not in told
 
 
 def test_a_network_is_averaged_over_four_headings_or_told_that_it_cannot_be(run):
@@ -269,7 +276,8 @@ def test_noises_are_fitted_with_the_whole_bias_of_a_raw_gyro_uncertain(raw, expe
     walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
     walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
     config = fitting.innovation_config(DATA, settings)
-    states = (each(walk, settings).state(config) for each in (fitting._wide_start, fitting._start))
+    starts = fitting._wide_start(walk, settings), fitting.evaluated_start(walk.start, settings)
+    states = (start.state(config) for start in starts)
     spreads = (
         np.sqrt(np.linalg.eigvalsh(state.core_covariance[GYRO_BIAS, GYRO_BIAS])) for state in states
     )
