@@ -92,6 +92,11 @@ def smooth(
     frame=config.displacement_frame)`. `state` is the prior, and earlier measurements are not
     smoothed. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
 
+    Smoothing trusts the IMU as far as `noise` says. Where the IMU is sampled too slowly for the
+    motion, as on a swinging leg at 100 Hz, its integration errs by more than that, and the smoothed
+    positions can be worse than those of the filter. With 200 Hz, or with a larger
+    `noise.accel_density` (0.03 there), they are better.
+
     Memory: about K · (18 m + 500) numbers, m = 21 + 6 (W + 1): 25 kB for each interval at W = 20,
     in float64. Smoothed variances are differences. In float32 a variance that becomes smaller by
     many orders of magnitude, as at the start, keeps few digits and can become negative.

@@ -118,5 +118,7 @@ def calibrate_run(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
         return folder
     reporter.line(f"calibrating {workdir.name}")
     shutil.rmtree(folder, ignore_errors=True)
-    calibration.calibrate(CalibrateConfig(str(workdir), out=str(folder)), workers=workers)
+    result = calibration.calibrate(CalibrateConfig(str(workdir), out=str(folder)), workers=workers)
+    for warning in result.warnings:
+        reporter.line(f"warning: {folder.name}: {warning}")
     return folder
