@@ -440,7 +440,7 @@ class FilterOptions:
             at.below("gate_softness").refuse(problem, "set one of them to 0")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FilterSettings(FilterOptions):
     """The stochastic-cloning EKF of an experiment (paper §III-G; TLIO's values). Its sections are
     the tuples that `filtering.run_odometry` takes."""
