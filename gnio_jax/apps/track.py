@@ -24,7 +24,7 @@ from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Recording, estimate, metrics, prepare, report
-from gnio_jax.evaluation.prepare import ROUGH_START, measured_rows
+from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
 from gnio_jax.filtering.settings import FilterSetup, filter_setup
@@ -167,7 +167,7 @@ def _check_bridged(sequence: Sequence) -> None:
     motion in it."""
     # An earlier resampling interpolated the holes, and each clock has widened a hole by up to a
     # sample at each end.
-    there = np.union1d(sequence.time[measured_rows(sequence)], sequence.time[[0, -1]])
+    there = np.union1d(sequence.time[sequence.measured_rows], sequence.time[[0, -1]])
     bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
     check_gaps(sequence.time, sequence.name)
     check_gaps(there, sequence.name, WINDOW_SECONDS + bridged)

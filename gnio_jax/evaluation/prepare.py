@@ -17,7 +17,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.filtering import FilterConfig, FilterState, InitialStd, initial_state, level_state
 from gnio_jax.filtering.settings import filter_config
-from gnio_jax.filtering.start import rest_at_start
+from gnio_jax.filtering.start import level_rows, rest_at_start
 from gnio_jax.numerics import (
     cumulative_rotation,
     finite_rows,
@@ -142,9 +142,9 @@ def prepare(
         first = 0 if from_first else int(np.argmax(sequence.valid))
         strides = (len(sequence.time) - 1 - first) // windows.stride
         whole = _cut(sequence, slice(first, first + strides * windows.stride + 1))
-        measured = measured_rows(whole)
+        measured = whole.measured_rows
         if strides <= windows.seen // windows.stride or len(measured) < windows.seen:
-            seconds = len(measured_rows(_cut(sequence, slice(first, None)))) / windows.rate
+            seconds = len(_cut(sequence, slice(first, None)).measured_rows) / windows.rate
             problem = f"{seconds:.2f} s measured from its first trusted sample on"
             left_out[sequence.name] = f"{problem}, too short for a window and a stride"
             continue
@@ -187,12 +187,6 @@ def prepare(
     return recordings, left_out
 
 
-def measured_rows(sequence: Sequence) -> Int[np.ndarray, "m"]:
-    """Rows of the IMU that were measured, and not interpolated across a gap."""
-    mask = sequence.imu_valid
-    return np.arange(len(sequence.time)) if mask is None else np.flatnonzero(mask)
-
-
 def _check(
     sequence: Sequence, init: Init, gyro_bias: BiasSource, orientation: Orientation | None
 ) -> None:
@@ -233,9 +227,7 @@ def _start(
         velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
         rotation = matrix_from_quaternion(sequence.orientation[0])
         return rotation, velocity, sequence.position[0], std, ""
-    second = measured[measured < round(windows.rate)]
-    if 2 * len(second) < round(windows.rate):  # most of the first second was not measured
-        second = measured[: round(windows.rate)]
+    second = level_rows(measured, round(windows.rate))
     config = filter_config(windows, FilterSettings())
     level = level_state(config, sequence.gyro[second], sequence.accel[second], std)
     found = np.sqrt(np.diag(level.core_covariance))

@@ -87,6 +87,8 @@ class Displacement:
             weaker = linear._replace(covariance=linear.covariance + (factor - 1) * self.covariance)
             _, correction = project(state, weaker, step)
             accepted = tested
+        # What is no covariance must spoil the state, which `healthy` reports.
+        accepted = accepted | (outcome.present & jnp.isnan(outcome.nis))
         outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
         return correct(state._replace(gate=gate), outcome, correction, step)
 
@@ -156,6 +158,8 @@ def linearise_displacement(
         (transposed,), _ = whiten(covariance, (covariance,))  # L⁻¹ Σ = Lᵀ
         jacobian["correlated"] = correlation.share * transposed.T
         predicted = geometry.matmul(jacobian["correlated"], state.correlated[:, None])[:, 0]
+        # NaN if Σ is no covariance, which is not the same as no measurement.
+        predicted = jnp.where(jnp.isnan(predicted), 0.0, predicted)
         residual, covariance = residual - predicted, (1 - correlation.share**2) * covariance
     return linearise(state, residual, covariance, **jacobian), defined
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
+from gnio_jax.filtering.checks import Inputs, check_frame, checked_displacements, checked_inputs
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory, StepRecord, finished_history
@@ -75,6 +75,7 @@ def run_filter(
     not positive definite. Inside `jit` values are not known; `FilterHistory.healthy` reports bad
     ones.
     """
+    check_frame(frame)
     inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
     measured = checked_displacements(displacement, covariance, inputs, config)
     return _run_filter(inputs, *measured, config, frame)

@@ -39,7 +39,7 @@ from jaxtyping import Float, Int
 
 from gnio_jax import geometry
 from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
+from gnio_jax.filtering.checks import Inputs, check_frame, checked_displacements, checked_inputs
 from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.history import StepRecord
 from gnio_jax.filtering.propagation import Transition, put
@@ -101,6 +101,7 @@ def smooth(
     in float64. Smoothed variances are differences. In float32 a variance that becomes smaller by
     many orders of magnitude, as at the start, keeps few digits and can become negative.
     """
+    check_frame(frame)
     inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
     measured = checked_displacements(displacement, covariance, inputs, config)
     return _smooth(inputs, *measured, config, frame)
