@@ -210,8 +210,9 @@ def improper_covariances(
     present."""
     both = present[:, :, None] & present[:, None]
     covariance = np.where(both, covariance, np.eye(present.shape[1]))
-    finite = np.asarray(np.isfinite(covariance)).all(axis=(1, 2))
-    covariance = np.where(finite[:, None, None], covariance, np.eye(present.shape[1]))
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    usable = np.reshape(finite, (-1, 1, 1))
+    covariance = np.where(usable, covariance, np.eye(present.shape[1]))
     size, skew = np.abs(covariance), np.abs(covariance - covariance.transpose(0, 2, 1))
     symmetric = (skew <= ASYMMETRY * size.max(axis=(1, 2), keepdims=True)).all(axis=(1, 2))
     positive = np.linalg.eigvalsh(covariance).min(axis=1) > 0
