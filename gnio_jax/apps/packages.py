@@ -241,7 +241,7 @@ def _of_version_1(path: Path, manifest: dict[str, Any]) -> dict[str, Any]:
     return manifest | {
         "measured": "",
         "card": texts["README.md"].splitlines(),
-        "config": configuration.plain(config),
+        "config": configuration.to_plain(config),
         "weights": fingerprints.get(WEIGHTS),
     }
 
@@ -347,7 +347,7 @@ def publish(
         _measured(figures, run.config.datasets),
         f"gnio-jax {version('gnio-jax')}",
         [],
-        configuration.plain(configuration.without_places(run.config)),
+        configuration.to_plain(configuration.without_paths(run.config)),
         fingerprint(weights),
     )
     manifest = manifest._replace(card=_card(manifest, fails, run, figures, workdir).split("\n"))

@@ -38,8 +38,8 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
     console.prepare_filter()
     with console.terminal() as terminal:
         result = calibration.calibrate(asked, terminal.progress, usable_cores())
-    table, before = Table("filter", "before", "calibrated"), configuration.flat(result.before)
-    for name, value in configuration.flat(result.considered.settings).items():
+    table, before = Table("filter", "before", "calibrated"), configuration.flatten(result.before)
+    for name, value in configuration.flatten(result.considered.settings).items():
         if value != before.get(name):
             table.add_row(name, _spelled(before.get(name)), _spelled(value))
     console.say(table)

@@ -234,7 +234,7 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     parts = [config.dataset, config.split, config.estimator]
     parts += [text.format(own[x]) for x, text in NAMED.items() if own[x] != usual[x]]
     if config.estimator != "integrate":
-        trained, own = configuration.flat(run.filter), configuration.flat(config.filter)
+        trained, own = configuration.flatten(run.filter), configuration.flatten(config.filter)
         for name in {**trained, **own}:
             if (value := own.get(name)) != trained.get(name):
                 numbers = value if isinstance(value, tuple) else (value,)
@@ -265,7 +265,7 @@ def _settings(
         "model": run.model.name,
         "checkpoint": config.checkpoint,
         **{name: getattr(run.data, name) for name in WINDOWS},
-        "filter": configuration.plain(config.filter),
+        "filter": configuration.to_plain(config.filter),
         "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,
         "definitions": DEFINITIONS,
         "device": jax.devices()[0].device_kind,

@@ -118,7 +118,7 @@ def write(
             alignment = report.settings["alignment"]
             views = [pictures.view(each, alignment) for each in estimates]
             pictures.save_all(new / "plots", views, report, progress)
-            run = page.of_report(report, views, command, configuration.text(trained))
+            run = page.of_report(report, views, command, configuration.to_yaml(trained))
             title = f"{report.settings['dataset']} {report.settings['split']}: {run.name}"
             page.write(new / PAGE, title, [run, *page.beside(folder, report.settings)])
 

@@ -112,7 +112,7 @@ def set_up(
         problem = f"is {size}, but there are only {epoch} {task.unit}"
         raise InputError("optim.batch_size", problem, "lower it")
     recordings = Recordings(parallel.everywhere(task.joined(sources)), held_out, splits)
-    anywhere = dataclasses.replace(configuration.without_places(config), seed=0)
+    anywhere = dataclasses.replace(configuration.without_paths(config), seed=0)
     return task(model, anywhere, epoch // size, parts), recordings
 
 
@@ -232,7 +232,7 @@ def _labeller(by: PosesBy) -> tuple[float, Predict, filtering.FilterSetup]:
 
 def _digest_of_run(run: Run) -> str:
     """Digest of the settings, without the places of folders, and of the weights of a run."""
-    settings = configuration.flat(configuration.without_places(run.config))
+    settings = configuration.flatten(configuration.without_paths(run.config))
     return _digest(sorted(settings.items()), run.variables)
 
 

@@ -56,8 +56,8 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     if not kept.exists():
         problem = "holds no run to resume (config.yaml is missing)"
         raise InputError(workdir, problem, "start it without --resume")
-    both = map(configuration.without_places, (config, configuration.load(kept)))
-    ours, theirs = map(configuration.flat, both)
+    both = map(configuration.without_paths, (config, configuration.load(kept)))
+    ours, theirs = map(configuration.flatten, both)
     for name in ours | theirs:
         if ours.get(name) != theirs.get(name):
             problem = f"'{name}' was {theirs.get(name)} and is now {ours.get(name)}"
@@ -144,7 +144,7 @@ def compare_processes(config: TrainConfig, recordings: Recordings, variables: An
         leaves = [np.atleast_1d(leaf) for leaf in jax.tree.leaves(parallel.on_host(tree))]
         return [(leaf.shape, leaf[:: len(leaf) // 999 + 1].tobytes()) for leaf in leaves]
 
-    settings = configuration.flat(configuration.without_places(config))
+    settings = configuration.flatten(configuration.without_paths(config))
     for what, value, remedy in (
         ("settings", settings, "start all with the same options, also --config"),
         (

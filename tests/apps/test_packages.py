@@ -194,7 +194,7 @@ def test_a_package_of_the_first_version(run, package):
     """Its settings and its card are files, whose SHA-256 the manifest has."""
     manifest = json.loads((package / "manifest.json").read_text())
     wanted, card = packages.load_pretrained(package), manifest.pop("card")
-    (package / "config.yaml").write_text(configuration.text(wanted.config))
+    (package / "config.yaml").write_text(configuration.to_yaml(wanted.config))
     (package / "README.md").write_text("\n".join(card))
     kept = "format name network data license epoch step made_by".split()
     about = {name: manifest[name] for name in kept} | {"version": 1, "files": {}}

@@ -131,7 +131,7 @@ def test_numbers_are_those_of_yaml_1_2():
 def test_text_that_looks_like_something_else_survives_its_file():
     for name in ("1e-3", "010", "yes", "null", "2020-01-01", "~", "a: b", "1:30"):
         config = TrainConfig(workdir=name, filter=changed(noise={"correlation": CorrelatedError()}))
-        assert read(configuration.text(config)) == config
+        assert read(configuration.to_yaml(config)) == config
 
 
 def experiment_of(*words):
@@ -215,7 +215,7 @@ def test_words_of_a_command_line_are_values():
         (str | tuple[str, ...], ["one", "two"], ("one", "two")),
         (Path, ["010"], Path("010")),
     ):
-        found = configuration.value_from_words(hint, words, "--x")
+        found = configuration.parse_words(hint, words, "--x")
         assert found == value and type(found) is type(value)
     for hint, words, problem in (
         (int, ["3.5"], "--x: must be a whole number, found 3.5"),
@@ -225,7 +225,7 @@ def test_words_of_a_command_line_are_values():
         (tuple[int, ...], ["1", "a"], "--x: must be a whole number, found 'a'"),
     ):
         with pytest.raises(InputError) as refused:
-            configuration.value_from_words(hint, words, "--x")
+            configuration.parse_words(hint, words, "--x")
         assert str(refused.value) == problem
 
 
@@ -260,7 +260,7 @@ def test_the_config_of_an_old_run_is_the_same_experiment():
     )
     assert found.augment.noise == (0.001, 0.01) and found.loss.outlier_sigmas == 10.0
     assert (found.model.width, found.optim.epochs, found.data.train_split) == (16, 24, "train")
-    assert read(configuration.text(found)) == found
+    assert read(configuration.to_yaml(found)) == found
     white = read(OLD.replace("share: 0.8971", "share: 0.0"))
     assert white.filter.noise.correlation is None
     folded = OLD.replace("folds: 1, left_out: 0", "folds: 4, left_out: 1")

@@ -31,7 +31,7 @@ def evaluation(run, **settings):
         "dataset": "tlio",
         "data_root": str(run.parent / "data"),
         "step": 7,
-        "filter": configuration.plain(BASE.filter),
+        "filter": configuration.to_plain(BASE.filter),
         **settings,
     }
     folder = run / "eval" / f"tlio_test_{settings.get('estimator', 'ekf')}"
@@ -58,7 +58,7 @@ def test_what_is_there_is_taken(run, monkeypatch):
     [
         ({"definitions": report.DEFINITIONS - 1}, "another version"),
         ({"step": 6}, "of a checkpoint that the run has no more"),
-        ({"filter": {**configuration.plain(BASE.filter), "gravity": 9.0}}, "of another filter"),
+        ({"filter": {**configuration.to_plain(BASE.filter), "gravity": 9.0}}, "of another filter"),
         ({"alignment": "se3"}, "of alignment se3"),
     ],
 )
@@ -107,7 +107,7 @@ def test_a_run_whose_filter_was_trained_is_restored_once(run, monkeypatch):
 
     def evaluate(config, progress, workers, run):
         given.append((config.filter, run))
-        evaluation(folder, filter=configuration.plain(own.config.filter))
+        evaluation(folder, filter=configuration.to_plain(own.config.filter))
 
     folder = run
     monkeypatch.setattr(kept, "evaluate", evaluate)

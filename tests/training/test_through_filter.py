@@ -120,7 +120,7 @@ def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
         assert same(parameters, after.variables["params"][module]) == (module != "head"), module
     statistics = after.variables["batch_stats"]
     assert same(before.variables["batch_stats"]["norm"], statistics["norm"])
-    given, found = configuration.flat(OPTIONS), configuration.flat(after.config.filter)
+    given, found = configuration.flatten(OPTIONS), configuration.flatten(after.config.filter)
     moved = {name for name in given if given[name] != found[name]}
     numbers = {name for name in given if name.startswith(("noise.", "start."))}
     assert moved == numbers - {"start.tilt"}  # which is 0
