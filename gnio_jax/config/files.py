@@ -4,7 +4,6 @@ runs and of the experiments that come with the package."""
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 import reprlib
 import types
@@ -19,10 +18,7 @@ from yaml.constructor import ConstructorError
 
 from gnio_jax.config.schema import (
     Bound,
-    ConsideredStd,
-    InitialStd,
     Location,
-    NoiseModel,
     TrainConfig,
 )
 from gnio_jax.errors import InputError, did_you_mean
@@ -145,8 +141,6 @@ def parse(content: str, source: str, base: TrainConfig | None = None) -> TrainCo
     fields = _parse_yaml(content, source)
     if fields is None:
         raise InputError(source, "is empty", "write settings into it, e.g. seed: 0")
-    if _is_of_earlier_version(fields):
-        fields = _of_earlier_version(fields, source)
     return _read_section(base or TrainConfig(), fields, Location(source))
 
 
@@ -404,73 +398,3 @@ def _parse_yaml(content: str, source: str) -> Any:
     except (AttributeError, LookupError, TypeError):  # from PyYAML, if a tag has other content
         problem = "a tag does not fit its value"
     raise InputError(source, f"is not YAML ({problem})")
-
-
-# Files of earlier versions
-# ------------------------------------------------------------------------------------------------
-
-_MOVED: dict[str, str] = {
-    **{name: f"noise.{name}" for name in NoiseModel._fields},
-    **{f"{name}_std": f"start.{name}" for name in InitialStd._fields},
-    # The first four; no version wrote raw_gyro_bias in this form.
-    **{f"considered_{name}_std": f"considered.{name}" for name in ConsideredStd._fields[:4]},
-}
-"""Settings of the filter, which was a flat section with angles in degrees."""
-_GONE = {
-    "data.residency": ...,
-    "model.dtype": "float32",
-    "model.bank_heads": None,
-    "model.dropout": None,
-    "optim.accumulate": 1,
-    "optim.ema_decay": 0.0,
-    "optim.end_learning_rate": 1e-6,
-    "optim.plateau_epochs": 10,
-    "optim.plateau_factor": 0.1,
-    "filter.scale_error_std": 0.0,
-    "filter.heading_error_std_degrees": 0.0,
-    "filter.walk_error_seconds": ...,
-    "through_filter.truncate_seconds": 10.0,
-    "through_filter.start_spread": 1.0,
-    "through_filter.gate_softness": 2.0,
-    "through_filter.skip_above": 1000.0,
-}
-"""Settings that no longer exist, and for each the value without effect; `...` is any value."""
-
-
-def _is_of_earlier_version(fields: Any) -> bool:
-    """Whether it is a complete config.yaml that an earlier version wrote."""
-    if not isinstance(fields, dict) or "checkpoint_every_seconds" not in fields:
-        return False
-    sections = (name for name, value in vars(TrainConfig()).items() if is_section(type(value)))
-    return all(isinstance(fields.get(name), dict) for name in sections)
-
-
-def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
-    """The settings of an earlier version's config.yaml in this version's names. Raises `InputError`
-    if they ask for something that no longer exists."""
-    new = {name: dict(value) if isinstance(value, dict) else value for name, value in old.items()}
-    del new["checkpoint_every_seconds"]
-    for path, neutral in _GONE.items():
-        section, field = path.split(".")
-        value = new[section].pop(field, neutral)
-        if neutral is not ... and value != neutral:
-            problem = f"is {_show(value)}, and there is no such setting any more"
-            Location(source, path).refuse(problem, "train the run again without it")
-    data, augment, flat = new["data"], new["augment"], new["filter"]
-    count, left_out = data.pop("folds", 1), data.pop("left_out", 0)
-    if count != 1:
-        data["train_split"] = f"{data.get('train_split', 'train')}-{left_out}of{count}"
-    augment["noise"] = [augment.pop("gyro_noise", 0.0), augment.pop("accel_noise", 0.0)]
-    new["loss"]["outlier_sigmas"] = 10.0  # the likelihood always had this bound
-    new["filter"] = sections = {"noise": {}, "start": {}, "considered": {}}
-    share, seconds = flat.pop("window_error_share", 0.0), flat.pop("window_error_seconds", 0.5)
-    sections["noise"]["std_factor"] = [flat.pop(f"std_factor_{axis}", 1.0) for axis in "xyz"]
-    if share:
-        sections["noise"]["correlation"] = {"share": share, "seconds": seconds}
-    for name, value in flat.items():
-        path = _MOVED.get(str(name).removesuffix("_degrees"), str(name))
-        section, _, field = path.rpartition(".")
-        if str(name).endswith("_degrees"):
-            value = check_value(float, value, Location(source, f"filter.{name}")) * (math.pi / 180)
-        (sections[section] if section else sections)[field] = value
-    return new

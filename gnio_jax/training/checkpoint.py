@@ -30,9 +30,6 @@ from gnio_jax.training.optimizer import Plateau, filter_numbers, trained_setting
 from gnio_jax.training.task import TrainState
 
 Which = Literal["best", "latest"]
-VERSION = 2
-"""Version of what a checkpoint holds besides the network's variables, which are the same in every
-version."""
 METADATA = 2**17
 """Largest number of bytes that a checkpoint takes besides its arrays."""
 
@@ -86,7 +83,7 @@ def save(workdir: Path, which: Which, state: TrainState, position: Position) -> 
     """
     folder, state = _folder(workdir, which), jax.device_get(state)
     shapes = _shapes(state.variables)
-    meta = {"version": VERSION, "position": position._asdict(), "shapes": shapes}
+    meta = {"position": position._asdict(), "shapes": shapes}
     items: dict[str, Any] = {
         "variables": ocp.args.StandardSave(state.variables),
         "meta": ocp.args.JsonSave(meta),
@@ -120,12 +117,11 @@ def write_best(workdir: Path, run: Run) -> None:
 def restore(workdir: Path, template: TrainState) -> tuple[TrainState, Position]:
     """The latest state, in the structure of `template`, placed by `parallel.everywhere`.
 
-    Raises `InputError` if it does not fit, or is of an earlier version.
+    Raises `InputError` if it does not fit.
     """
     template = jax.device_get(template)
     wanted = {"variables": template.variables, "optimizer": template.opt_state}
-    remedy = f"begin another run from its weights: --init-from {workdir} --workdir ..."
-    position, found = _read(workdir, "latest", wanted, remedy)
+    position, found = _read(workdir, "latest", wanted)
     state = TrainState(jnp.int32(position.step), found["variables"], found["optimizer"])
     chex.assert_trees_all_equal_shapes_and_dtypes(state, template)
     return parallel.everywhere(state), position
@@ -146,8 +142,7 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
     template = {"batch_stats": {}, **models.variable_shapes(model, config.data.seen)}
     if numbers := filter_numbers(config):
         template["filter"] = numbers
-    remedy = f"train it again from the run that it began with, {config.init_from}"
-    position, found = _read(workdir, which, {"variables": template}, remedy)
+    position, found = _read(workdir, which, {"variables": template})
     variables = found["variables"]
     chex.assert_trees_all_equal_shapes_and_dtypes(variables, template)
     try:
@@ -231,13 +226,12 @@ def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
 
 
 def _read(
-    workdir: Path, which: Which, templates: dict[str, Any], remedy: str
+    workdir: Path, which: Which, templates: dict[str, Any]
 ) -> tuple[Position, dict[str, Any]]:
     """The position of a checkpoint, and the items that these templates name.
 
     Raises `InputError` if there is no checkpoint, if it is damaged, or if its variables have other
-    shapes. It raises it with this remedy for a checkpoint of an earlier version, if the state of an
-    optimizer or numbers of the filter are asked for.
+    shapes.
     """
     where = _folder(workdir, which)
     if not exists(workdir, which):
@@ -255,10 +249,6 @@ def _read(
                 raise damaged from None
 
         meta = restored({"meta": ocp.args.JsonRestore()})["meta"]
-        older = meta.get("version") != VERSION
-        if older and ("optimizer" in templates or "filter" in templates["variables"]):
-            problem = "is of an earlier version of gnio-jax, with other states beside the weights"
-            raise InputError(where / str(step), problem, remedy)
         wanted, kept = _shapes(templates["variables"]), meta["shapes"]
         for name in sorted(wanted.keys() | kept.keys()):
             if wanted.get(name) != kept.get(name):
@@ -271,8 +261,6 @@ def _read(
         found = restored({n: ocp.args.StandardRestore(tree) for n, tree in templates.items()})
         found = {name: found[name] for name in templates}
     position = meta["position"]
-    if older:  # its weights have today's form
-        return Position(position["epoch"], position["step"]), found
     return Position(**position | {"plateau": Plateau(*position["plateau"])}), found
 
 

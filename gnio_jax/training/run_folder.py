@@ -106,7 +106,7 @@ def opened(
 def _refuse_other_recordings(path: Path, splits: dict[str, dict[str, int] | list[str]]) -> None:
     """Refuse recordings other than those with which the run was begun. Hold-outs are drawn from the
     recordings of a copy of the data, which may differ between copies, and so may recordings with
-    the same name. An earlier version kept only the names."""
+    the same name."""
     try:
         before = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -116,8 +116,6 @@ def _refuse_other_recordings(path: Path, splits: dict[str, dict[str, int] | list
     before = before if isinstance(before, dict) else {}
     for split in splits | before:
         own, theirs = (recordings_by_name(each.get(split)) for each in (splits, before))
-        if None in theirs.values():
-            own = dict.fromkeys(own)
         if list(own.items()) != list(theirs.items()):
             changed = sorted(
                 name for name in own | theirs if own.get(name, -1) != theirs.get(name, -1)

@@ -106,14 +106,6 @@ def assert_same_runs(workdir, other):
         assert ours == pytest.approx(theirs, rel=1e-6)
 
 
-def age(run):
-    """Make the checkpoints of a run those of an earlier version."""
-    for file in Path(run).glob("checkpoints/*/*/meta/metadata"):
-        meta = json.loads(file.read_text())
-        assert meta.pop("version") == checkpoint.VERSION
-        file.write_text(json.dumps(meta))
-
-
 @contextlib.contextmanager
 def stopped_at(step, act=lambda: signal.raise_signal(signal.SIGTERM)):
     """One step a dispatch, and `act` once a run has reached this one."""

@@ -23,7 +23,6 @@ from tests.support.drawn_state import fresh_state
 from tests.support.tiny_network import Tiny
 from tests.support.tiny_run import (
     STEPS,
-    age,
     arrays,
     assert_same_runs,
     config,
@@ -203,13 +202,6 @@ def test_runs_that_cannot_be_loaded(recording, finished, tmp_path):
     configuration.save(tmp_path / "lost" / "config.yaml", run.config)
     checkpoint.write_best(tmp_path / "lost", run)
     refused("best: holds parameters that are not finite", tmp_path / "lost")
-
-
-def test_a_run_of_an_earlier_version_is_evaluated_and_not_resumed(recording, finished, tmp_path):
-    age(shutil.copytree(finished[0], tmp_path / "run"))
-    assert same(arrays(tmp_path / "run", "best"), arrays(finished[0], "best"))
-    with pytest.raises(InputError, match=r"is of an earlier version of .*; begin .* --init-from"):
-        loop.train(config(recording, tmp_path / "run"), resume=True)
 
 
 def test_a_head_that_no_gradient_reaches_is_told_of(recording, finished):
