@@ -76,7 +76,10 @@ def evaluate(
     missing data, and a split of which no sequence can be estimated.
     """
     _check(config)
-    from gnio_jax.training.checkpoint import learnt_from, load_run  # Orbax takes seconds to import
+    from gnio_jax.training.checkpoint import (  # Orbax takes seconds to import
+        load_run,
+        training_recordings,
+    )
 
     workdir = Path(config.workdir or configuration.newest_run())
     run = run or load_run(workdir, config.checkpoint)
@@ -92,7 +95,7 @@ def evaluate(
             problem = f"has waypoints, and no --alignment {config.alignment}"
             remedy = "leave it out: one turn about z and one shift are fitted"
             raise InputError(each.name, problem, remedy)
-    learnt = learnt_from(workdir, run.config, config.dataset)
+    learnt = training_recordings(workdir, run.config, config.dataset)
     if seen := [each.name for each in sequences if each.name in learnt]:
         count = f"{len(seen)} of {len(sequences)} recordings, e.g. {seen[0]}"
         reporter.line(f"warning: the network has learnt from {count}: its errors there are smaller")

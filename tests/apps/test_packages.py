@@ -270,8 +270,8 @@ def test_the_shipped_network_answers():
     assert np.linalg.norm(prediction.displacement) < 0.1
     # Training starts from it by its name.
     config = dataclasses.replace(configuration.load("pedestrian"), init_from="pedestrian")
-    first = checkpoint.initial_run(config, gnio_jax.load_pretrained)
+    first = checkpoint.load_initial_network(config, gnio_jax.load_pretrained)
     assert first is not None and first.step > 0
     other = dataclasses.replace(config, model=dataclasses.replace(config.model, width=8))
     with pytest.raises(InputError, match=r"pedestrian: its model.width is 32.* describe the same"):
-        checkpoint.initial_run(other, gnio_jax.load_pretrained)
+        checkpoint.load_initial_network(other, gnio_jax.load_pretrained)

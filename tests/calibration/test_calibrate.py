@@ -110,7 +110,7 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
 
 def test_a_network_is_averaged_over_four_headings_or_told_that_it_cannot_be(run):
     loaded = checkpoint.load_run(run)
-    averaged = checkpoint.averaged_over_headings(loaded, "the run")
+    averaged = checkpoint.average_over_headings(loaded, "the run")
     assert averaged.config.model.equivariance == "four_headings"
     assert averaged.model == models.from_config(averaged.config.model) != loaded.model
     model = dataclasses.replace(loaded.config.model, equivariance="canonical_frame")
@@ -121,7 +121,7 @@ def test_a_network_is_averaged_over_four_headings_or_told_that_it_cannot_be(run)
     ):
         config = dataclasses.replace(loaded.config, **change)
         with pytest.raises(InputError, match=f"the run.*{problem}"):
-            checkpoint.averaged_over_headings(loaded._replace(config=config), "the run")
+            checkpoint.average_over_headings(loaded._replace(config=config), "the run")
 
 
 def test_what_is_refused(run, splits_read, tmp_path):
@@ -194,7 +194,7 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(
         assert recording.name == name and tiny_run.same(variables, network.variables)
 
 
-def test_the_network_of_every_fold_is_averaged_over_headings(run, fold_runs):
+def test_the_network_of_every_fold_is_average_over_headings(run, fold_runs):
     config = CalibrateConfig(str(run), out_of_fold=tuple(fold_runs), average_headings=True)
     _, networks = evidence.sources(evidence.load_run(run, config), config)
     for source in networks:
