@@ -14,14 +14,15 @@ ROOMS = {
     "data": BASE,
     "models": BASE,
     "filtering": BASE,
-    "training": BASE | {"data", "models", "filtering"},
-    "evaluation": BASE | {"data", "models", "filtering", "training"},
-    "calibration": BASE | {"data", "models", "filtering", "training", "evaluation"},
-    "interop": BASE | {"models", "training"},
-    "tables": BASE | {"data", "models", "training", "evaluation", "calibration"},
-    "apps": BASE | {"data", "models", "filtering", "training", "evaluation", "calibration"},
+    "networks": BASE | {"models"},
+    "training": BASE | {"data", "models", "filtering", "networks"},
+    "evaluation": BASE | {"data", "models", "filtering", "networks", "training"},
+    "calibration": BASE | {"data", "models", "filtering", "networks", "training", "evaluation"},
+    "interop": BASE | {"models", "networks"},
+    "tables": BASE | {"data", "models", "networks", "training", "evaluation", "calibration"},
+    "apps": BASE | {"data", "models", "filtering", "networks", "evaluation"},
     "commands": BASE
-    | {"data", "filtering", "training", "evaluation", "calibration", "interop"}
+    | {"data", "filtering", "networks", "training", "evaluation", "calibration", "interop"}
     | {"tables", "apps"},
     **{name: BASE for name in BASE},
 }
@@ -30,7 +31,7 @@ ROOMS = {
 ONNX = {"apps.onnx.conversion", "apps.onnx.driver"}
 LIBRARIES = {
     "bokeh": {"evaluation.page"},
-    "flax": {"models", "training", "evaluation", "interop"},
+    "flax": {"models", "networks", "training", "evaluation"},
     "jax2onnx": {"apps.onnx.conversion"},
     "loky": {"data.loading"},
     "mcap": {"apps.importing.ros", "apps.export"},
@@ -43,7 +44,7 @@ LIBRARIES = {
     "rosbags": {"apps.importing.ros", "apps.export"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
-    "safetensors": {"apps.packages"},
+    "safetensors": {"networks.folder"},
     "tensorboardX": {"training.run_folder"},
 }
 """Libraries that only these rooms or modules import."""
@@ -54,7 +55,7 @@ REFUSED |= set("these those wanted taken laid made left rest apart since late".s
 OLD_NAMES = ("apps/importing", "apps/live", "apps/track", "calibration", "commands/calibrate")
 OLD_NAMES += ("data/parsing", "evaluation", "filtering")
 """Rooms and modules whose variables still have such names."""
-TWO_MEANINGS = {"Estimate", "Inputs", "Recording", "Run", "Source", "Summary"}
+TWO_MEANINGS = {"Estimate", "Inputs", "Recording", "Source", "Summary"}
 """Names that two classes of these rooms still share."""
 
 

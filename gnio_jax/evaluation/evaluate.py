@@ -1,4 +1,4 @@
-"""One evaluation, from a run and its options to a folder of results.
+"""One evaluation, from a network and its options to a folder of results.
 
     prepare → infer → estimate → score → report
 
@@ -32,6 +32,8 @@ from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.trajectory import Alignment, Undefined, paired, read_tum
 from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.models import Network
+from gnio_jax.networks import TrainedNetwork, find_network, newest_run, read_network
+from gnio_jax.networks.folder import evaluations_folder, training_recordings
 from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
 
@@ -64,27 +66,25 @@ def evaluate(
     reporter: Reporter = SILENCE,
     workers: int = 1,
     command: str = "",
-    run: Any = None,
 ) -> Evaluation:
-    """Estimate every sequence of a split with the network of a run, measure the errors, and write
-    the results to a folder of the run.
+    """Estimate every sequence of a split with a trained network, measure the errors, and write the
+    results to a folder of the network.
 
     The folder is written whole or not at all, and replaces that of an earlier evaluation with the
     same options. `workers` processes read recordings that are slow to read; `command` is the
-    command line, for the page; `run` is the `training.checkpoint.Run` of `config`, if it is loaded
-    already. Raises `InputError` for options that do not fit together, a run without the checkpoint,
-    missing data, and a split of which no sequence can be estimated.
+    command line, for the page. Raises `InputError` for options that do not fit together, a network
+    that cannot be loaded, missing data, and a split of which no sequence can be estimated.
     """
     _check(config)
-    from gnio_jax.training.checkpoint import (  # Orbax takes seconds to import
-        load_run,
-        training_recordings,
-    )
+    path = find_network(config.network or newest_run())
+    if config.checkpoint == "latest":
+        from gnio_jax.training.checkpoint import load_latest  # Orbax takes half a second to import
 
-    workdir = Path(config.workdir or configuration.newest_run())
-    run = run or load_run(workdir, config.checkpoint)
-    config = resolve(config, run.config)
-    windows, ekf = run.config.data, filter_setup(run.config.data, config.filter)
+        trained = load_latest(path)
+    else:
+        trained = read_network(path)
+    config = resolve(config, trained.config)
+    windows, ekf = trained.config.data, filter_setup(trained.config.data, config.filter)
 
     def stage(name: str) -> Progress:
         return functools.partial(reporter.progress, name)
@@ -95,7 +95,7 @@ def evaluate(
             problem = f"has waypoints, and no --alignment {config.alignment}"
             remedy = "leave it out: one turn about z and one shift are fitted"
             raise InputError(each.name, problem, remedy)
-    learnt = training_recordings(workdir, run.config, config.dataset)
+    learnt = training_recordings(path, trained.config, config.dataset)
     if seen := [each.name for each in sequences if each.name in learnt]:
         count = f"{len(seen)} of {len(sequences)} recordings, e.g. {seen[0]}"
         reporter.line(f"warning: the network has learnt from {count}: its errors there are smaller")
@@ -113,7 +113,7 @@ def evaluate(
         problem = f"no sequence of split '{config.split}' can be estimated ({name}: {reason})"
         raise InputError(f"dataset {config.dataset}", problem)
 
-    network = Network.of(run.model, run.variables)
+    network = Network.of(trained.model, trained.variables)
     if _infers(config):
         least_std = math.exp(ekf.config.log_std_min) if config.estimator == "ekf" else 0.0
         source = infer(network, recordings, windows, stage("inferring"), least_std=least_std)
@@ -131,7 +131,7 @@ def evaluate(
     compared = {"never_moves": never_moves(estimates), "perfect_displacements": floor}
 
     report = Report(
-        {**_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
+        _settings(config, trained, sequences),
         score(estimates, config.alignment),
         {row: score(of, config.alignment) for row, of in compared.items() if of},
         {each.name: each.group for each in recordings},
@@ -139,8 +139,8 @@ def evaluate(
         left_out,
         {each.name: each.placement for each in recordings if each.placement},
     )
-    folder = folder_of(workdir, config, run.config)
-    write(folder, report, estimates, run.config, command, config.plots, stage("drawing"))
+    folder = folder_of(path, config, trained.config)
+    write(folder, report, estimates, trained.config, command, config.plots, stage("drawing"))
     return Evaluation(report, estimates, recordings, folder)
 
 
@@ -186,7 +186,7 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
     if config.dataset is None and len(run.datasets) > 1:
         remedy = f"give --dataset, e.g. {dataset}"
         raise InputError(
-            config.workdir or "the run", f"has learnt from {', '.join(run.datasets)}", remedy
+            config.network or "the run", f"has learnt from {', '.join(run.datasets)}", remedy
         )
     if data.get(dataset).needs_root:
         given = config.data_root or (run.data_root if dataset in run.datasets else None)
@@ -212,11 +212,11 @@ def _usual_orientation(config: EvaluateConfig) -> Orientation:
     return "reference" if _infers(config) else "filter"
 
 
-def folder_of(workdir: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
-    """The folder of a run for the results of a resolved `config`. If that folder holds figures of
-    other recordings, it keeps them: the name then ends with the place of the recordings, in this
+def folder_of(path: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
+    """The folder of a network for the results of a resolved `config`. If that folder holds figures
+    of other recordings, it keeps them: the name then ends with the place of the recordings, in this
     and in later evaluations."""
-    folder = workdir / "eval" / folder_name(config, run)
+    folder = evaluations_folder(path) / folder_name(config, run)
     if config.data_root is None:
         return folder
     place = Path(config.data_root)
@@ -247,7 +247,7 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
 
 
 def _settings(
-    config: EvaluateConfig, run: TrainConfig, sequences: list[Sequence]
+    config: EvaluateConfig, trained: TrainedNetwork, sequences: list[Sequence]
 ) -> dict[str, Any]:
     """The settings that define the meaning of the figures and their subject."""
     compensated = {str(each.attributes.get("imu_compensated", "no")) for each in sequences}
@@ -265,12 +265,15 @@ def _settings(
         "gyro_bias": config.gyro_bias,
         "imu_compensated": " and ".join(sorted(compensated)),
         "alignment": config.alignment,
-        "model": run.model.name,
+        "model": trained.config.model.name,
         "checkpoint": config.checkpoint,
-        **{name: getattr(run.data, name) for name in WINDOWS},
+        "weights": trained.digest or None,
+        **{name: getattr(trained.config.data, name) for name in WINDOWS},
         "filter": configuration.to_plain(config.filter),
         "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,
         "definitions": DEFINITIONS,
         "device": jax.devices()[0].device_kind,
         "version": version("gnio-jax"),
+        "epoch": trained.epoch,
+        "step": trained.step,
     }

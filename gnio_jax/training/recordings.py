@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,21 +19,17 @@ import jax
 import numpy as np
 
 from gnio_jax import config as configuration
-from gnio_jax import data, filtering, models, parallel
+from gnio_jax import data, filtering, models, networks, parallel
 from gnio_jax.config import NoiseModel, TrainConfig
 from gnio_jax.data.hdf5 import Reading, cache_entry, read_reading, write_reading
 from gnio_jax.data.loading import FEW, in_processes
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.network import Predict
 from gnio_jax.models import Network
+from gnio_jax.networks import TrainedNetwork
 from gnio_jax.reporting import Reporter
-from gnio_jax.training.checkpoint import Run, load_run
 from gnio_jax.training.task import Task, visit_count
 from gnio_jax.types import Sequence
-
-Load = Callable[[str], Run]
-"""A function that reads the run, or the package of weights, of this name. It must be a function of
-a module, because other processes call it too."""
 
 
 class TrainingData(NamedTuple):
@@ -52,8 +48,8 @@ class TrainingData(NamedTuple):
 class PoseNetwork(NamedTuple):
     """The network that makes poses of walks with waypoints."""
 
-    run: str
-    load: Load
+    name: str
+    """Name, folder or zip of the network."""
     digest: str
     """Digest of its weights and settings."""
 
@@ -63,14 +59,12 @@ def set_up(
     config: TrainConfig,
     reporter: Reporter,
     workers: int = 1,
-    load: Load = load_run,
 ) -> tuple[Task, TrainingData]:
     """Load the recordings and find the windows or segments in them.
 
     Raises `InputError` for options that the network does not have, missing data, recordings that
     are too short, a batch that is larger than the split, and one that the devices cannot share
-    evenly. `workers` processes read recordings that are slow to read, and make smoothed poses with
-    the run that `load` reads.
+    evenly. `workers` processes read recordings that are slow to read, and make smoothed poses.
     """
     model = models.from_config(config.model)  # finds mistakes in its options before reading data
     size, devices = config.optim.batch_size, parallel.count()
@@ -79,7 +73,7 @@ def set_up(
         remedy = f"make it a multiple of {devices}, or use fewer --devices"
         raise InputError("optim.batch_size", problem, remedy)
     train, val = config.data.train_split, config.data.val_split
-    names, pose_network = config.datasets, _load_pose_network(config, reporter, load)
+    names, pose_network = config.datasets, _load_pose_network(config, reporter)
     reporter.line(f"reading {', '.join(names)}: {train} and {val}")
     sources, held_out, splits = [], {}, {}
     for split, training in ((train, True), (val, False)):
@@ -116,23 +110,24 @@ def set_up(
     return task(model, portable, epoch // size, parts), training_data
 
 
-def _load_pose_network(config: TrainConfig, reporter: Reporter, load: Load) -> PoseNetwork | None:
+def _load_pose_network(config: TrainConfig, reporter: Reporter) -> PoseNetwork | None:
     """The network that `data.poses_by` names. Raises `InputError` if its rate is lower than that of
     the trained network, because its poses come with the IMU at its own rate."""
     name = config.data.poses_by
     if name is None:
         return None
-    run = load(name)
-    if run.config.data.rate < config.data.rate:
-        problem = f"names a network of {run.config.data.rate:g} Hz, slower than data.rate"
+    network = networks.load(name)
+    rate = network.config.data.rate
+    if rate < config.data.rate:
+        problem = f"names a network of {rate:g} Hz, slower than data.rate"
         remedy = f"name one of {config.data.rate:g} Hz or more"
         raise InputError("data.poses_by", problem, remedy)
-    if run.config.filter.noise == NoiseModel():
+    if network.config.filter.noise == NoiseModel():
         reporter.line(
             f"warning: {name}: its filter is not calibrated, and smooths worse than interpolation; "
             "calibrate it with gnio calibrate"
         )
-    return PoseNetwork(name, load, digest_network(run))
+    return PoseNetwork(name, digest_network(network))
 
 
 def read_split(
@@ -228,20 +223,20 @@ def smooth_poses(walk: Sequence, pose_network: PoseNetwork) -> Reading:
 def _load_smoother(pose_network: PoseNetwork) -> tuple[float, Predict, filtering.FilterSetup]:
     """A network's rate (Hz), the network and its filter. They are made once, because programs are
     compiled for each network object. Raises `InputError` if the run has changed."""
-    run = pose_network.load(pose_network.run)
-    if digest_network(run) != pose_network.digest:
+    trained = networks.load(pose_network.name)
+    if digest_network(trained) != pose_network.digest:
         raise InputError(
-            pose_network.run, "has changed while it made poses", "begin the training anew"
+            pose_network.name, "has changed while it made poses", "begin the training anew"
         )
-    network, windows = Network.of(run.model, run.variables), run.config.data
+    network, windows = Network.of(trained.model, trained.variables), trained.config.data
     predict = functools.partial(network.apply, network.variables)
-    return windows.rate, predict, filtering.filter_setup(windows, run.config.filter)
+    return windows.rate, predict, filtering.filter_setup(windows, trained.config.filter)
 
 
-def digest_network(run: Run) -> str:
-    """Digest of the settings, without the places of folders, and of the weights of a run."""
-    settings = configuration.flatten(configuration.without_paths(run.config))
-    return _digest(sorted(settings.items()), run.variables)
+def digest_network(network: TrainedNetwork) -> str:
+    """Digest of the settings, without the paths of folders, and of the weights of a network."""
+    settings = configuration.flatten(configuration.without_paths(network.config))
+    return _digest(sorted(settings.items()), network.variables)
 
 
 def _cache_entry(walk: Sequence, pose_network: PoseNetwork) -> Path:

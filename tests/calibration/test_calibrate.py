@@ -11,6 +11,7 @@ import functools
 import json
 import re
 import shutil
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -30,7 +31,7 @@ from gnio_jax.config import (
     FilterSettings,
     ModelConfig,
     TrainConfig,
-    plain,
+    to_plain,
 )
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
@@ -39,7 +40,7 @@ from gnio_jax.evaluation.estimate import Inputs
 from gnio_jax.evaluation.prepare import Start, prepare
 from gnio_jax.filtering.settings import free_parameters
 from gnio_jax.filtering.state import GYRO_BIAS
-from gnio_jax.training import checkpoint
+from gnio_jax.networks import read_network
 from tests.support import tiny_run
 from tests.support.filter_settings import changed
 from tests.support.walks import simulate, with_correlated_errors
@@ -76,15 +77,15 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     run, out = shutil.copytree(run, tmp_path / "run"), tmp_path / "calibrated"
     for name in ("splits.yaml", "metrics.jsonl"):
         (run / name).write_text(f"{name} of the run")
-    words = ["calibrate", "--workdir", str(run), "--out", str(out), "--average-headings"]
+    words = ["calibrate", "--network", str(run), "--out", str(out), "--average-headings"]
     app.main([*words, "--fit", "measurement", "noise", "window"])
     told, warned = capsys.readouterr()
     assert "warning: the fit stopped after 2 steps" in warned
     assert f"warning: only {WALKS} recordings without a raw gyro: fewer than 5" in warned
     assert f"recordings: 0 with a raw gyro, {WALKS} without" in told
-    assert "noise.std_factor" in told and f"gnio evaluate --workdir {out}" in told
+    assert "noise.std_factor" in told and f"gnio evaluate --network {out}" in told
     assert splits_read == ["val"]
-    before, after = (checkpoint.load_run(folder) for folder in (run, out))
+    before, after = (read_network(folder) for folder in (run, out))
     assert after.config.model.equivariance == "four_headings"
     same = {name: getattr(before.config, name) for name in ("workdir", "filter", "model")}
     assert dataclasses.replace(after.config, **same) == before.config
@@ -100,7 +101,7 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     assert found.considered.gyro_bias > 0
     nees = about["position_nees_per_axis"]
     assert abs(np.log(nees["after"])) < abs(np.log(nees["before"]))
-    assert about["split"] == "val" and about["filter"] == plain(found)
+    assert about["split"] == "val" and about["filter"] == to_plain(found)
     assert about["recordings"] == WALKS and about["recordings_with_raw_gyro"] == 0
     assert [f"warning: {line}" for line in about["warnings"]] == warned.splitlines()
     change = about["trajectories"]["ate"]
@@ -109,8 +110,8 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
 
 
 def test_a_network_is_averaged_over_four_headings_or_told_that_it_cannot_be(run):
-    loaded = checkpoint.load_run(run)
-    averaged = checkpoint.average_over_headings(loaded, "the run")
+    loaded = read_network(run)
+    averaged = evidence.average_over_headings(loaded, "the run")
     assert averaged.config.model.equivariance == "four_headings"
     assert averaged.model == models.from_config(averaged.config.model) != loaded.model
     model = dataclasses.replace(loaded.config.model, equivariance="canonical_frame")
@@ -121,7 +122,7 @@ def test_a_network_is_averaged_over_four_headings_or_told_that_it_cannot_be(run)
     ):
         config = dataclasses.replace(loaded.config, **change)
         with pytest.raises(InputError, match=f"the run.*{problem}"):
-            checkpoint.average_over_headings(loaded._replace(config=config), "the run")
+            evidence.average_over_headings(loaded._replace(config=config), "the run")
 
 
 def test_what_is_refused(run, splits_read, tmp_path):
@@ -134,7 +135,7 @@ def test_what_is_refused(run, splits_read, tmp_path):
         ({"workdir": str(tmp_path / "run")}, "is a calibrated run; calibrate the run that it was"),
     ):
         with pytest.raises(InputError, match=problem):
-            calibration.calibrate(CalibrateConfig(**{"workdir": str(run)} | options))
+            calibration.calibrate(CalibrateConfig(**{"network": str(run)} | options))
     assert splits_read == []
 
 
@@ -166,7 +167,7 @@ def test_the_factors_are_those_of_the_errors():
 @pytest.fixture(scope="module")
 def fold_runs(run, tmp_path_factory):
     """Copies of the run as the folds of one experiment, whose networks differ by a factor."""
-    folders, loaded, parent = [], checkpoint.load_run(run), tmp_path_factory.mktemp("folds")
+    folders, loaded, parent = [], read_network(run), tmp_path_factory.mktemp("folds")
     for fold in (0, 1):
         windows = dataclasses.replace(loaded.config.data, train_split=f"train-{fold}of2")
         config = dataclasses.replace(loaded.config, data=windows, workdir=None)
@@ -181,22 +182,22 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(
         return [(each.name, network.variables) for each in prepared]
 
     monkeypatch.setattr(evidence, "estimate", asked_about)
-    loaded = checkpoint.load_run(run)
-    config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
+    loaded = read_network(run)
+    config = CalibrateConfig(network=str(run), out_of_fold=tuple(fold_runs))
     split, asked = evidence.sources(loaded, config)
     found = evidence.gather(split, asked, config, loaded.config.filter, lambda *_: None, 1)
     assert splits_read == ["train"] and len(found.estimates) == WALKS
     fold_of = data.folds(data.load("synthetic", None, "train"), 2)
     assert sorted(set(fold_of.values())) == [0, 1]
     for recording, (name, variables) in zip(*found, strict=True):
-        of_fold = checkpoint.load_run(fold_runs[fold_of[recording.group]])
+        of_fold = read_network(Path(fold_runs[fold_of[recording.group]]))
         network = models.Network.of(of_fold.model, of_fold.variables)
         assert recording.name == name and tiny_run.same(variables, network.variables)
 
 
 def test_the_network_of_every_fold_is_average_over_headings(run, fold_runs):
     config = CalibrateConfig(str(run), out_of_fold=tuple(fold_runs), average_headings=True)
-    _, networks = evidence.sources(evidence.load_run(run, config), config)
+    _, networks = evidence.sources(evidence.load_network(run, config), config)
     for source in networks:
         assert source.run.config.model.equivariance == "four_headings"
 
@@ -209,7 +210,7 @@ def test_walks_without_a_reference_are_left_out_and_raw_gyros_start_wide(run, mo
     walks[1] = walks[1]._replace(attributes=raw)
     monkeypatch.setattr(data, "load", lambda *_: walks)
     monkeypatch.setattr(evidence, "estimate", lambda prepared, *_, **__: prepared)
-    loaded, config = checkpoint.load_run(run), CalibrateConfig(str(run))
+    loaded, config = read_network(run), CalibrateConfig(str(run))
     settings = dataclasses.replace(loaded.config.filter, raw_gyro_bias=0.05)
     split, networks = evidence.sources(loaded, config)
     recordings, _ = evidence.gather(split, networks, config, settings, lambda *_: None, 1)
@@ -258,7 +259,7 @@ def test_displacements_and_truth_are_those_of_their_times(run, splits_read, tmp_
 
 
 def test_folds_that_do_not_make_a_whole_are_refused(run, splits_read, fold_runs):
-    config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
+    config = CalibrateConfig(network=str(run), out_of_fold=tuple(fold_runs))
     first, _ = fold_runs
     for changes, problem in (
         ({"out_of_fold": (first,)}, "were trained on the splits train-0of2; train one run for ea"),
@@ -268,7 +269,7 @@ def test_folds_that_do_not_make_a_whole_are_refused(run, splits_read, fold_runs)
         with pytest.raises(InputError, match=problem):
             calibration.calibrate(dataclasses.replace(config, **changes))
     assert splits_read == []
-    loaded = checkpoint.load_run(run)
+    loaded = read_network(run)
     other = dataclasses.replace(loaded.config.model, width=5)
     changed = loaded._replace(config=dataclasses.replace(loaded.config, model=other))
     with pytest.raises(InputError, match="fold0: differs from the calibrated run in 'model'"):

@@ -8,11 +8,10 @@ from gnio_jax import config as configuration
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import kept, report
+from gnio_jax.networks.folder import write_weights
 from gnio_jax.reporting import Lines
-from gnio_jax.training import checkpoint
-from gnio_jax.training.checkpoint import Run
 from tests.support.filter_settings import changed
-from tests.support.reports import BASE, report_of, write_report, write_run
+from tests.support.reports import BASE, digest, report_of, write_report, write_run
 
 
 @pytest.fixture
@@ -30,7 +29,7 @@ def evaluation(run, **settings):
     own = {
         "dataset": "tlio",
         "data_root": str(run.parent / "data"),
-        "step": 7,
+        "weights": digest(run),
         "filter": configuration.to_plain(BASE.filter),
         **settings,
     }
@@ -48,8 +47,8 @@ def test_what_is_there_is_taken(run, monkeypatch):
     assert (found.folder, found.problem) == (folder, "")
     monkeypatch.setattr(kept, "evaluate", None)
     assert kept.made(found, Lines()) == report.read(folder)
-    (run / "checkpoints" / "best" / "7").rmdir()
-    with pytest.raises(InputError, match="holds no checkpoint"):
+    (run / "weights.safetensors").unlink()
+    with pytest.raises(InputError, match=r"holds no weights .*; let gnio train finish"):
         look(run)
 
 
@@ -57,7 +56,8 @@ def test_what_is_there_is_taken(run, monkeypatch):
     "settings, problem",
     [
         ({"definitions": report.DEFINITIONS - 1}, "another version"),
-        ({"step": 6}, "of a checkpoint that the run has no more"),
+        ({"weights": "0" * 64}, "of weights that the network has no more"),
+        ({"weights": None}, "of weights that the network has no more"),
         ({"filter": {**configuration.to_plain(BASE.filter), "gravity": 9.0}}, "of another filter"),
         ({"alignment": "se3"}, "of alignment se3"),
     ],
@@ -95,22 +95,14 @@ def test_recordings_of_another_folder_are_never_taken(run, tmp_path):
     assert look(run, estimator="integrate").problem == ""
 
 
-def test_a_run_whose_filter_was_trained_is_restored_once(run, monkeypatch):
-    config = configuration.load(run / "config.yaml")
-    through = dataclasses.replace(config.through_filter, learn=("noise",))
-    configuration.save(
-        run / "config.yaml", dataclasses.replace(config, through_filter=through, init_from="walks")
-    )
-    own = Run(dataclasses.replace(config, filter=changed(noise={"gyro_density": 0.5})), *[None] * 4)
-    restored, given = [], []
-    monkeypatch.setattr(checkpoint, "load_run", lambda *asked: restored.append(asked) or own)
+def test_a_filter_that_was_trained_is_that_of_the_weights(run, monkeypatch):
+    trained, requests = changed(noise={"gyro_density": 0.5}), []
+    write_weights(run, {}, 1, 7, trained)
 
-    def evaluate(config, progress, workers, run):
-        given.append((config.filter, run))
-        evaluation(folder, filter=configuration.to_plain(own.config.filter))
+    def evaluate(config, progress, workers):
+        requests.append(config.filter)
+        evaluation(run, filter=configuration.to_plain(trained))
 
-    folder = run
     monkeypatch.setattr(kept, "evaluate", evaluate)
     kept.made(look(run), Lines())
-    assert given == [(own.config.filter, own)] and restored == [(run, "best")]
-    assert look(run).run is None  # nothing is left to be made
+    assert requests == [trained] and look(run).problem == ""

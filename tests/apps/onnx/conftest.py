@@ -15,8 +15,8 @@ from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.models import Network
+from gnio_jax.networks import read_network
 from gnio_jax.numerics import matrix_from_quaternion
-from gnio_jax.training.checkpoint import load_run
 from gnio_jax.types import GRAVITY
 from tests.support import drawn_run
 from tests.support.filter_settings import changed
@@ -60,7 +60,7 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="package")
 def package(run):
     """The odometry of the package over the walk, from a state made of its setup."""
-    loaded = load_run(run)
+    loaded = read_network(run)
     setup = filter_setup(loaded.config.data, loaded.config.filter)
     network = Network.of(loaded.model, loaded.variables)
 
