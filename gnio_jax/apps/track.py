@@ -27,7 +27,7 @@ from gnio_jax.evaluation import Estimate, Recording, estimate, metrics, prepare,
 from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
-from gnio_jax.filtering.settings import FilterSetup, filter_setup
+from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.filtering.zero_velocity import quiet_samples
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
@@ -120,21 +120,20 @@ def track(
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
     _check_bridged(sequence)
-    ekf = filter_setup(config.data, config.filter)
+    ekf = make_filter(config.data, config.filter)
     ready, left_out = prepare(
         [sequence],
         config.data,
-        ekf.initial_std,
+        ekf,
         init="static",
         gyro_bias="rest",
         from_first=True,
-        raw_gyro_bias=ekf.raw_gyro_bias,
     )
     if not ready:
         raise InputError(sequence.name, left_out[sequence.name], "record for longer")
     if ekf.considered is not None and not ready[0].start.raw_gyro:
         considered = ekf.considered._replace(raw_gyro_bias=0.0)
-        ekf = ekf._replace(considered=considered if any(considered) else None)
+        ekf = dataclasses.replace(ekf, considered=considered if any(considered) else None)
     network = Network.of(weights.run.model, weights.run.variables)
     (found,) = estimate(ready, network, config.data, ekf, 1, progress)
     compared = np.isfinite(found.reference.position).any() or found.waypoints is not None
@@ -179,7 +178,7 @@ def summarise(
     ready: Recording,
     recording: Imported,
     weights: Weights,
-    ekf: FilterSetup,
+    ekf: Filter,
 ) -> Summary:
     """The figures of a finished track, up to a divergence if there was one."""
     filtered, sequence = found.filtered, recording.sequence
@@ -268,7 +267,7 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
     return [text for text, applies in found.items() if applies]
 
 
-def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
+def _share_at_rest(ready: Recording, ekf: Filter) -> float:
     """Share of the strides in which the IMU is as quiet as the filter's rest; strides across a gap
     do not count as rest."""
     rate = ready.gyro - ready.start.gyro_bias
@@ -279,7 +278,7 @@ def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
     return float(quiet.reshape(-1, ekf.config.samples_per_clone).all(axis=1).mean())
 
 
-def _share_running(ready: Recording, ekf: FilterSetup) -> float:
+def _share_running(ready: Recording, ekf: Filter) -> float:
     """Share of the measured seconds with accelerations as in a run."""
     second = round(1.0 / ekf.config.dt)
     off = np.linalg.norm(ready.accel, axis=1) - GRAVITY

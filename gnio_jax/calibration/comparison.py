@@ -11,7 +11,7 @@ from gnio_jax.config import ConsideredStd, CorrelatedError, DataConfig, FilterSe
 from gnio_jax.evaluation import Displacements, Recording, estimate, score
 from gnio_jax.evaluation.statistics import Scores, summarise
 from gnio_jax.evaluation.tabulate import column, number
-from gnio_jax.filtering import filter_setup
+from gnio_jax.filtering import make_filter
 
 METRICS = ("ate", "rpe_1s", "path_length_ratio")
 """Metrics that are compared, by their names in `metrics.json`."""
@@ -113,4 +113,4 @@ def _scores(
         recording._replace(start=evaluated_start(recording.start, settings))
         for recording in recordings
     ]
-    return score(estimate(started, displacements, windows, filter_setup(windows, settings)))
+    return score(estimate(started, displacements, windows, make_filter(windows, settings)))

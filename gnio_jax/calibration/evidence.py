@@ -12,7 +12,7 @@ from gnio_jax import data
 from gnio_jax.config import CalibrateConfig, FilterSettings, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
-from gnio_jax.filtering import filter_setup
+from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run
@@ -123,9 +123,7 @@ def gather(
                 sequence for dataset in datasets for sequence in source.fold.select(dataset)
             ]
         with_reference = [sequence for sequence in sequences if sequence.valid.any()]
-        prepared, _ = prepare(
-            with_reference, windows, settings.start, raw_gyro_bias=settings.raw_gyro_bias
-        )
+        prepared, _ = prepare(with_reference, windows, make_filter(windows, settings))
         if not prepared:
             problem = "has no recording with a reference that is long enough to be fitted"
             raise InputError(subset, problem)
@@ -134,7 +132,7 @@ def gather(
             prepared,
             network,
             trained.data,
-            filter_setup(trained.data, settings),
+            make_filter(trained.data, settings),
             progress=lambda share, n=number: progress("estimating", (n + share) / len(networks)),
         )
         evidence.recordings.extend(prepared)

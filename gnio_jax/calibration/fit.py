@@ -19,21 +19,21 @@ from scipy.optimize import minimize
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flat
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate
-from gnio_jax.evaluation.estimate import Inputs
+from gnio_jax.evaluation.estimate import BatchInputs
 from gnio_jax.evaluation.prepare import Start
 from gnio_jax.filtering import (
     ConsideredStd,
-    FilterConfig,
+    Filter,
     FilterHistory,
     FilterState,
     considered_covariance,
+    make_filter,
     over_sequences,
     run_filter,
     sensitivity,
 )
 from gnio_jax.filtering.history import POSITION
 from gnio_jax.filtering.settings import (
-    filter_config,
     free_parameters,
     with_free_parameters,
     with_written_parameters,
@@ -143,7 +143,7 @@ def start_of_fit(settings: FilterSettings, paths: Sequence[str]) -> FilterSettin
 
 
 def fit_innovations(
-    walks: Inputs,
+    walks: BatchInputs,
     windows: DataConfig,
     settings: FilterSettings,
     paths: Sequence[str],
@@ -159,12 +159,11 @@ def fit_innovations(
     free = free_parameters(settings, paths)
     names, start = tuple(free), np.array(list(free.values()))
     on_device = jax.device_put((walks, start, settings))
-    config = innovation_config(windows, settings)
     evidences: list[float] = []
     """Values of every call, the first of which is at the start."""
 
     def evaluate(vector: np.ndarray) -> tuple[float, np.ndarray]:
-        call = _value_and_gradient(vector, *on_device, names=names, config=config)
+        call = _value_and_gradient(vector, *on_device, names=names, windows=windows)
         (value, evidence), gradient = jax.device_get(call)
         sound = np.isfinite(value) and np.isfinite(gradient).all()
         evidences.append(float(evidence) if sound else FAILED)
@@ -219,33 +218,36 @@ def unphysical(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
     return lines
 
 
-def innovation_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig:
+def innovation_filter(windows: DataConfig, settings: FilterSettings) -> Filter:
     """The filter whose innovations are evaluated: its gate accepts everything."""
-    return dataclasses.replace(
-        filter_config(windows, settings),
+    ekf = make_filter(windows, settings)
+    config = dataclasses.replace(
+        ekf.config,
         gate_threshold=NO_GATE,
         history="diagonal",
         checkpoint_every=CHECKPOINT_EVERY,
     )
+    return dataclasses.replace(ekf, config=config)
 
 
 def innovation_objective(
     free: Float[Array, "u"],
-    walks: Inputs,
+    walks: BatchInputs,
     start: Float[Array, "u"],
     settings: FilterSettings,
     *,
     names: tuple[str, ...],
-    config: FilterConfig,
+    windows: DataConfig,
 ) -> tuple[Array, Array]:
     """The objective to be minimised, as a function of the free parameters `names` of the settings,
     and its part that is the −log-likelihood of all innovations divided by their number. The rest is
     the prior about `start`, which keeps parameters in place that the walks do not determine."""
     chex.assert_equal_shape([free, start])
 
-    def of_walk(settings: FilterSettings, walk: Inputs) -> Array:
-        run, displacement = _repeated(walk, settings, config)
-        history = run(_wide_start(walk, settings).state(config), displacement)
+    def of_walk(settings: FilterSettings, walk: BatchInputs) -> Array:
+        ekf = innovation_filter(windows, settings)
+        run, displacement = _repeated(walk, ekf)
+        history = run(_wide_start(walk, settings).state(ekf), displacement)
         # The padding of the walk comes after its last displacement, where the filter may diverge.
         present = jnp.isfinite(displacement).all(axis=1)
         healthy = jnp.all((history.healthy > 0) | ~present)
@@ -259,7 +261,7 @@ def innovation_objective(
 
 
 _value_and_gradient = jax.jit(
-    jax.value_and_grad(innovation_objective, has_aux=True), static_argnames=("names", "config")
+    jax.value_and_grad(innovation_objective, has_aux=True), static_argnames=("names", "windows")
 )
 
 
@@ -272,7 +274,7 @@ def evaluated_start(start: Start, settings: FilterSettings) -> Start:
     return start._replace(std=settings.start, level_gyro_bias=level)
 
 
-def _wide_start(walk: Inputs, settings: FilterSettings) -> Start:
+def _wide_start(walk: BatchInputs, settings: FilterSettings) -> Start:
     """The start with all components of a raw gyro's bias uncertain (ours). Otherwise the fit would
     explain an unknown vertical component by noise."""
     start = evaluated_start(walk.start, settings)
@@ -280,16 +282,16 @@ def _wide_start(walk: Inputs, settings: FilterSettings) -> Start:
 
 
 def _repeated(
-    walk: Inputs, settings: FilterSettings, config: FilterConfig
+    walk: BatchInputs, ekf: Filter
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], Array]:
     """The run over one walk without the network, as a function of a start and displacements, with
     the displacements of the walk."""
     assert walk.given is not None
     value, covariance, _ = walk.given
-    fixed = config, settings.noise, walk.imu_valid, config.displacement_frame
+    fixed = walk.imu_valid, ekf.config.displacement_frame
 
     def run(state: FilterState, displacement: Array) -> FilterHistory:
-        return run_filter(state, walk.gyro, walk.accel, displacement, covariance, *fixed)[1]
+        return run_filter(ekf, state, walk.gyro, walk.accel, displacement, covariance, *fixed)[1]
 
     return run, jnp.asarray(value)
 
@@ -388,31 +390,33 @@ def _reported(positions: Positions, std: ConsideredStd) -> Array:
 
 
 def filtered_positions(
-    walks: Inputs, truth: Float[np.ndarray, "w k 3"], windows: DataConfig, settings: FilterSettings
+    walks: BatchInputs,
+    truth: Float[np.ndarray, "w k 3"],
+    windows: DataConfig,
+    settings: FilterSettings,
 ) -> Positions:
     """The positions of a filter over the walks, where it is healthy.
 
     `truth` has the true positions after each stride, m; NaN where there is none.
     """
-    healthy, position, *parts = jax.device_get(
-        _filtered(walks, settings, config=filter_config(windows, settings))
-    )
+    healthy, position, *parts = jax.device_get(_filtered(walks, settings, windows=windows))
     error = truth - position
     compared = np.isfinite(error).all(axis=2) & (healthy > 0)
     return Positions(*(part[compared] for part in (error, *parts)))
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@functools.partial(jax.jit, static_argnames="windows")
 def _filtered(
-    walks: Inputs, settings: FilterSettings, *, config: FilterConfig
+    walks: BatchInputs, settings: FilterSettings, *, windows: DataConfig
 ) -> tuple[Array, Array, Array, Array, Array]:
     """For every walk: where the filter is healthy, its positions, their covariances and S, and the
     axis of a raw gyro."""
 
-    def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
+    def of_walk(settings: FilterSettings, walk: BatchInputs) -> tuple[Any, ...]:
+        ekf = make_filter(windows, settings)
         start = evaluated_start(walk.start, settings)
-        state = start.state(config)
-        run, displacement = _repeated(walk, settings, config)
+        state = start.state(ekf)
+        run, displacement = _repeated(walk, ekf)
         history = run(state, displacement)
         derivatives = sensitivity(run, state, displacement)
         assert history.covariance is not None

@@ -9,7 +9,8 @@ import re
 import reprlib
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -217,6 +218,8 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
     origin, members = typing.get_origin(kind), typing.get_args(kind)
     if is_section(kind):
         return _section(kind() if base is None else base, content, place)
+    if origin is Mapping:
+        return _mapping(members[1], content, place, base or {})
     if origin is tuple and isinstance(content, list | tuple):
         if ... not in members and len(content) != len(members):
             place.refuse(f"must be a list of {len(members)} values, found {_shown(content)}")
@@ -236,6 +239,19 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
         place.refuse(problem, remedy.strip())
     _check_bounds(hint, value, place)
     return value
+
+
+def _mapping(hint: Any, content: Any, place: Place, base: Mapping) -> OrderedDict[str, Any]:
+    """The mapping `base` with the entries of another one, whose values have the type `hint`; an
+    entry that is null goes."""
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        place.refuse(f"must be a mapping of names, found {_shown(content)}")
+    entries = OrderedDict(base)
+    for key, value in content.items():
+        entries[key] = checked_value(hint, value, place.below(key), entries.get(key))
+        if entries[key] is None:
+            del entries[key]
+    return entries
 
 
 def _check_bounds(hint: Any, value: Any, place: Place) -> None:
@@ -301,8 +317,20 @@ def named(section: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
         name, value = prefix + field, getattr(section, field)
         if is_section(type(value)):
             yield from named(value, f"{name}.")
+        elif isinstance(value, Mapping):
+            yield from _named_entries(value, kind_of(hint), f"{name}.")
         else:
             yield name, hint, value
+
+
+def _named_entries(entries: Mapping, hint: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
+    """`named` of a mapping whose type is `hint`."""
+    inner = typing.get_args(hint)[1]
+    for key, value in entries.items():
+        if isinstance(value, Mapping):
+            yield from _named_entries(value, kind_of(inner), f"{prefix}{key}.")
+        else:
+            yield prefix + key, inner, value
 
 
 def flat(section: Any) -> dict[str, Any]:
@@ -342,6 +370,8 @@ def plain(value: Any) -> Any:
     """Settings as the dictionaries, lists and numbers that YAML and JSON know."""
     if is_section(type(value)):
         return {name: plain(getattr(value, name)) for name in typing.get_type_hints(type(value))}
+    if isinstance(value, Mapping):
+        return {name: plain(entry) for name, entry in value.items()}
     return list(value) if isinstance(value, tuple) else value
 
 

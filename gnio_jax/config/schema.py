@@ -7,7 +7,8 @@ A section that relates several fields to each other checks them in `check`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn
@@ -396,17 +397,12 @@ class FilterOptions:
     """When the last success is older than this, the gate pauses: everything passes, s."""
     pause_seconds: NonNegative = 1.0
     """Length of such a pause, s."""
-    zero_velocity_std: NonNegative = 0.0
-    """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
-    quiet; 0 for no such update. If a displacement is tested in the same interval and its gate is
-    active, a rest that fails the χ² test is refused, independently of `mahalanobis_fail_scale` and
-    `gate_softness`."""
     rest_gyro: NonNegative = 0.05
     """Bound of |gyro − b_g| in every sample of a quiet IMU, rad/s."""
     rest_accel: NonNegative = 0.3
     """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
     rest_seconds: NonNegative = 0.5
-    """How long the IMU is quiet before its velocity is measured as zero, s."""
+    """How long the IMU is quiet before it rests, s."""
     bridge_seconds: NonNegative = 0.1
     """For this long, s, the last IMU sample stands in for missing ones; then the filter coasts with
     constant attitude and velocity, and windows are no measurements."""
@@ -436,6 +432,11 @@ class FilterSettings(FilterOptions):
     """Standard deviations of the initial state."""
     considered: ConsideredStd = field(default_factory=ConsideredStd)
     """Errors that are not estimated but included in the covariance (Schmidt's consider states)."""
+    measurements: Mapping[str, Mapping[str, float] | None] = field(default_factory=OrderedDict)
+    """Measurements besides the displacement, by their names, each with its numbers; they are taken
+    after the displacement of a clone interval, in this order. zero_velocity: {std: 0.02} measures a
+    velocity of zero with a standard deviation of 0.02 m/s while the IMU rests. `null` takes one
+    away. Others are those that a plugin registers (ours)."""
     window_rotation: Literal["per_sample", "single", "tlio"] | None = None
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
@@ -463,9 +464,9 @@ class ThroughFilter:
     learn: Annotated[tuple[Part, ...], Words("PART")] = ()
     """Parts that are trained through the filter. Without this option the network is trained on
     windows. noise: the filter's densities and bias walks; measurement: the factors of the network's
-    covariance and the correlation of its errors; start: the standard deviations at the start;
-    uncertainty, head, encoder: the network's; all: everything. A filter option that is 0 stays
-    0."""
+    covariance, the correlation of its errors, and the numbers of `filter.measurements`; start: the
+    standard deviations at the start; uncertainty, head, encoder: the network's; all: everything. A
+    filter option that is 0 stays 0."""
     piece_seconds: Positive = 60.0
     """Length of the segments of recordings that are filtered, s."""
     filter_learning_rate: Positive = 0.03

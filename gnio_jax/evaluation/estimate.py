@@ -8,6 +8,7 @@ trajectory has a row at the start and one at the end of every stride. The filter
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -24,11 +25,10 @@ from gnio_jax.evaluation.metrics import Filtered
 from gnio_jax.evaluation.prepare import Recording, Start
 from gnio_jax.evaluation.trajectory import Alignment, Trajectory, in_frame_of, relative_yaw
 from gnio_jax.filtering import (
-    ConsideredStd,
+    Filter,
     FilterConfig,
     FilterHistory,
     FilterState,
-    NoiseModel,
     considered_covariance,
     over_sequences,
     run_filter,
@@ -37,7 +37,6 @@ from gnio_jax.filtering import (
 )
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION
-from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.filtering.state import gyro_bias_covariance
 from gnio_jax.models import Network
 from gnio_jax.numerics import (
@@ -100,7 +99,7 @@ def estimate(
     recordings: list[Recording],
     source: Network | list[Displacements],
     windows: DataConfig,
-    ekf: FilterSetup | None,
+    ekf: Filter | None,
     batch_size: int = 16,
     progress: Progress = silent,
 ) -> list[Estimate]:
@@ -123,8 +122,7 @@ def estimate(
         displacements = None if given is None else [given[i] for i in batch.members]
         members = [recordings[i] for i in batch.members]
         inputs = filter_inputs(members, displacements, batch.intervals, ekf.config)
-        fixed = {"apply": network.apply, "config": ekf.config}
-        history = _run(network.variables, inputs, ekf.noise, ekf.considered, **fixed)
+        history = _run(network.variables, inputs, ekf, apply=network.apply)
         history = jax.device_get(history)
         for place, i in enumerate(dict.fromkeys(batch.members)):
             own = jax.tree.map(lambda leaf, p=place, k=strides[i]: leaf[p, :k], history)
@@ -146,12 +144,12 @@ def never_moves(estimates: list[Estimate]) -> list[Estimate]:
     return still
 
 
-def perfect(ekf: FilterSetup) -> FilterSetup:
+def perfect(ekf: Filter) -> Filter:
     """The filter for true displacements: without the settings that were calibrated for a
     network."""
     noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), measurement_scale=1.0, correlation=None)
     considered = ekf.considered and ekf.considered._replace(scale=0.0, heading=0.0, slope=0.0)
-    return ekf._replace(noise=noise, considered=considered)
+    return dataclasses.replace(ekf, noise=noise, considered=considered)
 
 
 def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> Estimate:
@@ -175,7 +173,7 @@ def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> 
 # --- the filter over many recordings
 
 
-class Inputs(NamedTuple):
+class BatchInputs(NamedTuple):
     """The inputs of the filter, with the recordings along the leading axis."""
 
     start: Start
@@ -208,7 +206,7 @@ def filter_inputs(
     given: list[Displacements] | None,
     strides: int,
     config: FilterConfig,
-) -> Inputs:
+) -> BatchInputs:
     """The recordings side by side, padded to the given number of strides by samples that change
     nothing before them. Rows of `given` without a displacement get a covariance of 1 m², which has
     a derivative but no effect."""
@@ -220,7 +218,7 @@ def filter_inputs(
             covariance = filled_up(np.where(known, each.covariance, np.eye(3)), strides)
             rows.append(Displacements(filled_up(each.value, strides, np.nan), covariance))
         stacked = _stacked(rows)
-    return Inputs(
+    return BatchInputs(
         _stacked([each.start for each in recordings]),
         *padded_signals(((each.gyro, each.accel) for each in recordings), samples),
         padded_masks((each.imu_valid for each in recordings), samples),
@@ -228,42 +226,38 @@ def filter_inputs(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("apply", "config"))
+@functools.partial(jax.jit, static_argnames="apply")
 def _run(
-    variables: Any,
-    inputs: Inputs,
-    noise: NoiseModel,
-    considered: ConsideredStd | None,
-    *,
-    apply: Callable | None,
-    config: FilterConfig,
+    variables: Any, inputs: BatchInputs, ekf: Filter, *, apply: Callable | None
 ) -> FilterHistory:
     """One compiled run over all recordings of a batch. Of its covariances only that of the position
     is kept, including the consider covariance."""
 
-    def run(own: Inputs) -> FilterHistory:
-        signals, fixed = (own.gyro, own.accel), (config, noise, own.imu_valid)
-        state = own.start.state(config)
+    def run(inputs: BatchInputs) -> FilterHistory:
+        signals, valid = (inputs.gyro, inputs.accel), inputs.imu_valid
+        state = inputs.start.state(ekf)
         if apply is None:
-            assert own.given is not None
-            frame, covariance = "given", own.given.covariance
-            history = run_filter(state, *signals, own.given.value, covariance, *fixed)[1]
+            assert inputs.given is not None
+            frame, displacement = "given", inputs.given.value
+            covariance = inputs.given.covariance
+            history = run_filter(ekf, state, *signals, displacement, covariance, valid)[1]
         else:
-            frame = config.displacement_frame
+            frame = ekf.config.displacement_frame
             predict = functools.partial(_predict, apply, variables)
-            history = run_odometry(predict, state, *signals, *fixed)[1]
+            history = run_odometry(predict, ekf, state, *signals, valid)[1]
         diagonal, whole = history.covariance_diagonal, history.covariance
         assert whole is not None
         position = whole[:, POSITION, POSITION]
-        if considered is not None:
-            displacement, covariance = history.given(noise)
+        if ekf.considered is not None:
+            displacement, covariance = history.given(ekf.noise)
 
             def repeated(state: FilterState, displacement: Array) -> FilterHistory:
-                return run_filter(state, *signals, displacement, covariance, *fixed, frame)[1]
+                rows = displacement, covariance, valid, frame
+                return run_filter(ekf, state, *signals, *rows)[1]
 
-            found = sensitivity(repeated, state, displacement)
-            axis = jnp.tile(own.start.raw_axis[None], (len(found), 1))
-            added = considered_covariance(found, considered, axis)
+            derivatives = sensitivity(repeated, state, displacement)
+            axis = jnp.tile(inputs.start.raw_axis[None], (len(derivatives), 1))
+            added = considered_covariance(derivatives, ekf.considered, axis)
             diagonal = diagonal + jnp.diagonal(added, axis1=1, axis2=2)
             position = position + added[:, POSITION, POSITION]
         return history._replace(covariance_diagonal=diagonal, covariance=position)
@@ -275,7 +269,7 @@ def _predict(apply: Callable, variables: Any, windows: Array) -> Prediction:
     return keep(apply(variables, windows))
 
 
-def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) -> Estimate:
+def _of_history(recording: Recording, history: FilterHistory, ekf: Filter) -> Estimate:
     """The estimate from the history of one recording, with a row for its start. It is invalid where
     the history is not healthy."""
     start, notes = recording.start, recording.notes

@@ -30,7 +30,7 @@ from gnio_jax.evaluation.metrics import score
 from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.trajectory import Alignment, Undefined, paired, read_tum
-from gnio_jax.filtering.settings import filter_setup
+from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
@@ -81,7 +81,7 @@ def evaluate(
     workdir = Path(config.workdir or configuration.newest_run())
     run = run or load_run(workdir, config.checkpoint)
     config = resolve(config, run.config)
-    windows, ekf = run.config.data, filter_setup(run.config.data, config.filter)
+    windows, ekf = run.config.data, make_filter(run.config.data, config.filter)
 
     def stage(name: str) -> Progress:
         return functools.partial(reporter.progress, name)
@@ -99,11 +99,10 @@ def evaluate(
     recordings, left_out = prepare(
         sequences,
         windows,
-        ekf.initial_std,
+        ekf,
         init=config.init,
         gyro_bias=config.gyro_bias,
         orientation=config.orientation if _infers(config) else None,
-        raw_gyro_bias=ekf.raw_gyro_bias,
     )
     if not recordings:
         name, reason = next(iter(left_out.items()))

@@ -59,9 +59,6 @@ class FilterHistory(NamedTuple):
     log_likelihood: Float[Array, "k"]
     """ln N(r; 0, S) of the innovation, r in m; NaN where no measurement. Their sum is the evidence
     for the noise model."""
-    at_rest: Float[Array, "k"]
-    """1 where the velocity was measured as zero (`zero_velocity_std`), else 0, including where the
-    χ² test refused this."""
     imu_gap: Float[Array, "k"]
     """Age of the oldest held IMU sample of the interval, s; 0 where none was missing. Above
     `bridge_seconds` the filter coasted."""
@@ -69,9 +66,9 @@ class FilterHistory(NamedTuple):
     """0 from the first row on whose state is not finite, has a negative variance or a speed above
     `FilterConfig.speed_limit`. The input was bad, and all rows from there on are invalid. The final
     state remembers this, and a later run from it begins with 0."""
-    others: tuple[Outcome, ...]
-    """The outcomes of the other measurements, stacked over K: the velocity at rest where
-    `zero_velocity_std` is above 0, then the caller's `measurements`."""
+    outcomes: dict[str, Outcome]
+    """The outcomes of all other measurements by their names, stacked over K: of those of the
+    filter, as "zero_velocity", and of those of the run, as "fix"."""
     diagnostics: dict[str, Array]
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a
     network."""
@@ -97,8 +94,8 @@ class StepRecord(NamedTuple):
     covariance: Array
     """Covariance of θ, v, p, b_g, b_a, or its diagonal: see `FilterConfig.history`."""
     displacement: Displacement
-    outcomes: tuple[Outcome, ...]
-    """Outcomes of the displacement and of the other measurements in their order."""
+    outcomes: dict[str, Outcome]
+    """Outcomes of the displacement and of the other measurements by their names."""
     diagnostics: dict[str, Array]
 
 
@@ -106,7 +103,8 @@ def finished_history(
     records: StepRecord, imu_gap: Float[Array, "k"], healthy: Bool[Array, ""], config: FilterConfig
 ) -> FilterHistory:
     """The history of K stacked records from a state that was `healthy` or not."""
-    (update, *others), covariance = records.outcomes, records.covariance
+    outcomes, covariance = dict(records.outcomes), records.covariance
+    update = outcomes.pop("displacement")
     dtype, whole = covariance.dtype, config.history == "core"
 
     def where_present(value: Array) -> Array:
@@ -116,7 +114,6 @@ def finished_history(
     # S is the identity where there is no measurement, so that the logarithm has a derivative there.
     log_likelihood = -0.5 * (update.nis + 3 * math.log(2 * math.pi)) - jnp.log(update.volume)
     diagonal = jnp.diagonal(covariance, axis1=1, axis2=2) if whole else covariance
-    at_rest = others[0].accepted if config.zero_velocity_std > 0 else jnp.zeros_like(update.present)
 
     parts = (*records.mean, covariance)
     finite = [jnp.all(jnp.isfinite(part), axis=tuple(range(1, part.ndim))) for part in parts]
@@ -134,9 +131,8 @@ def finished_history(
         gate_passed=where_present(update.weight),
         nis=where_present(update.nis),
         log_likelihood=where_present(log_likelihood),
-        at_rest=at_rest.astype(dtype),
         imu_gap=imu_gap.astype(dtype),
         healthy=healthy.astype(dtype),
-        others=tuple(others),
+        outcomes=outcomes,
         diagnostics=records.diagnostics,
     )

@@ -208,18 +208,18 @@ def smoothed_poses(walk: Sequence, by: PosesBy) -> Reading:
     point ahead, and the taps may belong to another walk.
     """
     with jax.enable_x64(True):
-        rate, predict, setup = _labeller(by)
+        rate, predict, ekf = _labeller(by)
         try:
             resampled = data.resample(walk, rate)
             legs = data.with_poses(resampled)
-            poses = filtering.waypoint_poses(resampled, predict, setup).sequence
+            poses = filtering.waypoint_poses(resampled, predict, ekf).sequence
         except InputError as error:
             return Reading([], refusals=(str(error),))
     return Reading([poses.with_reference_where(legs.valid & poses.valid)])
 
 
 @functools.cache
-def _labeller(by: PosesBy) -> tuple[float, Predict, filtering.FilterSetup]:
+def _labeller(by: PosesBy) -> tuple[float, Predict, filtering.Filter]:
     """A network's rate (Hz), the network and its filter. They are made once, because programs are
     compiled for each network object. Raises `InputError` if the run has changed."""
     run = by.load(by.run)
@@ -227,7 +227,7 @@ def _labeller(by: PosesBy) -> tuple[float, Predict, filtering.FilterSetup]:
         raise InputError(by.run, "has changed while it made poses", "begin the training anew")
     network, windows = Network.of(run.model, run.variables), run.config.data
     predict = functools.partial(network.apply, network.variables)
-    return windows.rate, predict, filtering.filter_setup(windows, run.config.filter)
+    return windows.rate, predict, filtering.make_filter(windows, run.config.filter)
 
 
 def _digest_of_run(run: Run) -> str:
