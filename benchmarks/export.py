@@ -28,7 +28,7 @@ from gnio_jax.apps.onnx import driver, export_run  # noqa: E402
 from gnio_jax.apps.onnx.programs import start_arrays  # noqa: E402
 from gnio_jax.apps.onnx.run import draw_walk  # noqa: E402
 from gnio_jax.evaluation import Recording  # noqa: E402
-from gnio_jax.filtering.settings import filter_setup  # noqa: E402
+from gnio_jax.filtering import make_filter  # noqa: E402
 from gnio_jax.models import Network  # noqa: E402
 
 
@@ -44,7 +44,7 @@ def main() -> None:
         out = Path(folder) / "models"
         export_run(arguments.run, out)
         models = driver.open_models(out, arguments.threads)
-        setup = filter_setup(run.config.data, run.config.filter)
+        setup = make_filter(run.config.data, run.config.filter)
         recording = draw_walk(run.config.data, setup, arguments.seconds)
         times = measure(run, models, recording)
     period = 1e3 * setup.config.clone_seconds
@@ -60,13 +60,13 @@ def main() -> None:
 
 def measure(run: Any, models: driver.Models, recording: Recording) -> dict[str, list[float]]:
     """Seconds of each part of each clone interval that has a window."""
-    setup = filter_setup(run.config.data, run.config.filter)
+    setup = make_filter(run.config.data, run.config.filter)
     network = Network.of(run.model, run.variables)
     apply = jax.jit(
         lambda window: network.apply(network.variables, window)._replace(diagnostics={})
     )
     state = recording.start.state(setup.config)
-    tracker = filtering.Tracker(apply, setup.config, setup.noise, state)
+    tracker = filtering.Tracker(apply, filtering.Filter(setup.config, setup.noise), state)
     arrays, dt = start_arrays(state, setup), setup.config.dt
     times: dict[str, list[float]] = defaultdict(list)
     for k, rows in enumerate(clone_intervals(len(recording.gyro), setup.config.samples_per_clone)):

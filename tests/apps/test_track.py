@@ -31,7 +31,7 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("home") / "runs"
     with tiny_run.known():
         settings = changed(considered={"raw_gyro_bias": 0.02})
-        settings = dataclasses.replace(settings, zero_velocity_std=0.02)
+        settings = dataclasses.replace(settings, measurements={"zero_velocity": {"std": 0.02}})
         tiny_run.save(folder / "mute", dataclasses.replace(CONFIG, filter=settings), size=0.0)
         tiny_run.save(folder / "walker", CONFIG)
         yield folder

@@ -35,7 +35,7 @@ from gnio_jax.config import (
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Displacements, Estimate, Trajectory
-from gnio_jax.evaluation.estimate import Inputs
+from gnio_jax.evaluation.estimate import BatchInputs
 from gnio_jax.evaluation.prepare import Start, prepare
 from gnio_jax.filtering.settings import free_parameters
 from gnio_jax.filtering.state import GYRO_BIAS
@@ -301,7 +301,7 @@ def walks_and_truth():
     given = Displacements(
         runs.displacement, uncorrelated(np.full_like(runs.displacement, SIGMA / 3))
     )
-    return Inputs(start, runs.gyro, runs.accel, None, given), runs.position
+    return BatchInputs(start, runs.gyro, runs.accel, None, given), runs.position
 
 
 def fit(walks, settings, **options):
@@ -323,7 +323,7 @@ def test_the_noises_and_errors_of_simulated_walks_are_found():
 
 def test_the_gradient_is_that_of_the_likelihood():
     free = free_parameters(TRUE, PATHS)
-    fixed = {"names": tuple(free), "config": fitting.innovation_config(DATA, TRUE)}
+    fixed = {"names": tuple(free), "windows": DATA}
     free, rng = np.array(list(free.values())), np.random.default_rng(0)
 
     def at(vector):
@@ -343,9 +343,9 @@ def test_noises_are_fitted_with_the_whole_bias_of_a_raw_gyro_uncertain(raw, expe
     settings = dataclasses.replace(TRUE, raw_gyro_bias=0.05)
     walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
     walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
-    config = fitting.innovation_config(DATA, settings)
+    ekf = fitting.innovation_filter(DATA, settings)
     starts = fitting._wide_start(walk, settings), fitting.evaluated_start(walk.start, settings)
-    states = (start.state(config) for start in starts)
+    states = (start.state(ekf) for start in starts)
     spreads = (
         np.sqrt(np.linalg.eigvalsh(state.core_covariance[GYRO_BIAS, GYRO_BIAS])) for state in states
     )

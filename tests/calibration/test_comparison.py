@@ -15,7 +15,6 @@ from gnio_jax.commands import app
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings
 from gnio_jax.evaluation import Displacements, Estimate, Recording, Trajectory
 from gnio_jax.evaluation.prepare import Start
-from gnio_jax.filtering.settings import filter_config
 from tests.support.filter_settings import changed
 from tests.support.walks import simulate
 
@@ -50,12 +49,12 @@ def simulated():
 
 def filtered(walk, displacement, settings):
     """Positions and attitudes of the filter, with its first ones."""
-    config, start = filter_config(DATA, settings), walk.start
+    ekf, start = filtering.make_filter(DATA, settings), walk.start
     level = settings.raw_gyro_bias if start.raw_gyro else settings.start.gyro_bias
     pose = start.rotation, start.velocity, start.position, start.gyro_bias, 0
-    state = filtering.initial_state(config, *pose, settings.start, level)
+    state = filtering.initial_state(ekf, *pose, level)
     signals = walk.gyro, walk.accel, *displacement[:2]
-    history = filtering.run_filter(state, *signals, config, settings.noise)[1]
+    history = filtering.run_filter(ekf, state, *signals)[1]
     rotation = np.concatenate([start.rotation[None], history.rotation])
     return np.concatenate([start.position[None], history.position]), Rotation.from_matrix(rotation)
 

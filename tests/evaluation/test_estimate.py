@@ -13,7 +13,7 @@ from gnio_jax import evaluation
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.evaluation import infer, metrics
 from gnio_jax.evaluation.estimate import PERFECT_STD, _batches, mean_over_windows, perfect
-from gnio_jax.filtering import ConsideredStd, CorrelatedError, filter_setup
+from gnio_jax.filtering import ConsideredStd, CorrelatedError, make_filter
 from tests.support.estimators import (
     CONFIG,
     NETWORK,
@@ -122,7 +122,7 @@ def test_true_displacements_lack_nothing_that_was_calibrated(walks):
     considered = changed(
         calibrated, considered={**of_gyro, "scale": 0.1, "heading": 0.1, "slope": 0.1}
     )
-    assert perfect(filter_setup(CONFIG, considered)).considered == ConsideredStd(**of_gyro)
+    assert perfect(make_filter(CONFIG, considered)).considered == ConsideredStd(**of_gyro)
 
 
 def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks):

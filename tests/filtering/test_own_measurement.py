@@ -27,6 +27,7 @@ class Height(NamedTuple):
 
     height: jax.Array
     std: jax.Array
+    name = "height"
 
     def update(self, state, step):
         residual = jnp.stack([self.height - state.position[2]])
@@ -37,13 +38,13 @@ class Height(NamedTuple):
 
 
 def start():
-    return filtering.initial_state(CONFIG, *START)
+    return filtering.initial_state(filtering.Filter(CONFIG), *START)
 
 
 @functools.partial(quick, static_argnames="config")
 def run(state, gyro, accel, displacement, covariance, config, measurements):
-    given = state, gyro, accel, displacement, covariance, config, NOISE
-    return filtering.run_filter(*given, measurements=measurements)
+    given = state, gyro, accel, displacement, covariance
+    return filtering.run_filter(filtering.Filter(config, NOISE), *given, measurements=measurements)
 
 
 def test_a_height_is_the_textbooks_update():
@@ -59,7 +60,7 @@ def test_a_height_is_the_textbooks_update():
         height = np.nan if k % 3 == 0 else without.position[2] + 0.1 * np.sin(k)
         height = np.asarray(100.0 if k == 20 else height)
         state, history = run(state, *given, CONFIG, (none._replace(height=height[None]),))
-        (outcome,) = history.others
+        outcome = history.outcomes["height"]
         assert outcome.present[0] == np.isfinite(height)
         assert outcome.accepted[0] == (np.isfinite(height) and k != 20)
         before = np.asarray(whole(without))

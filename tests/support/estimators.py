@@ -10,7 +10,7 @@ from gnio_jax import evaluation
 from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.evaluation import given_displacements, infer, no_displacements, perfect, prepare
 from gnio_jax.evaluation.estimate import PERFECT_STD
-from gnio_jax.filtering import filter_setup
+from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
 from gnio_jax.types import Prediction, Waypoints
 
@@ -60,12 +60,12 @@ def ready(walks, config=CONFIG, **how):
 
 def tight(recordings, network=NETWORK, config=CONFIG, options=OPTIONS, **how):
     """The filter with the network in it; how: options of `estimate`."""
-    return evaluation.estimate(recordings, network, config, filter_setup(config, options), **how)
+    return evaluation.estimate(recordings, network, config, make_filter(config, options), **how)
 
 
 def loose(recordings, network=NETWORK, config=CONFIG, options=OPTIONS, **how):
     """The filter with displacements that were inferred before."""
-    ekf = filter_setup(config, options)
+    ekf = make_filter(config, options)
     found = infer(network, recordings, config, least_std=math.exp(ekf.config.log_std_min))
     return evaluation.estimate(recordings, found, config, ekf, **how)
 
@@ -78,13 +78,13 @@ def summed(recordings, network=NETWORK, config=CONFIG):
 def imu_only(recordings, config=CONFIG, options=OPTIONS):
     """The filter without displacements."""
     nothing = [no_displacements(each) for each in recordings]
-    return evaluation.estimate(recordings, nothing, config, filter_setup(config, options))
+    return evaluation.estimate(recordings, nothing, config, make_filter(config, options))
 
 
 def with_truth(recordings, config=CONFIG, options=OPTIONS, filtered=True, **how):
     """The filter, or the sum of displacements, with those of the reference."""
     truth = [given_displacements(each, PERFECT_STD) for each in recordings]
-    ekf = perfect(filter_setup(config, options)) if filtered else None
+    ekf = perfect(make_filter(config, options)) if filtered else None
     return evaluation.estimate(recordings, truth, config, ekf, **how)
 
 
