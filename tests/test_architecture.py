@@ -9,7 +9,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "gnio_jax"
 
 BASE = {"config", "cores", "decimation", "errors", "files", "geometry", "numerics", "reporting"}
-BASE |= {"parallel", "types", "windows"}
+BASE |= {"parallel", "plugins", "types", "windows"}
 ROOMS = {
     "data": BASE,
     "models": BASE,

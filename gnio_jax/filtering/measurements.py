@@ -12,6 +12,7 @@ from typing import Any, get_type_hints
 
 from jax.core import Tracer
 
+from gnio_jax import plugins
 from gnio_jax.config.files import checked_value
 from gnio_jax.config.schema import Place
 from gnio_jax.errors import InputError, did_you_mean
@@ -24,7 +25,8 @@ _PUBLISHED = frozenset({*_MEASUREMENTS, "displacement"})
 
 
 def names() -> list[str]:
-    """Names of the known measurements."""
+    """Names of the known measurements, with those of plugins."""
+    plugins.load()
     return sorted(_MEASUREMENTS)
 
 
@@ -64,6 +66,8 @@ def create_measurements(
 
 
 def _create(name: str, numbers: Mapping[str, Any], place: Place) -> Measurement:
+    if name not in _MEASUREMENTS:
+        plugins.load()
     if name not in _MEASUREMENTS:
         remedy = f"{did_you_mean(name, names())}known measurements: {', '.join(names())}"
         place.refuse("is not known", f"{remedy}; a plugin may register others")

@@ -118,6 +118,31 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
             assert np.nanmax(np.abs(other - wanted["displacement"])) > 1e-4
 
 
+@pytest.mark.parametrize("cut", [3, 11, 16])
+def test_a_run_in_two_calls_is_one_run(cut):
+    """The windows of the second call begin in the first, before and after there is a measurement;
+    with missing samples just before the cut, and with a gap that the filter coasts through."""
+    gyro, accel = recording(2)
+    valid = np.ones(len(gyro), bool)
+    valid[N * cut - 3 : N * cut - 1] = valid[N * 12 + 2 : N * 13 + 4] = False
+    ekf = filtering.Filter(CONFIG, NOISE, measurements=(filtering.ZeroVelocity(),))
+
+    @jax.jit
+    def run(state, gyro, accel, valid):
+        return filtering.run_odometry(predict, ekf, state, gyro, accel, valid)
+
+    final, history = run(start(CONFIG), gyro, accel, valid)
+    parts, state = [], start(CONFIG)
+    for rows in (slice(0, N * cut), slice(N * cut, None)):
+        state, part = run(state, gyro[rows], accel[rows], valid[rows])
+        parts.append(part)
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    assert np.isfinite(history.nis[max(cut, FIRST) :]).any()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), joined, history)
+    np.testing.assert_allclose(state.position, final.position, atol=1e-10)
+    np.testing.assert_array_equal(state.window, final.window)
+
+
 def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     """With `history.given`, which takes the factors of the axes off again. The network's log
     standard deviation is raised to a floor."""
