@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 from gnio_jax.config import CompareConfig, EvaluateConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import kept, statistics, tabulate
+from gnio_jax.evaluation.folder import REMEDY, read
 from gnio_jax.evaluation.kept import IDENTITY
 from gnio_jax.evaluation.metrics import NAMES
-from gnio_jax.evaluation.report import REMEDY, Report, read
+from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Cell
 from gnio_jax.files import with_ending
 from gnio_jax.reporting import Lines, Reporter
@@ -326,7 +327,8 @@ def filter_options(comparison: Comparison) -> list[str]:
 
 def write(path: Path, comparison: Comparison) -> None:
     """Write `path`.md, `path`.csv and `path`.png."""
-    from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
+    from gnio_jax import drawing  # Matplotlib takes a second to import
+    from gnio_jax.evaluation import plots
 
     text = f"{title(comparison)}\n\n{tabulate.markdown(HEADER, lines(comparison))}\n"
     text += "\n\n".join(explanations(comparison))
@@ -344,4 +346,4 @@ def write(path: Path, comparison: Comparison) -> None:
     ]
     rows = {row.label: row.reports for row in comparison.rows}
     picture = plots.paired(rows, next(iter(drawable or comparison.cells)))
-    plots.save(with_ending(path, ".png"), picture)
+    drawing.save(with_ending(path, ".png"), picture)

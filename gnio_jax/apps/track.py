@@ -311,13 +311,15 @@ def _draw(
     folder: Path, found: Estimate, summary: Summary, config: TrainConfig, command: str
 ) -> None:
     """Draw the picture and write the page, in the form of an evaluation's sequence."""
-    from gnio_jax.evaluation import page, plots, tabulate  # they take a second to import
+    from gnio_jax import drawing  # they take a second to import
+    from gnio_jax.evaluation import page, plots, tabulate
+    from gnio_jax.evaluation.views import make_view
 
-    seen = plots.view(found, alignment=None)
+    seen = make_view(found, alignment=None)
     length = f"{summary.path_length:.1f} m in {summary.seconds:.0f} s"
     expected = f"{summary.expected_error:.1f} m"
     title = f"{shown_name(summary.recording)}: {length}, expected error at the end {expected}"
-    plots.save(folder / "track.png", plots.sequence(seen, title))
+    drawing.save(folder / "track.png", plots.sequence(seen, title))
     aligned = "start position and yaw" if found.waypoints is None else tabulate.TO_WAYPOINTS
     known = np.isfinite(found.reference.position).all(axis=1).mean()
     partly = f"known for {known:.0%} of the time: errors and ratios are of this part"

@@ -25,10 +25,11 @@ from gnio_jax import data
 from gnio_jax.config import EvaluateConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimate import PERFECT_STD, Estimate, estimate, never_moves, perfect
+from gnio_jax.evaluation.folder import write
 from gnio_jax.evaluation.infer import given_displacements, infer, no_displacements
 from gnio_jax.evaluation.metrics import score
 from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
-from gnio_jax.evaluation.report import DEFINITIONS, Report, write
+from gnio_jax.evaluation.report import DEFINITIONS, Report
 from gnio_jax.evaluation.trajectory import Alignment, Undefined, paired, read_tum
 from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.models import Network

@@ -9,7 +9,8 @@ from gnio_jax import config as configuration
 from gnio_jax.config import EvaluateConfig, plain
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import evaluate, folder_of, resolve
-from gnio_jax.evaluation.report import Report, read
+from gnio_jax.evaluation.folder import read
+from gnio_jax.evaluation.report import Report
 from gnio_jax.reporting import Reporter
 
 IDENTITY = ("dataset", "data_root", "split", "alignment")

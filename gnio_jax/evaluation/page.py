@@ -24,26 +24,24 @@ from bokeh.resources import Resources
 from jaxtyping import Float
 from jinja2 import Environment
 
-from gnio_jax.errors import InputError
-from gnio_jax.evaluation import colours, plots, tabulate
-from gnio_jax.evaluation.plots import View
-from gnio_jax.evaluation.report import Report, read, read_estimates
+from gnio_jax import drawing
+from gnio_jax.evaluation import tabulate
+from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.tabulate import COLUMNS
+from gnio_jax.evaluation.views import SIGMAS, View, ellipses
 from gnio_jax.files import write_text
 
 ROWS, FEWEST_ROWS = 9000, 150
 """Largest number of rows of a page, over all runs and sequences, and smallest number of rows of a
 sequence. Fifteen minutes at ten rows per second are complete; longer sequences are thinned."""
-SAME = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "step")
-"""Settings that evaluations must share to be shown together."""
 LATER = ("command", "weights")
 """Facts about the first run that are not shown under the title."""
 STRIPS = {"gate": "gate γ (–)", "scale": "scale (–)", "std": "σ of network (m)"}
 """Curves with a value for each axis of the window's yaw frame, and their labels."""
-LEVELS = (("mean", 3.0, colours.GREEN), ("refused above", 11.345, colours.VERMILION))
+LEVELS = (("mean", 3.0, drawing.GREEN), ("refused above", 11.345, drawing.VERMILION))
 """Levels of the NIS of three axes: the mean of χ², and the filter's default threshold."""
 MAP_HEIGHT, STRIP_HEIGHT, LABEL_HEIGHT, LEFT = 560, 158, 30, 62
-WAYPOINT = {"marker": "x", "color": colours.REFERENCE, "line_width": 2.0}
+WAYPOINT = {"marker": "x", "color": drawing.REFERENCE, "line_width": 2.0}
 LONGEST_LABEL = 45
 """Letters in a line of a legend, which fit on the screen of a phone."""
 LONG = 1e6
@@ -103,30 +101,6 @@ def of_report(
     )
 
 
-def of_folder(folder: Path, report: Report, name: str) -> Run:
-    """An evaluation read from its folder: its paths and figures, without the curves of network and
-    filter."""
-    estimates = read_estimates(folder, list(report.scores))
-    views = [plots.view(each, report.settings["alignment"]) for each in estimates]
-    return of_report(report, views, name=name)
-
-
-def beside(folder: Path, settings: Mapping[str, Any]) -> list[Run]:
-    """The other evaluations of the same recordings by the same network, beside `folder`.
-    Evaluations that cannot be read or were measured in another way are left out."""
-    found: dict[str, Run | None] = {tabulate.way(settings): None}
-    for other in sorted(path.parent for path in folder.parent.glob("*/metrics.json")):
-        try:
-            report = read(other)
-            own = report.settings
-            if other != folder and all(own.get(name) == settings.get(name) for name in SAME):
-                name = other.name if tabulate.way(own) in found else tabulate.way(own)
-                found[name] = of_folder(other, report, name)
-        except (InputError, OSError):
-            continue
-    return [run for run in found.values() if run is not None]
-
-
 # --- the file
 
 
@@ -136,7 +110,7 @@ def write(path: Path, title: str, runs: list[Run]) -> None:
     The first run gives the sequences and the curves of network and filter; the others have only
     paths, errors and figures. At most `len(COLOURS)` runs are shown.
     """
-    write_text(path, render(title, runs[: len(colours.COLOURS)]))
+    write_text(path, render(title, runs[: len(drawing.COLOURS)]))
 
 
 def render(title: str, runs: list[Run]) -> str:
@@ -155,7 +129,7 @@ def render(title: str, runs: list[Run]) -> str:
         subtitle="; ".join(f"{name}: {text}" for name, text in about.items() if name not in LATER),
         command=about.get("command"),
         sequences=sequences,
-        runs=[run._asdict() | {"colour": colours.COLOURS[place]} for place, run in enumerate(runs)],
+        runs=[run._asdict() | {"colour": drawing.COLOURS[place]} for place, run in enumerate(runs)],
         below=list(dict.fromkeys(name for run in runs for name in run.summary)),
         columns={metric: COLUMNS[metric] for metric in shown},
         number=tabulate.number,
@@ -195,12 +169,12 @@ def columns(seen: View, rows: int) -> Columns:
         "reference_x": reference[:, 0],
         "reference_y": reference[:, 1],
         "error": np.linalg.norm((path - reference)[:, :2], axis=1),
-        **plots.ellipses(seen.filtered.covariance)._asdict(),
+        **ellipses(seen.filtered.covariance)._asdict(),
     }
     curves = {**seen.network.diagnostics, "std": seen.network.std}
     for name in STRIPS:
         if name in curves and np.isfinite(values := curves[name]).any():
-            found |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(colours.AXES)}
+            found |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(drawing.AXES)}
     found = {name: values[::step] for name, values in found.items()}
     if len(seen.passed):
         # A waypoint is in the row that is nearest in time; other rows are NaN.
@@ -224,7 +198,7 @@ def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
     first."""
     views = [seen for run in runs for seen in run.views if seen.name == sequence]
     variance = np.diagonal(views[0].filtered.covariance, axis1=1, axis2=2)[:, :2]
-    reach = np.nan_to_num(colours.SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
+    reach = np.nan_to_num(SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
     own = views[0].position[:, :2]
     parts = [
         part[:, :2]
@@ -256,7 +230,7 @@ class Sources(NamedTuple):
 def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, list[str]]:
     """Bokeh's document, with the script that fills its figures when they are drawn, and the names
     of its figures."""
-    palette, one = list(colours.COLOURS[: len(runs)]), [1.0] * len(runs)
+    palette, one = list(drawing.COLOURS[: len(runs)]), [1.0] * len(runs)
     marks = ("time", "x", "y", "reference_x", "reference_y", "width", "height", "angle")
     sources = Sources(
         [ColumnDataSource({name: [1.0, 2.0] for name in of_run[0]}) for of_run in held],
@@ -279,11 +253,11 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     for name, label in STRIPS.items():
         if f"{name}_x" in there:
             curves = [
-                (first, f"{name}_{axis}", axis, colour) for axis, colour in colours.AXES.items()
+                (first, f"{name}_{axis}", axis, colour) for axis, colour in drawing.AXES.items()
             ]
             strips.append(_draw_strip(sources, times, label, curves))
     if "nis" in there:
-        curve = [(first, "nis", "NIS", colours.BLUE)]
+        curve = [(first, "nis", "NIS", drawing.BLUE)]
         strips.append(_draw_strip(sources, times, "NIS (–)", curve, levels=LEVELS))
     strips[-1].xaxis.axis_label, strips[-1].height = "time (s)", STRIP_HEIGHT + LABEL_HEIGHT
     figures["strips"] = gridplot(
@@ -295,11 +269,11 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     document = Document()
     for root in figures.values():
         document.add_root(root)
-    drawings = [figures["map"], *strips]
+    plots: list[Any] = [figures["map"], *strips]
     for place, line in enumerate(figures["map"].select(name="x")):
         # A run that is hidden in the legend of the map is hidden everywhere.
-        for drawing in drawings[1:]:
-            for other in drawing.select(name="error"):
+        for plot in plots[1:]:
+            for other in plot.select(name="error"):
                 if other.data_source is sources.paths[place]:
                     line.js_link("visible", other, "visible")
     arguments = {
@@ -307,7 +281,7 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
         "columns": [[ColumnDataSource(own) for own in of_run] for of_run in held],
         "frames": [frame(runs, seen.name) for seen in runs[0].views],
         "plan": figures["map"],
-        "legends": [drawing.legend[0] for drawing in drawings if drawing.legend],
+        "legends": [plot.legend[0] for plot in plots if plot.legend],
         "times": times,
     }
     document.js_on_event("document_ready", CustomJS(args=arguments, code=_file("page.js")))
@@ -332,14 +306,14 @@ def _draw_map(
     corners = plan.scatter("x", "y", source=sources.corners, alpha=0.0)
     plan.x_range, plan.y_range = DataRange1d(renderers=[corners]), DataRange1d(renderers=[corners])
     if known:
-        black = {"color": colours.REFERENCE, "line_width": 2.0, "legend_label": "reference"}
+        black = {"color": drawing.REFERENCE, "line_width": 2.0, "legend_label": "reference"}
         path = {"source": sources.paths[0], "name": "reference_x"}
         plan.line("reference_x", "reference_y", **path, **black)
     if tapped:
         ends = {"x0": "x", "y0": "y", "x1": "waypoint_x", "y1": "waypoint_y"}
         label = {"source": sources.paths[0], "legend_label": "waypoint, error"}
         label |= {"name": "waypoint_x"}
-        plan.segment(**ends, color=colours.VERMILION, line_width=1.2, **label)
+        plan.segment(**ends, color=drawing.VERMILION, line_width=1.2, **label)
         plan.scatter("waypoint_x", "waypoint_y", size=9, **WAYPOINT, **label)
     for path, name, colour in drawn:
         label = textwrap.fill(name, LONGEST_LABEL)
@@ -352,7 +326,7 @@ def _draw_map(
     now = {"source": sources.marks, "line_color": "white", "line_width": 2.0}
     plan.scatter("x", "y", size=11, fill_color="colour", **now)
     if known:
-        plan.scatter("reference_x", "reference_y", size=9, fill_color=colours.REFERENCE, **now)
+        plan.scatter("reference_x", "reference_y", size=9, fill_color=drawing.REFERENCE, **now)
     return _finish(plan, grid_x=True)
 
 
@@ -403,7 +377,7 @@ def _finish(figure: new_figure, grid_x: bool = False) -> new_figure:
     figure.axis.axis_label_text_font_style = "normal"
     figure.axis.axis_label_text_color = figure.axis.major_label_text_color = "#222222"
     figure.axis.minor_tick_line_color = None
-    figure.grid.grid_line_color = plots.GRID
+    figure.grid.grid_line_color = drawing.GRID
     figure.xgrid.visible = grid_x
     if not figure.legend:
         return figure

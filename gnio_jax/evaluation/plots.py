@@ -8,33 +8,25 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import PercentFormatter
 
-from gnio_jax.evaluation import colours, metrics, statistics, tabulate
-from gnio_jax.evaluation.estimate import Estimate, in_one_frame
-from gnio_jax.evaluation.infer import Displacements
-from gnio_jax.evaluation.metrics import Filtered
-from gnio_jax.evaluation.report import Report, file_names
-from gnio_jax.evaluation.trajectory import Alignment, positions_at
-from gnio_jax.files import replacing, shown_name
-from gnio_jax.numerics import finite_rows, spans
+from gnio_jax import drawing
+from gnio_jax.evaluation import metrics, statistics, tabulate
+from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation.views import SIGMAS, View, ellipses
+from gnio_jax.files import file_stems, shown_name
+from gnio_jax.numerics import finite_rows
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Waypoints
 
 STANDING = "#E8E8E8"
-GRID = "#DDDDDD"
-DOTS_PER_INCH = 120
-START: dict[str, Any] = {"marker": "o", "ls": "", "mfc": "white", "ms": 8, "mew": 1.8}
-END: dict[str, Any] = {"marker": "s", "ls": "", "ms": 7}
 TAP: dict[str, Any] = {"marker": "x", "ls": "", "ms": 7, "mew": 1.8}
 MARKERS = "os^Dv"
 """Markers; the next one is used when there are more rows than colours."""
@@ -44,88 +36,7 @@ TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
 """Errors that the title of a sequence names."""
 
 
-# --- the data that a picture draws
-
-
-class View(NamedTuple):
-    """A trajectory and its reference in one frame, with the curves of network and filter.
-
-    There are n rows, one for each row of the estimate. Unknown values are NaN.
-    """
-
-    name: str
-    time: Float[np.ndarray, "n"]
-    """Time from the start, s."""
-    position: Float[np.ndarray, "n 3"]
-    """Position of the estimate, m."""
-    reference: Float[np.ndarray, "n 3"]
-    """Position of the reference, m."""
-    network: Displacements
-    filtered: Filtered
-    waypoints: Waypoints
-    """Waypoints, at times from the start; none if the sequence has poses."""
-    passed: Float[np.ndarray, "k 2"]
-    """Horizontal position of the estimate at the times of the waypoints, m."""
-
-    @property
-    def step(self) -> float:
-        """Time between two rows, s."""
-        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
-
-    @property
-    def known(self) -> bool:
-        """Whether there is a reference."""
-        return bool(np.isfinite(self.reference).any())
-
-    @property
-    def errors(self) -> Float[np.ndarray, "_"]:
-        """Horizontal errors where there is a reference, or at the waypoints, m."""
-        if not self.known:
-            return np.linalg.norm(self.passed - self.waypoints.position, axis=1)
-        error = (self.position - self.reference)[finite_rows(self.reference), :2]
-        return np.linalg.norm(error, axis=1)
-
-
-def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
-    """An estimate in the frame of its reference; without an `alignment` the reference is moved to
-    the start of the estimate."""
-    seen = in_one_frame(estimate, alignment)
-    rows = len(seen.trajectory.time)
-    none, blank = np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan)
-    begin = seen.trajectory.time[0]
-    stamps, places = seen.waypoints or Waypoints(np.zeros(0), np.zeros((0, 2)))
-    return View(
-        seen.name,
-        seen.trajectory.time - begin,
-        seen.trajectory.position,
-        seen.reference.position,
-        seen.displacements or Displacements(none, blank),
-        seen.filtered or Filtered(blank, none[:, 0], none[:, 0]),
-        Waypoints(stamps - begin, places),
-        positions_at(seen.trajectory, stamps),
-    )
-
-
-class Ellipses(NamedTuple):
-    """Contours of horizontal covariances at `SIGMAS`, one for each row; NaN where one is not
-    finite."""
-
-    major: Float[np.ndarray, "n"]
-    """Semi-axis, m."""
-    minor: Float[np.ndarray, "n"]
-    """Semi-axis, m."""
-    angle: Float[np.ndarray, "n"]
-    """Angle of the major axis, from x towards y, rad."""
-
-
-def ellipses(covariance: Float[np.ndarray, "n 3 3"]) -> Ellipses:
-    """The contours of the horizontal parts of covariances of positions, m²."""
-    horizontal = covariance[:, :2, :2]
-    known = finite_rows(horizontal.reshape(-1, 4))
-    variance, axes = np.linalg.eigh(np.where(known[:, None, None], horizontal, np.eye(2)))
-    minor, major = colours.SIGMAS * np.sqrt(np.maximum(variance, 0.0)).T
-    angle = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
-    return Ellipses(*(np.where(known, part, np.nan) for part in (major, minor, angle)))
+# --- one sequence
 
 
 def speed(position: Float[np.ndarray, "n 3"], step: float) -> Float[np.ndarray, "n"]:
@@ -136,9 +47,6 @@ def speed(position: Float[np.ndarray, "n 3"], step: float) -> Float[np.ndarray, 
         moved = np.linalg.norm((position[apart:] - position[:-apart])[:, :2], axis=1)
         found[apart // 2 :][: len(moved)] = moved / (apart * step)
     return found
-
-
-# --- one sequence
 
 
 def sequence(seen: View, title: str = "") -> Figure:
@@ -160,13 +68,13 @@ def sequence(seen: View, title: str = "") -> Figure:
     still = metrics.standing(seen.reference, seen.step)
     for row, draw in enumerate(strips):
         axes = figure.add_subplot(grid[row, 1])
-        _shade(axes, seen.time, still)
+        drawing.shade(axes, seen.time, still, STANDING, "standing still")
         draw(axes, seen)
         axes.set_xlim(seen.time[0], max(seen.time[-1], seen.time[0] + 1e-3))
         axes.tick_params(labelbottom=draw is strips[-1])
         # The legend is beside the curves, where it hides nothing.
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
-        finish(axes)
+        drawing.finish(axes)
     figure.axes[-1].set_xlabel("time (s)")
     figure.suptitle(title or shown_name(seen.name), fontsize=11)
     return figure
@@ -175,48 +83,48 @@ def sequence(seen: View, title: str = "") -> Figure:
 def _draw_map(axes: Axes, seen: View) -> None:
     """Plan view, both axes to the same scale."""
     if seen.known:
-        axes.plot(*seen.reference[:, :2].T, color=colours.REFERENCE, lw=1.6, label="reference")
-    axes.plot(*seen.position[:, :2].T, color=colours.BLUE, lw=1.4, label="estimate")
+        axes.plot(*seen.reference[:, :2].T, color=drawing.REFERENCE, lw=1.6, label="reference")
+    axes.plot(*seen.position[:, :2].T, color=drawing.BLUE, lw=1.4, label="estimate")
     if len(seen.passed):
         axes.plot(
-            *seen.waypoints.position.T, color=colours.REFERENCE, zorder=5, label="waypoint", **TAP
+            *seen.waypoints.position.T, color=drawing.REFERENCE, zorder=5, label="waypoint", **TAP
         )
         for ends in np.stack([seen.waypoints.position, seen.passed], 1):
-            axes.plot(*ends.T, color=colours.VERMILION, lw=1.0, zorder=3)
-        axes.plot([], [], color=colours.VERMILION, lw=1.0, label="error at its time")
+            axes.plot(*ends.T, color=drawing.VERMILION, lw=1.0, zorder=3)
+        axes.plot([], [], color=drawing.VERMILION, lw=1.0, label="error at its time")
     shapes = ellipses(seen.filtered.covariance)
     there = np.flatnonzero(np.isfinite(shapes.major) & finite_rows(seen.position))
     if len(there):
-        outline: dict[str, Any] = {"color": colours.BLUE, "lw": 0.9, "alpha": 0.55}
+        outline: dict[str, Any] = {"color": drawing.BLUE, "lw": 0.9, "alpha": 0.55}
         for row in there[np.linspace(0, len(there) - 1, ELLIPSES + 1).astype(int)[1:]]:
             size, angle = (2 * shapes.major[row], 2 * shapes.minor[row]), shapes.angle[row]
             shape = Ellipse(tuple(seen.position[row, :2]), *size, angle=float(np.degrees(angle)))
             shape.set(fill=False, **outline)
             axes.add_patch(shape)
         axes.plot([], [], label="3σ", **outline)
-    for path, colour in ((seen.reference, colours.REFERENCE), (seen.position, colours.BLUE)):
+    for path, colour in ((seen.reference, drawing.REFERENCE), (seen.position, drawing.BLUE)):
         good = path[finite_rows(path)]
         if len(good):
-            axes.plot(*good[0, :2], color=colour, zorder=4, **START)
-            axes.plot(*good[-1, :2], color=colour, zorder=4, **END)
-    axes.plot([], [], color=colours.GREY, label="start", **START)
-    axes.plot([], [], color=colours.GREY, label="end", **END)
+            axes.plot(*good[0, :2], color=colour, zorder=4, **drawing.START)
+            axes.plot(*good[-1, :2], color=colour, zorder=4, **drawing.END)
+    axes.plot([], [], color=drawing.GREY, label="start", **drawing.START)
+    axes.plot([], [], color=drawing.GREY, label="end", **drawing.END)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.legend(loc="best", ncols=2, fontsize=9, framealpha=0.9)
-    finish(axes)
+    drawing.finish(axes)
 
 
 def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
     """Draw the error of the position, with the filter's 3σ behind it; without a reference only the
     3σ."""
-    bound, colour, name = ellipses(seen.filtered.covariance).major, colours.BLUE, "horizontal"
+    bound, colour, name = ellipses(seen.filtered.covariance).major, drawing.BLUE, "horizontal"
     error = np.linalg.norm((seen.position - seen.reference)[:, :2], axis=1)
     if vertical:
-        bound = colours.SIGMAS * np.sqrt(np.maximum(seen.filtered.covariance[:, 2, 2], 0.0))
-        error, colour, name = (seen.position - seen.reference)[:, 2], colours.GREEN, "vertical"
+        bound = SIGMAS * np.sqrt(np.maximum(seen.filtered.covariance[:, 2, 2], 0.0))
+        error, colour, name = (seen.position - seen.reference)[:, 2], drawing.GREEN, "vertical"
     if np.isfinite(bound).any():
         low = -bound if vertical else np.zeros_like(bound)
         axes.fill_between(seen.time, low, bound, color=colour, alpha=0.16, lw=0, label="3σ")
@@ -224,14 +132,14 @@ def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
         axes.plot(seen.time, error, color=colour, lw=1.2, label="error")
     tapped = len(seen.passed) > 0 and not vertical
     if tapped:
-        style = {"color": colours.REFERENCE, "label": "at waypoints", "clip_on": False, **TAP}
+        style = {"color": drawing.REFERENCE, "label": "at waypoints", "clip_on": False, **TAP}
         axes.plot(seen.waypoints.time, seen.errors, **style)
-    axes.axhline(0, color=colours.REFERENCE, lw=0.6)
+    axes.axhline(0, color=drawing.REFERENCE, lw=0.6)
     axes.set_ylabel(f"{name}\n{'error' if seen.known or tapped else '3σ'} (m)")
 
 
 def _draw_speed(axes: Axes, seen: View) -> None:
-    black = {"color": colours.REFERENCE, "lw": 1.4}
+    black = {"color": drawing.REFERENCE, "lw": 1.4}
     if seen.known:
         axes.plot(seen.time, speed(seen.reference, seen.step), label="reference", **black)
     if len(seen.passed):
@@ -239,22 +147,22 @@ def _draw_speed(axes: Axes, seen: View) -> None:
         legs = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times)
         axes.stairs(legs, times, baseline=None, label="legs", **black)
     own = speed(seen.position, seen.step)
-    axes.plot(seen.time, own, color=colours.BLUE, lw=1.1, label="estimate")
+    axes.plot(seen.time, own, color=drawing.BLUE, lw=1.1, label="estimate")
     axes.set_ylabel("horizontal\nspeed (m/s)")
     axes.set_ylim(bottom=0)
 
 
 def _draw_gate(axes: Axes, seen: View) -> None:
     gate = seen.network.diagnostics["gate"]
-    for k, (name, colour) in enumerate(colours.AXES.items()):
+    for k, (name, colour) in enumerate(drawing.AXES.items()):
         axes.plot(seen.time, gate[:, k], color=colour, lw=1.1, label=name)
-    axes.axhline(0, color=colours.REFERENCE, lw=0.6)
+    axes.axhline(0, color=drawing.REFERENCE, lw=0.6)
     axes.set_ylim(-1.05 if np.nanmin(gate) < 0 else -0.05, 1.05)
     axes.set_ylabel("gate γ (–)")
 
 
 def _draw_accepted(axes: Axes, seen: View) -> None:
-    axes.plot(seen.time, seen.filtered.accepted, color=colours.BLUE, lw=1.0, label="used")
+    axes.plot(seen.time, seen.filtered.accepted, color=drawing.BLUE, lw=1.0, label="used")
     axes.set_ylim(-0.05, 1.05)
     axes.set_ylabel("displacement")
 
@@ -272,16 +180,16 @@ def error_cdf(views: list[View], report: Report) -> Figure:
     posed = any(seen.known for seen in views)
     tapped = any(len(seen.passed) for seen in views)
     for error in errors:
-        _step(left, error, color=colours.BLUE, lw=0.7, alpha=0.25)
+        _step(left, error, color=drawing.BLUE, lw=0.7, alpha=0.25)
     if errors:
         label = "all samples" if posed else "all waypoints"
-        _step(left, np.concatenate(errors), color=colours.BLUE, lw=2.2, label=label)
-    left.plot([], [], color=colours.BLUE, lw=0.7, alpha=0.5, label="one sequence")
+        _step(left, np.concatenate(errors), color=drawing.BLUE, lw=2.2, label=label)
+    left.plot([], [], color=drawing.BLUE, lw=0.7, alpha=0.5, label="one sequence")
     left.set_xlabel("horizontal position error (m)")
     left.set_ylabel("share with at most this error")
     left.yaxis.set_major_formatter(PercentFormatter(1.0))
     scored = {"this network": report.scores, **report.reference_rows}
-    styles = ((colours.BLUE, "-"), (colours.VERMILION, "--"), (colours.GREEN, "-."))
+    styles = ((drawing.BLUE, "-"), (drawing.VERMILION, "--"), (drawing.GREEN, "-."))
     for (name, scores), (colour, style) in zip(scored.items(), styles, strict=False):
         found = [own.values.get(x) for own in scores.values() for x in ("ate_2d", "waypoint_rms")]
         values = np.array([value for value in found if value is not None])
@@ -295,7 +203,7 @@ def error_cdf(views: list[View], report: Report) -> Figure:
         axes.set_ylim(0, 1.02)
         axes.set_xlim(left=0)
         axes.legend(loc="lower right", fontsize=9, framealpha=0.9)
-        finish(axes)
+        drawing.finish(axes)
     settings = report.settings
     subject = f"{settings['dataset']} {settings['split']}: {settings['estimator']}"
     figure.suptitle(f"{subject}, {len(errors)} sequences", fontsize=11)
@@ -328,7 +236,7 @@ def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
     height = 0.24 + 0.08 * len(rows)
     figure = Figure(figsize=(8.0, 2.0 + height * len(names)), layout="constrained")
     axes, legend = figure.add_subplot(), {}
-    palette = (colours.GREY, *colours.COLOURS)
+    palette = (drawing.GREY, *drawing.COLOURS)
     for number, (label, table, diverged) in enumerate(zip(rows, tables, lost, strict=True)):
         colour = palette[number % len(palette)]
         marker = MARKERS[number // len(palette) % len(MARKERS)]
@@ -357,45 +265,20 @@ def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
     columns = 2 if max(map(len, legend)) < 40 else 1
     style = {"fontsize": 8, "frameon": False, "loc": "outside lower center", "ncols": columns}
     figure.legend(legend.values(), legend.keys(), **style)
-    finish(axes)
+    drawing.finish(axes)
     return figure
 
 
 def save_all(folder: Path, views: list[View], report: Report, progress: Progress = silent) -> None:
     """Every picture as a PNG in `folder`: one for each sequence, and `error_cdf`."""
     folder.mkdir(parents=True, exist_ok=True)
-    stems = file_names([seen.name for seen in views])
+    stems = file_stems([seen.name for seen in views])
     for done, (stem, seen) in enumerate(zip(stems, views, strict=True)):
         progress(done / len(views))
         values = report.scores[seen.name].values
         known = {x: text for x, text in TITLE.items() if values.get(x) is not None}
         errors = [f"{heading} {values[name]:.2f} m" for name, heading in known.items()]
         title = ": ".join(filter(None, (shown_name(seen.name), ", ".join(errors))))
-        save(folder / f"{stem}.png", sequence(seen, title))
+        drawing.save(folder / f"{stem}.png", sequence(seen, title))
     if any(len(seen.errors) for seen in views):
-        save(folder / "error_cdf.png", error_cdf(views, report))
-
-
-# --- parts of a picture
-
-
-def save(path: Path, figure: Figure) -> None:
-    """Write one figure as a PNG, whole or not at all."""
-    FigureCanvasAgg(figure)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=DOTS_PER_INCH)
-
-
-def finish(axes: Axes) -> None:
-    """Put the grid behind the lines, and remove the frame above and to the right."""
-    axes.grid(True, color=GRID, lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _shade(axes: Axes, time: Float[np.ndarray, "n"], still: Bool[np.ndarray, "n"]) -> None:
-    """Shade the times at which the reference stands still, with one entry in the legend."""
-    for number, (start, stop) in enumerate(spans(still)):
-        begin, end = float(time[start]), float(time[stop - 1])
-        label = "standing still" if not number else None
-        axes.axvspan(begin, end, color=STANDING, lw=0, zorder=0, label=label)
+        drawing.save(folder / "error_cdf.png", error_cdf(views, report))

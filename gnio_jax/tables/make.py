@@ -21,6 +21,7 @@ from gnio_jax.config import TablesConfig, TrainConfig
 from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
+from gnio_jax.evaluation.folder import read_views
 from gnio_jax.evaluation.statistics import Cell, Summary
 from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
@@ -229,9 +230,11 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[RowResult
     from gnio_jax.evaluation import page
     from gnio_jax.tables import plots
 
-    runs = [
-        page.of_folder(result.folders[0], result.reports[0], result.row.label) for result in results
-    ]
+    runs = []
+    for result in results:
+        report = result.reports[0]
+        views = read_views(result.folders[0], report)
+        runs.append(page.of_report(report, views, name=result.row.label))
     available = [view.name for view in runs[0].views if view.known]
     names = _words(options.sequences) if options.sequences else available[:8]
     for name in names:

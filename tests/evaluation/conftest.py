@@ -11,7 +11,7 @@ from tests.support.trajectories import lost
 @pytest.fixture(autouse=True)
 def few_dots(monkeypatch):
     """Pictures are drawn in a quarter of the time."""
-    monkeypatch.setattr("gnio_jax.evaluation.plots.DOTS_PER_INCH", 30)
+    monkeypatch.setattr("gnio_jax.drawing.DOTS_PER_INCH", 30)
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from gnio_jax import config as configuration
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import kept, report
+from gnio_jax.evaluation.folder import read
 from gnio_jax.reporting import Lines
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run
@@ -47,7 +48,7 @@ def test_what_is_there_is_taken(run, monkeypatch):
     found = look(run)
     assert (found.folder, found.problem) == (folder, "")
     monkeypatch.setattr(kept, "evaluate", None)
-    assert kept.made(found, Lines()) == report.read(folder)
+    assert kept.made(found, Lines()) == read(folder)
     (run / "checkpoints" / "best" / "7").rmdir()
     with pytest.raises(InputError, match="holds no checkpoint"):
         look(run)
@@ -74,7 +75,7 @@ def test_what_means_something_else_is_made_anew(run, monkeypatch, settings, prob
     monkeypatch.setattr(Lines, "line", lambda self, text: lines.append(text))
     found = look(run)
     assert problem in found.problem and found.report is None
-    assert kept.made(found, Lines()) == report.read(folder) and len(made) == 1
+    assert kept.made(found, Lines()) == read(folder) and len(made) == 1
     assert made[0].filter == BASE.filter and problem in lines[0]
     assert look(run).problem == ""
     (folder / "metrics.json").write_text("{}")

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from gnio_jax.config import TrainConfig
-from gnio_jax.evaluation import Estimate, Trajectory, page, plots, report
+from gnio_jax.evaluation import Estimate, Trajectory, folder, page
+from gnio_jax.evaluation.views import ellipses, make_view
 from tests.support.estimates import SETTINGS, estimate, reported, with_covariance
 
 EVIL = "</script><script>alert('x')</script><b onmouseover=alert(1)>&amp; $$x$$"
@@ -18,7 +19,7 @@ EVIL = "</script><script>alert('x')</script><b onmouseover=alert(1)>&amp; $$x$$"
 
 def run_of(estimates, *more, **named):
     made = reported(estimates, notes={estimates[0].name: ["start: rough"]})
-    return page.of_report(made, [plots.view(each) for each in estimates], *more, **named)
+    return page.of_report(made, [make_view(each) for each in estimates], *more, **named)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ def written(runs, tmp_path_factory):
 def test_thinned_curves_keep_the_largest_innovation(walks):
     nis = np.full(400, 2.0)
     nis[[0, 201]], nis[3:6] = [np.nan, 70.0], np.nan
-    seen = plots.view(walks[0]._replace(filtered=walks[0].filtered._replace(nis=nis)))
+    seen = make_view(walks[0]._replace(filtered=walks[0].filtered._replace(nis=nis)))
     found = page.columns(seen, 150)
     assert len(found["time"]) == 134 and found["time"][1] == pytest.approx(0.3)
     np.testing.assert_allclose(found["x"][:3], seen.position[:9:3, 0], rtol=1e-6)
@@ -135,15 +136,15 @@ def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
     }
     for name, changes in of.items():
         own = made._replace(settings=settings | changes)
-        report.write(tmp_path / name, own, estimates, TrainConfig(), plots=False)
+        folder.write(tmp_path / name, own, estimates, TrainConfig(), plots=False)
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "metrics.json").write_text("{")
-    found = page.beside(tmp_path / "ours", settings)
-    assert [run.name for run in found] == ["again", "integrate, device orientation"]
-    first = found[0]
+    found = folder.read_others(tmp_path / "ours", settings)
+    assert [*found] == ["again", "integrate, device orientation"]
+    first = page.of_report(*found["again"])
     assert first.figures == {name: own.values for name, own in made.scores.items()}
     seen = {view.name: view for view in first.views}
-    whole = plots.view(estimates[0])
+    whole = make_view(estimates[0])
     np.testing.assert_allclose(seen["room 1/walk"].position, whole.position, atol=1e-6)
     np.testing.assert_allclose(seen["room 1/walk"].reference, whole.reference, atol=1e-8)
     assert not seen["blind"].known and first.remarks[0] == "blind: start: rough"
@@ -192,8 +193,8 @@ def test_in_a_browser(written, walks, tmp_path, width):
     found = json.loads(html.unescape(re.search(r"<body[^>]*>(.*)</body>", shown, re.DOTALL)[1]))
     assert found["perMetre"][0] == pytest.approx(found["perMetre"][1], rel=0.02)
     assert found["beyond"] <= 0 and found["problems"] == [] and found["chosen"] == EVIL
-    whole = plots.view(walks[0])
-    (x, y), shapes = whole.position[120, :2], plots.ellipses(whole.filtered.covariance)
+    whole = make_view(walks[0])
+    (x, y), shapes = whole.position[120, :2], ellipses(whole.filtered.covariance)
     error = np.linalg.norm((whole.position - whole.reference)[120, :2])
     wanted = f"12.0 s  ·  x {x:.1f} m, y {y:.1f} m  ·  error {error:.2f} m"
     assert found["first"].startswith(wanted)

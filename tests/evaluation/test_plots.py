@@ -4,7 +4,9 @@ import jax
 import numpy as np
 import pytest
 
+from gnio_jax import drawing
 from gnio_jax.evaluation import Trajectory, plots
+from gnio_jax.evaluation.views import ellipses, make_view
 from tests.support.estimates import with_covariance
 from tests.support.reports import LOST, report_of
 
@@ -15,7 +17,7 @@ def labels(axes):
 
 def test_ellipses_are_contours_of_their_covariance():
     covariance = np.array([[[4.0, 1.5, 0], [1.5, 1.0, 0], [0, 0, 9]], np.full((3, 3), np.nan)])
-    found = plots.ellipses(covariance)
+    found = ellipses(covariance)
     angle = np.linspace(0, 2 * np.pi, 25)
     along, across = found.major[0] * np.cos(angle), found.minor[0] * np.sin(angle)
     cosine, sine = np.cos(found.angle[0]), np.sin(found.angle[0])
@@ -37,22 +39,22 @@ def test_an_estimate_is_seen_in_the_frame_of_the_reference(estimates):
     covariance = walk.filtered.covariance[:, [1, 0, 2]][:, :, [1, 0, 2]]
     moved = with_covariance(walk, covariance)
     moved = moved._replace(trajectory=Trajectory(path.time, turned + 5.0, attitude))
-    whole, found = plots.view(walk), plots.view(moved)
+    whole, found = make_view(walk), make_view(moved)
     np.testing.assert_allclose(found.position, whole.position, atol=1e-9)
-    angles = [plots.ellipses(seen.filtered.covariance).angle for seen in (whole, found)]
+    angles = [ellipses(seen.filtered.covariance).angle for seen in (whole, found)]
     np.testing.assert_allclose(np.abs(np.sin(angles)), 1.0, atol=1e-6)
     # By hand: the starts are one, and so are the yaws.
     shift = path.position[0] - walk.reference.position[0]
     np.testing.assert_allclose(whole.position, path.position - shift, atol=1e-9)
     np.testing.assert_array_equal(whole.reference, walk.reference.position)
     # A track stays where it is, and its reference comes to it.
-    own = plots.view(moved, alignment=None)
+    own = make_view(moved, alignment=None)
     np.testing.assert_array_equal(own.position, moved.trajectory.position)
     np.testing.assert_allclose(own.reference[0], moved.trajectory.position[0], atol=1e-9)
 
 
 def test_the_picture_of_a_sequence(estimates):
-    seen = plots.view(estimates[0])
+    seen = make_view(estimates[0])
     figure = plots.sequence(seen, "walk: ATE 1.23 m")
     plan, horizontal, vertical, speed, gate = figure.axes
     assert figure.get_suptitle() == "walk: ATE 1.23 m" and plan.get_aspect() == 1.0
@@ -76,19 +78,19 @@ def test_the_picture_of_a_sequence(estimates):
 def test_without_a_reference_nothing_is_called_an_error(estimates):
     blind = estimates[2]
     blind = blind._replace(displacements=blind.displacements._replace(diagnostics={}))
-    figure = plots.sequence(plots.view(blind, alignment=None))
+    figure = plots.sequence(make_view(blind, alignment=None))
     plan, horizontal, vertical, speed, used = figure.axes
     assert "reference" not in labels(plan) and labels(horizontal) == ["3σ"]
     assert "error" not in horizontal.get_ylabel() + vertical.get_ylabel()
     assert labels(speed) == ["estimate"]
     assert labels(used) == ["used"]
-    bare = plots.view(blind._replace(filtered=None))
+    bare = make_view(blind._replace(filtered=None))
     assert len(plots.sequence(bare).axes) == 2
 
 
 def test_the_distribution_of_errors_counts_what_diverged(with_divergence):
     of, made = with_divergence
-    figure = plots.error_cdf([plots.view(each, "se3") for each in of], made)
+    figure = plots.error_cdf([make_view(each, "se3") for each in of], made)
     left, right = figure.axes
     of_one, of_all = left.get_lines()[1], left.get_lines()[3]
     assert of_one.get_ydata()[-1] == pytest.approx(0.5)  # the lost walk: 200 of 400 samples
@@ -98,15 +100,15 @@ def test_the_distribution_of_errors_counts_what_diverged(with_divergence):
 
 
 def test_one_picture_for_each_sequence(tmp_path, estimates, made):
-    plots.save_all(tmp_path, [plots.view(each) for each in estimates[:2]], made)
+    plots.save_all(tmp_path, [make_view(each) for each in estimates[:2]], made)
     pictures = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert pictures.keys() == {"error_cdf.png", "room_1_walk.png", "room_1_walk_.png"}
     assert all(each.startswith(b"\x89PNG") for each in pictures.values())
-    seen = plots.view(estimates[0])._replace(name="a$x^$\udcff")  # of any bytes, and short
+    seen = make_view(estimates[0])._replace(name="a$x^$\udcff")  # of any bytes, and short
     kept = (x for x in seen._fields if x not in ("name", "waypoints", "passed"))
     parts = {x: jax.tree.map(lambda rows: rows[:3], getattr(seen, x)) for x in kept}
     assert np.isnan(plots.speed(parts["position"], 0.1)).all()
-    plots.save(tmp_path / "p.png", plots.sequence(seen._replace(**parts)))
+    drawing.save(tmp_path / "p.png", plots.sequence(seen._replace(**parts)))
 
 
 def test_rows_side_by_side():

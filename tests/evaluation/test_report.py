@@ -11,22 +11,22 @@ import pytest
 from gnio_jax import evaluation
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Trajectory, report, score
+from gnio_jax.evaluation import Trajectory, folder, report, score
 from tests.support.estimates import reported
 
 
-def write(folder, made, estimates, **options):
+def write(place, made, estimates, **options):
     """The folder, by default without pictures, and its metrics.json."""
-    report.write(folder, made, estimates, TrainConfig(), plots=options.pop("plots", False))
+    folder.write(place, made, estimates, TrainConfig(), plots=options.pop("plots", False))
 
     def strict(constant):
         raise AssertionError(f"{constant} is not JSON")
 
-    return json.loads((folder / "metrics.json").read_text(), parse_constant=strict)
+    return json.loads((place / "metrics.json").read_text(), parse_constant=strict)
 
 
-def rows(folder):
-    with open(folder / "metrics.csv", newline="") as file:
+def rows(place):
+    with open(place / "metrics.csv", newline="") as file:
         return list(csv.DictReader(file))
 
 
@@ -86,7 +86,7 @@ def test_trajectories_are_read_back_at_their_own_stamps(tmp_path, estimates, mad
     path, reference = without(whole.trajectory, ends), without(whole.reference, holes)
     of = [whole._replace(trajectory=path, reference=reference), *estimates[1:]]
     write(tmp_path / "e", made, of)
-    first, _, blind = report.read_estimates(tmp_path / "e", list(made.scores))
+    first, _, blind = folder.read_estimates(tmp_path / "e", list(made.scores))
     read, true = first.trajectory, first.reference
     assert len(read.time) == 390
     np.testing.assert_allclose(read.position, path.position[:390], atol=1e-8)
@@ -113,17 +113,17 @@ def test_divergence_is_in_the_files(tmp_path, with_divergence):
 
 
 def test_no_page_is_lost_and_none_is_of_other_figures(tmp_path, estimates, made, no_pictures):
-    folder, of = tmp_path / "e", estimates[:1]
+    place, of = tmp_path / "e", estimates[:1]
     first = made._replace(scores=score(of))
-    write(folder, first, of)
-    assert not (folder / "report.html").exists() and not (folder / "plots").exists()
-    write(folder, first, of, plots=True)
+    write(place, first, of)
+    assert not (place / "report.html").exists() and not (place / "plots").exists()
+    write(place, first, of, plots=True)
     further = [of[0]._replace(trajectory=estimates[1].trajectory)]
     again = made._replace(scores=score(further))
-    write(folder, again, further)
+    write(place, again, further)
     ates = [each.scores["room 1/walk"].values["ate"] for each in (first, again)]
-    assert f"<td>{ates[1]:.2f}</td>" in (folder / "report.html").read_text(encoding="utf-8")
-    assert ates[0] != ates[1] and (folder / "plots").is_dir()
+    assert f"<td>{ates[1]:.2f}</td>" in (place / "report.html").read_text(encoding="utf-8")
+    assert ates[0] != ates[1] and (place / "plots").is_dir()
 
 
 DAMAGES = [
@@ -149,7 +149,7 @@ def test_what_is_no_evaluation_is_named(tmp_path, estimates, made):
     def refused(content, problem):
         path.write_bytes(content)
         with pytest.raises(InputError, match=re.escape(problem)):
-            report.read(path.parent)
+            folder.read(path.parent)
 
     for where, value in [*DAMAGES, (("settings", "definitions"), report.DEFINITIONS - 1)]:
         found = inner = json.loads(whole)
@@ -162,6 +162,6 @@ def test_what_is_no_evaluation_is_named(tmp_path, estimates, made):
     for broken in (b"[" * 100_000, b"nothing", b"\xff"):
         refused(broken, "is not a metrics.json of an evaluation")
     path.unlink()
-    for folder in (tmp_path, path, tmp_path / "nowhere"):
+    for place in (tmp_path, path, tmp_path / "nowhere"):
         with pytest.raises(InputError, match="is neither a run nor an evaluation"):
-            report.read(folder)
+            folder.read(place)

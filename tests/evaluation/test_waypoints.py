@@ -12,17 +12,18 @@ from gnio_jax.evaluation import (
     Trajectory,
     Undefined,
     align,
+    folder,
     measure,
     never_moves,
     page,
     plots,
     prepare,
-    report,
     score,
 )
 from gnio_jax.evaluation.estimate import in_one_frame
 from gnio_jax.evaluation.metrics import OF_FILTER, OF_WAYPOINTS
 from gnio_jax.evaluation.trajectory import positions_at
+from gnio_jax.evaluation.views import make_view
 from gnio_jax.types import Waypoints
 from tests.support.estimates import SETTINGS, estimate, reported
 from tests.support.estimators import CONFIG, with_waypoints
@@ -188,22 +189,22 @@ def made(unseen_ones):
 
 
 def test_the_folder_holds_the_waypoints_and_gives_them_back(unseen_ones, made, tmp_path):
-    report.write(tmp_path, made, unseen_ones, BASE, plots=False)
+    folder.write(tmp_path, made, unseen_ones, BASE, plots=False)
     assert sorted(x.name for x in (tmp_path / "waypoints").iterdir()) == ["a_b.txt", "c.txt"]
     for ours, theirs in zip(
-        report.read_estimates(tmp_path, list(made.scores)), unseen_ones, strict=True
+        folder.read_estimates(tmp_path, list(made.scores)), unseen_ones, strict=True
     ):
         assert not ours.reference.known.any()
         for one, other in zip(ours.waypoints, theirs.waypoints, strict=True):
             np.testing.assert_allclose(one, other, atol=1e-6)
-    assert report.read(tmp_path).scores == made.scores
+    assert folder.read(tmp_path).scores == made.scores
     (tmp_path / "waypoints" / "c.txt").write_text("1 2\n")
     with pytest.raises(InputError, match="2 columns"):
-        report.read_estimates(tmp_path, list(made.scores))
+        folder.read_estimates(tmp_path, list(made.scores))
 
 
 def test_picture_and_page_show_where_the_estimate_is_at_the_waypoints(unseen_ones, made):
-    seen = plots.view(unseen_ones[0])
+    seen = make_view(unseen_ones[0])
     aligned = in_one_frame(unseen_ones[0]).trajectory
     passed = positions_at(aligned, unseen_ones[0].waypoints.time)
     np.testing.assert_allclose(seen.passed, passed)
@@ -215,7 +216,7 @@ def test_picture_and_page_show_where_the_estimate_is_at_the_waypoints(unseen_one
     assert all(any(np.array_equal(ends, line) for line in lines) for ends in joined)
     (marks,) = (line for line in error.lines if line.get_label() == "at waypoints")
     np.testing.assert_array_equal(marks.get_ydata(), seen.errors)
-    of_all = plots.error_cdf([plots.view(each) for each in unseen_ones], made)
+    of_all = plots.error_cdf([make_view(each) for each in unseen_ones], made)
     assert "rms at waypoints" in of_all.axes[1].get_xlabel()
     found = page.columns(seen, 150)  # of the page, each waypoint once
     rows = np.flatnonzero(np.isfinite(found["waypoint_x"]))
