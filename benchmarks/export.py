@@ -27,7 +27,7 @@ from gnio_jax.apps import packages  # noqa: E402
 from gnio_jax.apps.onnx import driver, export_run  # noqa: E402
 from gnio_jax.apps.onnx.programs import start_arrays  # noqa: E402
 from gnio_jax.apps.onnx.run import draw_walk  # noqa: E402
-from gnio_jax.evaluation import Recording  # noqa: E402
+from gnio_jax.evaluation import PreparedRecording  # noqa: E402
 from gnio_jax.filtering.settings import filter_setup  # noqa: E402
 from gnio_jax.models import Network  # noqa: E402
 
@@ -58,7 +58,9 @@ def main() -> None:
     print(f"ONNX / gnio-jax, network:        {theirs / ours:.2f}")
 
 
-def measure(run: Any, models: driver.Models, recording: Recording) -> dict[str, list[float]]:
+def measure(
+    run: Any, models: driver.Models, recording: PreparedRecording
+) -> dict[str, list[float]]:
     """Seconds of each part of each clone interval that has a window."""
     setup = filter_setup(run.config.data, run.config.filter)
     network = Network.of(run.model, run.variables)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from gnio_jax.calibration.fit import evaluated_start
 from gnio_jax.config import ConsideredStd, CorrelatedError, DataConfig, FilterSettings
-from gnio_jax.evaluation import Displacements, Recording, estimate, score
+from gnio_jax.evaluation import Displacements, PreparedRecording, estimate, score
 from gnio_jax.evaluation.statistics import Scores, summarise
 from gnio_jax.evaluation.tabulate import column, number
 from gnio_jax.filtering import filter_setup
@@ -72,7 +72,7 @@ def _spelled(metric: str, change: Change) -> str:
 
 
 def compare_filters(
-    recordings: list[Recording],
+    recordings: list[PreparedRecording],
     displacements: list[Displacements],
     windows: DataConfig,
     before: FilterSettings,
@@ -99,7 +99,7 @@ def compare_filters(
 
 
 def _scores(
-    recordings: list[Recording],
+    recordings: list[PreparedRecording],
     displacements: list[Displacements],
     windows: DataConfig,
     settings: FilterSettings,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from gnio_jax import data
 from gnio_jax.config import CalibrateConfig, FilterSettings, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
+from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, estimate, prepare
 from gnio_jax.filtering import filter_setup
 from gnio_jax.models import Network
 from gnio_jax.training import checkpoint
@@ -24,8 +24,8 @@ OnStage = Callable[[str, float], None]
 class Evidence(NamedTuple):
     """Recordings and the estimates of a network for each, in the same order."""
 
-    recordings: list[Recording]
-    estimates: list[Estimate]
+    recordings: list[PreparedRecording]
+    estimates: list[SequenceEstimate]
 
 
 class Source(NamedTuple):

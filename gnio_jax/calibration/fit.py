@@ -18,8 +18,8 @@ from scipy.optimize import minimize
 
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flat
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate
-from gnio_jax.evaluation.estimate import Inputs
+from gnio_jax.evaluation import SequenceEstimate
+from gnio_jax.evaluation.estimate import FilterInputs
 from gnio_jax.evaluation.prepare import Start
 from gnio_jax.filtering import (
     ConsideredStd,
@@ -91,7 +91,7 @@ LEAST_FACTOR = 1e-3
 
 
 def std_factors(
-    estimates: list[Estimate], truths: list[Float[np.ndarray, "m 3"]]
+    estimates: list[SequenceEstimate], truths: list[Float[np.ndarray, "m 3"]]
 ) -> Float[np.ndarray, "3"]:
     """Root mean square of error over standard deviation, for each axis, over all windows.
 
@@ -143,7 +143,7 @@ def start_of_fit(settings: FilterSettings, paths: Sequence[str]) -> FilterSettin
 
 
 def fit_innovations(
-    walks: Inputs,
+    walks: FilterInputs,
     windows: DataConfig,
     settings: FilterSettings,
     paths: Sequence[str],
@@ -231,7 +231,7 @@ def innovation_config(windows: DataConfig, settings: FilterSettings) -> FilterCo
 
 def innovation_objective(
     free: Float[Array, "u"],
-    walks: Inputs,
+    walks: FilterInputs,
     start: Float[Array, "u"],
     settings: FilterSettings,
     *,
@@ -243,7 +243,7 @@ def innovation_objective(
     the prior about `start`, which keeps parameters in place that the walks do not determine."""
     chex.assert_equal_shape([free, start])
 
-    def of_walk(settings: FilterSettings, walk: Inputs) -> Array:
+    def of_walk(settings: FilterSettings, walk: FilterInputs) -> Array:
         run, displacement = _repeated(walk, settings, config)
         history = run(_wide_start(walk, settings).state(config), displacement)
         # The padding of the walk comes after its last displacement, where the filter may diverge.
@@ -272,7 +272,7 @@ def evaluated_start(start: Start, settings: FilterSettings) -> Start:
     return start._replace(std=settings.start, level_gyro_bias=level)
 
 
-def _wide_start(walk: Inputs, settings: FilterSettings) -> Start:
+def _wide_start(walk: FilterInputs, settings: FilterSettings) -> Start:
     """The start with all components of a raw gyro's bias uncertain (ours). Otherwise the fit would
     explain an unknown vertical component by noise."""
     start = evaluated_start(walk.start, settings)
@@ -280,7 +280,7 @@ def _wide_start(walk: Inputs, settings: FilterSettings) -> Start:
 
 
 def _repeated(
-    walk: Inputs, settings: FilterSettings, config: FilterConfig
+    walk: FilterInputs, settings: FilterSettings, config: FilterConfig
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], Array]:
     """The run over one walk without the network, as a function of a start and displacements, with
     the displacements of the walk."""
@@ -388,7 +388,10 @@ def _reported(positions: Positions, std: ConsideredStd) -> Array:
 
 
 def filtered_positions(
-    walks: Inputs, truth: Float[np.ndarray, "w k 3"], windows: DataConfig, settings: FilterSettings
+    walks: FilterInputs,
+    truth: Float[np.ndarray, "w k 3"],
+    windows: DataConfig,
+    settings: FilterSettings,
 ) -> Positions:
     """The positions of a filter over the walks, where it is healthy.
 
@@ -404,12 +407,12 @@ def filtered_positions(
 
 @functools.partial(jax.jit, static_argnames="config")
 def _filtered(
-    walks: Inputs, settings: FilterSettings, *, config: FilterConfig
+    walks: FilterInputs, settings: FilterSettings, *, config: FilterConfig
 ) -> tuple[Array, Array, Array, Array, Array]:
     """For every walk: where the filter is healthy, its positions, their covariances and S, and the
     axis of a raw gyro."""
 
-    def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
+    def of_walk(settings: FilterSettings, walk: FilterInputs) -> tuple[Any, ...]:
         start = evaluated_start(walk.start, settings)
         state = start.state(config)
         run, displacement = _repeated(walk, settings, config)

@@ -24,7 +24,7 @@ from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
-from gnio_jax.evaluation.estimate import Estimate
+from gnio_jax.evaluation.estimate import SequenceEstimate
 from gnio_jax.evaluation.report import DEFINITIONS, Report, as_json, from_json
 from gnio_jax.evaluation.trajectory import (
     Trajectory,
@@ -39,7 +39,7 @@ from gnio_jax.reporting import Progress, silent
 
 PAGE = "report.html"
 REMEDY = "evaluate the run anew with gnio evaluate"
-SAME = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "step")
+SHARED = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "step")
 """Settings that evaluations must share to be shown together."""
 
 
@@ -49,7 +49,7 @@ SAME = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "s
 def write(
     folder: Path,
     report: Report,
-    estimates: list[Estimate],
+    estimates: list[SequenceEstimate],
     trained: TrainConfig,
     command: str = "",
     plots: bool = True,
@@ -61,49 +61,50 @@ def write(
     made again, so that they are neither lost nor out of date. `trained` is the configuration of the
     run and `command` the command line, for the page.
     """
-    drawn = plots or (folder / PAGE).exists()
+    with_pictures = plots or (folder / PAGE).exists()
     with replacing_folder(folder) as new:
         text = json.dumps(as_json(report), indent=2, allow_nan=False, ensure_ascii=False)
         (new / "metrics.json").write_text(text + "\n", encoding="utf-8")
-        columns = list(dict.fromkeys(x for own in report.scores.values() for x in own.values))
-        rows = ([name, *map(own.values.get, columns)] for name, own in report.scores.items())
+        values = {name: measures.values for name, measures in report.scores.items()}
+        columns = list(dict.fromkeys(metric for row in values.values() for metric in row))
+        rows = ([name, *map(row.get, columns)] for name, row in values.items())
         write_csv(new / "metrics.csv", [["sequence", *columns], *rows])
         for kind in ("trajectories", "references", "states"):
             (new / kind).mkdir()
-        for stem, each in zip(file_stems(report.scores), estimates, strict=True):
-            write_tum(new / "trajectories" / f"{stem}.txt", each.trajectory)
-            np.savez(new / "states" / f"{stem}.npz", **arrays(each))
-            if each.reference.known.any():
-                write_tum(new / "references" / f"{stem}.txt", each.reference)
-            if each.waypoints is not None:
+        for stem, estimate in zip(file_stems(report.scores), estimates, strict=True):
+            write_tum(new / "trajectories" / f"{stem}.txt", estimate.trajectory)
+            np.savez(new / "states" / f"{stem}.npz", **arrays(estimate))
+            if estimate.reference.known.any():
+                write_tum(new / "references" / f"{stem}.txt", estimate.reference)
+            if estimate.waypoints is not None:
                 (new / "waypoints").mkdir(exist_ok=True)
-                write_waypoints(new / "waypoints" / f"{stem}.txt", each.waypoints)
-        if drawn:
+                write_waypoints(new / "waypoints" / f"{stem}.txt", estimate.waypoints)
+        if with_pictures:
             # Bokeh and Matplotlib take seconds to import.
             from gnio_jax.evaluation import page
             from gnio_jax.evaluation import plots as pictures
 
             alignment = report.settings["alignment"]
-            views = [make_view(each, alignment) for each in estimates]
+            views = [make_view(estimate, alignment) for estimate in estimates]
             pictures.save_all(new / "plots", views, report, progress)
-            run = page.of_report(report, views, command, configuration.text(trained))
+            run = page.describe_report(report, views, command, configuration.text(trained))
             title = f"{report.settings['dataset']} {report.settings['split']}: {run.name}"
             others = read_others(folder, report.settings)
-            runs = [page.of_report(*other, name=name) for name, other in others.items()]
+            runs = [page.describe_report(*other, name=name) for name, other in others.items()]
             page.write(new / PAGE, title, [run, *runs])
 
 
-def arrays(estimate: Estimate) -> dict[str, Float[np.ndarray, "n ..."]]:
+def arrays(estimate: SequenceEstimate) -> dict[str, Float[np.ndarray, "n ..."]]:
     """The results of the estimator that docs/tables.md lists: a row for each row of the
     trajectory."""
-    found: dict[str, Any] = estimate.trajectory._asdict()
+    results: dict[str, Any] = estimate.trajectory._asdict()
     if estimate.displacements is not None:
         value, covariance, diagnostics = estimate.displacements
-        found |= {"displacement": value, "displacement_covariance": covariance, **diagnostics}
+        results |= {"displacement": value, "displacement_covariance": covariance, **diagnostics}
     if estimate.filtered is not None:
         covariance, nis, accepted = estimate.filtered
-        found |= {"position_covariance": covariance, "nis": nis, "accepted": accepted}
-    return found | (estimate.states._asdict() if estimate.states else {})
+        results |= {"position_covariance": covariance, "nis": nis, "accepted": accepted}
+    return results | (estimate.states._asdict() if estimate.states else {})
 
 
 # --- read back
@@ -131,49 +132,49 @@ def read(folder: Path) -> Report:
         raise InputError(path, "is not a metrics.json of an evaluation", REMEDY) from None
 
 
-def read_estimates(folder: Path, names: list[str]) -> list[Estimate]:
+def read_estimates(folder: Path, names: list[str]) -> list[SequenceEstimate]:
     """Estimate and reference of each of an evaluation's sequences, at the estimate's stamps.
 
     `names` has all sequences, in the order of its metrics.json. A row without a reference is NaN.
     The estimate ends where it diverged.
     """
-    found = []
+    estimates = []
     for name, stem in zip(names, file_stems(names), strict=True):
         path = read_tum(folder / "trajectories" / f"{stem}.txt")
-        rows = len(path.time)
-        reference = Trajectory(path.time, np.full((rows, 3), np.nan), np.full((rows, 4), np.nan))
+        unknown = (np.full((len(path.time), width), np.nan) for width in (3, 4))
+        reference = Trajectory(path.time, *unknown)
         file = folder / "references" / f"{stem}.txt"
         if file.exists():
-            true = read_tum(file)
-            stamps = np.round(path.time, 6), np.round(true.time, 6)
-            _, here, there = np.intersect1d(stamps[0], stamps[1], return_indices=True)
-            reference.position[here] = true.position[there]
-            reference.orientation[here] = true.orientation[there]
+            poses = read_tum(file)
+            stamps = np.round(path.time, 6), np.round(poses.time, 6)
+            _, rows, pose_rows = np.intersect1d(*stamps, return_indices=True)
+            reference.position[rows] = poses.position[pose_rows]
+            reference.orientation[rows] = poses.orientation[pose_rows]
         file = folder / "waypoints" / f"{stem}.txt"
         waypoints = read_waypoints(file) if file.exists() else None
-        found.append(Estimate(name, path, reference, waypoints=waypoints))
-    return found
+        estimates.append(SequenceEstimate(name, path, reference, waypoints=waypoints))
+    return estimates
 
 
 def read_views(folder: Path, report: Report) -> list[View]:
     """The paths of the sequences of `report` from its folder, without the curves of network and
     filter."""
     estimates = read_estimates(folder, list(report.scores))
-    return [make_view(each, report.settings["alignment"]) for each in estimates]
+    return [make_view(estimate, report.settings["alignment"]) for estimate in estimates]
 
 
 def read_others(folder: Path, settings: Mapping[str, Any]) -> dict[str, tuple[Report, list[View]]]:
-    """The other evaluations of the same recordings by the same network, beside `folder`, by their
-    difference in few words. Evaluations that cannot be read or were measured in another way are
+    """The other evaluations of the same recordings by the same network, beside `folder`, each by
+    its difference in few words. Evaluations that cannot be read or were measured in another way are
     left out."""
     evaluations: dict[str, tuple[Report, list[View]]] = {}
-    for other in sorted(path.parent for path in folder.parent.glob("*/metrics.json")):
+    for path in sorted(path.parent for path in folder.parent.glob("*/metrics.json")):
         try:
-            report = read(other)
-            if other != folder and all(report.settings.get(x) == settings.get(x) for x in SAME):
+            report = read(path)
+            if path != folder and all(report.settings.get(x) == settings.get(x) for x in SHARED):
                 way = tabulate.way(report.settings)
-                name = other.name if way in {tabulate.way(settings), *evaluations} else way
-                evaluations[name] = report, read_views(other, report)
+                name = path.name if way in {tabulate.way(settings), *evaluations} else way
+                evaluations[name] = report, read_views(path, report)
         except (InputError, OSError):
             continue
     return evaluations

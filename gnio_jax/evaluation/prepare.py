@@ -75,7 +75,7 @@ class Start(NamedTuple):
         return initial_state(config, *known, 0, self.std, self.level_gyro_bias)
 
 
-class Recording(NamedTuple):
+class PreparedRecording(NamedTuple):
     """A sequence prepared for an estimator: K strides of n samples."""
 
     name: str
@@ -121,7 +121,7 @@ def prepare(
     orientation: Orientation | None = None,
     from_first: bool = False,
     raw_gyro_bias: float | None = None,
-) -> tuple[list[Recording], dict[str, str]]:
+) -> tuple[list[PreparedRecording], dict[str, str]]:
     """Recordings to estimate, and the names of the sequences that are left out with the reason.
 
     A recording begins at the first sample with a trusted reference. With `from_first`, or without a
@@ -130,8 +130,8 @@ def prepare(
     so its start is always static. `raw_gyro_bias` replaces the standard deviation of the level
     components of the gyro's bias if neither the phone nor a rest gives a first estimate of it: if
     `imu_compensated` is "no" and the bias starts from zero. `orientation` is the source of
-    `Recording.attitude`; None: there is none. Raises `InputError` for a sequence that lacks what
-    these choices need.
+    `PreparedRecording.attitude`; None: there is none. Raises `InputError` for a sequence that lacks
+    what these choices need.
     """
     recordings, left_out = [], {}
     for sequence in sequences:
@@ -163,7 +163,7 @@ def prepare(
         ends = slice(None, None, windows.stride)
         placement = str(sequence.attributes.get("placement", "unknown"))
         recordings.append(
-            Recording(
+            PreparedRecording(
                 name=sequence.name,
                 group=str(data.group(sequence)),
                 placement="" if placement == "unknown" else placement,

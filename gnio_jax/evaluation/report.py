@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 
 from gnio_jax.evaluation import statistics
 from gnio_jax.evaluation.metrics import Measures
-from gnio_jax.evaluation.statistics import Scores, Summary
+from gnio_jax.evaluation.statistics import MetricSummary, Scores
 
 DEFINITIONS = 3
 """Version of the meaning of the figures of metrics.json, in its `settings`. Raise it with every
 change after which the figures of older files cannot be compared with newer ones: another definition
 of a metric, of divergence or of a mean, or a new field that tables need."""
-BESIDE = ("infinite", "reasons", "diverged", "group", "placement", "notes")
-"""Fields of a sequence in metrics.json besides its metrics."""
+OTHER_FIELDS = ("infinite", "reasons", "diverged", "group", "placement", "notes")
+"""Fields of a sequence in metrics.json that are no metrics."""
 
 
 class Report(NamedTuple):
@@ -39,12 +39,14 @@ class Report(NamedTuple):
     @property
     def diverged(self) -> list[str]:
         """Sequences whose estimate diverged."""
-        return [name for name, own in self.scores.items() if own.diverged]
+        return [name for name, measures in self.scores.items() if measures.diverged]
 
-    def summary(self, row: str | None = None) -> dict[str, Summary]:
+    def summary(self, row: str | None = None) -> dict[str, MetricSummary]:
         """Each metric over the sequences, for this evaluation or one of its reference rows."""
         scores = self.scores if row is None else self.reference_rows[row]
-        metrics = dict.fromkeys(metric for own in scores.values() for metric in own.values)
+        metrics = dict.fromkeys(
+            metric for measures in scores.values() for metric in measures.values
+        )
         return {name: statistics.summarise([scores], name, self.groups) for name in metrics}
 
 
@@ -53,43 +55,43 @@ def as_json(report: Report) -> dict[str, Any]:
     `infinite` names the infinite metrics of a sequence."""
     return {
         "settings": report.settings,
-        "sequences": _of_estimates(report),
-        **_summaries(report.summary()),
+        "sequences": _plain_sequences(report),
+        **_plain_summaries(report.summary()),
         "reference_rows": {
-            row: {"sequences": _sequences(scores), **_summaries(report.summary(row))}
+            row: {"sequences": _plain_scores(scores), **_plain_summaries(report.summary(row))}
             for row, scores in report.reference_rows.items()
         },
         "left_out": report.left_out,
     }
 
 
-def _of_estimates(report: Report) -> dict[str, dict[str, Any]]:
-    found = _sequences(report.scores)
-    for name, own in found.items():
-        own |= {"group": report.groups[name], "notes": report.notes.get(name, [])}
+def _plain_sequences(report: Report) -> dict[str, dict[str, Any]]:
+    sequences = _plain_scores(report.scores)
+    for name, fields in sequences.items():
+        fields |= {"group": report.groups[name], "notes": report.notes.get(name, [])}
         if name in report.placements:
-            own["placement"] = report.placements[name]
-    return found
+            fields["placement"] = report.placements[name]
+    return sequences
 
 
-def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
+def _plain_scores(scores: Scores) -> dict[str, dict[str, Any]]:
     return {
         name: {
-            **finite(own.values),
-            "infinite": [metric for metric, value in own.values.items() if value == math.inf],
-            "reasons": own.reasons,
-            "diverged": own.diverged,
+            **finite(measures.values),
+            "infinite": [metric for metric, value in measures.values.items() if value == math.inf],
+            "reasons": measures.reasons,
+            "diverged": measures.diverged,
         }
-        for name, own in scores.items()
+        for name, measures in scores.items()
     }
 
 
-def _summaries(found: Mapping[str, Summary]) -> dict[str, dict[str, Any]]:
+def _plain_summaries(summaries: Mapping[str, MetricSummary]) -> dict[str, dict[str, Any]]:
     """Each statistic of all metrics."""
     names = {"mean": "mean", "median": "median", "interval": "interval", "n": "sequences"}
     names |= {"groups": "groups", "diverged": "diverged"}
     return {
-        key: finite({metric: getattr(of, field) for metric, of in found.items()})
+        key: finite({metric: getattr(summary, field) for metric, summary in summaries.items()})
         for key, field in names.items()
     }
 
@@ -104,33 +106,39 @@ def from_json(content: Mapping[str, Any]) -> Report:
     or `ArithmeticError` for content with another structure, such as a text in the place of a
     number."""
     settings, sequences = content["settings"], content["sequences"]
-    known = [isinstance(settings[x], str) for x in ("dataset", "split", "estimator", "alignment")]
-    known += [math.isfinite(settings["recordings"][name]) for name in sequences]
-    if not sequences or not all(known) or not isinstance(settings["filter"], dict):
+    texts = [settings[name] for name in ("dataset", "split", "estimator", "alignment")]
+    valid = [isinstance(text, str) for text in texts]
+    valid += [math.isfinite(settings["recordings"][name]) for name in sequences]
+    if not sequences or not all(valid) or not isinstance(settings["filter"], dict):
         raise ValueError
-    rows = {row: of["sequences"] for row, of in content["reference_rows"].items()}
+    rows = {name: row["sequences"] for name, row in content["reference_rows"].items()}
+    notes = {name: [*map(str, fields["notes"])] for name, fields in sequences.items()}
+    placements = {name: fields.get("placement") for name, fields in sequences.items()}
     report = Report(
         settings,
-        _scores(sequences),
-        {row: _scores(own) for row, own in rows.items()},
-        {name: str(own["group"]) for name, own in sequences.items()},
-        {name: [*map(str, own["notes"])] for name, own in sequences.items() if own["notes"]},
+        _scores_of(sequences),
+        {name: _scores_of(row) for name, row in rows.items()},
+        {name: str(fields["group"]) for name, fields in sequences.items()},
+        {name: lines for name, lines in notes.items() if lines},
         {name: str(reason) for name, reason in content["left_out"].items()},
-        {n: str(own["placement"]) for n, own in sequences.items() if "placement" in own},
+        {name: str(text) for name, text in placements.items() if text is not None},
     )
-    again = {row: _sequences(own) for row, own in report.reference_rows.items()}
-    if (_of_estimates(report), again, report.left_out) != (sequences, rows, content["left_out"]):
+    plain_rows = {name: _plain_scores(scores) for name, scores in report.reference_rows.items()}
+    plain = _plain_sequences(report), plain_rows, report.left_out
+    if plain != (sequences, rows, content["left_out"]):
         raise ValueError
     return report
 
 
-def _scores(sequences: Mapping[str, Any]) -> dict[str, Measures]:
-    """The inverse of `_sequences`."""
+def _scores_of(sequences: Mapping[str, Any]) -> dict[str, Measures]:
+    """The inverse of `_plain_scores`."""
     scores = {}
-    for name, own in sequences.items():
-        found = {metric: own[metric] for metric in own if metric not in BESIDE}
-        values = {metric: None if x is None else float(x) for metric, x in found.items()}
-        values |= dict.fromkeys(own["infinite"], math.inf)
-        reasons = {metric: str(reason) for metric, reason in own["reasons"].items()}
-        scores[name] = Measures(values, reasons, bool(own["diverged"]))
+    for sequence, fields in sequences.items():
+        figures = {metric: fields[metric] for metric in fields if metric not in OTHER_FIELDS}
+        values = {
+            metric: None if value is None else float(value) for metric, value in figures.items()
+        }
+        values |= dict.fromkeys(fields["infinite"], math.inf)
+        reasons = {metric: str(reason) for metric, reason in fields["reasons"].items()}
+        scores[sequence] = Measures(values, reasons, bool(fields["diverged"]))
     return scores

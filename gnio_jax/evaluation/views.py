@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.evaluation.estimate import Estimate, in_one_frame
+from gnio_jax.evaluation.estimate import SequenceEstimate, in_one_frame
 from gnio_jax.evaluation.infer import Displacements
 from gnio_jax.evaluation.metrics import Filtered
 from gnio_jax.evaluation.trajectory import Alignment, positions_at
@@ -36,7 +36,7 @@ class View(NamedTuple):
     filtered: Filtered
     waypoints: Waypoints
     """Waypoints, at times from the start; none if the sequence has poses."""
-    passed: Float[np.ndarray, "k 2"]
+    at_waypoints: Float[np.ndarray, "k 2"]
     """Horizontal position of the estimate at the times of the waypoints, m."""
 
     @property
@@ -45,36 +45,36 @@ class View(NamedTuple):
         return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
 
     @property
-    def known(self) -> bool:
+    def has_reference(self) -> bool:
         """Whether there is a reference."""
         return bool(np.isfinite(self.reference).any())
 
     @property
     def errors(self) -> Float[np.ndarray, "_"]:
         """Horizontal errors where there is a reference, or at the waypoints, m."""
-        if not self.known:
-            return np.linalg.norm(self.passed - self.waypoints.position, axis=1)
+        if not self.has_reference:
+            return np.linalg.norm(self.at_waypoints - self.waypoints.position, axis=1)
         error = (self.position - self.reference)[finite_rows(self.reference), :2]
         return np.linalg.norm(error, axis=1)
 
 
-def make_view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
+def make_view(estimate: SequenceEstimate, alignment: Alignment | None = "origin") -> View:
     """An estimate in the frame of its reference; without an `alignment` the reference is moved to
     the start of the estimate."""
-    seen = in_one_frame(estimate, alignment)
-    rows = len(seen.trajectory.time)
+    aligned = in_one_frame(estimate, alignment)
+    rows = len(aligned.trajectory.time)
     none, blank = np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan)
-    begin = seen.trajectory.time[0]
-    stamps, places = seen.waypoints or Waypoints(np.zeros(0), np.zeros((0, 2)))
+    begin = aligned.trajectory.time[0]
+    stamps, positions = aligned.waypoints or Waypoints(np.zeros(0), np.zeros((0, 2)))
     return View(
-        seen.name,
-        seen.trajectory.time - begin,
-        seen.trajectory.position,
-        seen.reference.position,
-        seen.displacements or Displacements(none, blank),
-        seen.filtered or Filtered(blank, none[:, 0], none[:, 0]),
-        Waypoints(stamps - begin, places),
-        positions_at(seen.trajectory, stamps),
+        aligned.name,
+        aligned.trajectory.time - begin,
+        aligned.trajectory.position,
+        aligned.reference.position,
+        aligned.displacements or Displacements(none, blank),
+        aligned.filtered or Filtered(blank, none[:, 0], none[:, 0]),
+        Waypoints(stamps - begin, positions),
+        positions_at(aligned.trajectory, stamps),
     )
 
 
@@ -93,8 +93,8 @@ class Ellipses(NamedTuple):
 def ellipses(covariance: Float[np.ndarray, "n 3 3"]) -> Ellipses:
     """The contours of the horizontal parts of covariances of positions, m²."""
     horizontal = covariance[:, :2, :2]
-    known = finite_rows(horizontal.reshape(-1, 4))
-    variance, axes = np.linalg.eigh(np.where(known[:, None, None], horizontal, np.eye(2)))
+    finite = finite_rows(horizontal.reshape(-1, 4))
+    variance, axes = np.linalg.eigh(np.where(finite[:, None, None], horizontal, np.eye(2)))
     minor, major = SIGMAS * np.sqrt(np.maximum(variance, 0.0)).T
     angle = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
-    return Ellipses(*(np.where(known, part, np.nan) for part in (major, minor, angle)))
+    return Ellipses(*(np.where(finite, part, np.nan) for part in (major, minor, angle)))

@@ -22,7 +22,7 @@ from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.folder import read_views
-from gnio_jax.evaluation.statistics import Cell, Summary
+from gnio_jax.evaluation.statistics import Cell, MetricSummary
 from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments
@@ -175,7 +175,7 @@ def _over_seeds(name: str, rows: list[Float[np.ndarray, "_"]]) -> dict[str, list
     """A figure of this table alone, for each row with its seeds."""
     means = [float(np.mean(values)) if len(values) else None for values in rows]
     summaries = [
-        Summary(mean, values.tolist(), None, None, 0, 0, 0, len(values))
+        MetricSummary(mean, values.tolist(), None, None, 0, 0, 0, len(values))
         for mean, values in zip(means, rows, strict=True)
     ]
     return {name: [Cell(summary, None) for summary in summaries]}
@@ -234,8 +234,8 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[RowResult
     for result in results:
         report = result.reports[0]
         views = read_views(result.folders[0], report)
-        runs.append(page.of_report(report, views, name=result.row.label))
-    available = [view.name for view in runs[0].views if view.known]
+        runs.append(page.describe_report(report, views, name=result.row.label))
+    available = [view.name for view in runs[0].views if view.has_reference]
     names = _words(options.sequences) if options.sequences else available[:8]
     for name in names:
         if name not in available:

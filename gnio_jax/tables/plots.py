@@ -43,8 +43,8 @@ def table(experiment: Experiment, results: list[RowResult], ates: list[Cell]) ->
     panels = np.atleast_1d(figure.subplots(1, len(ratios), sharey=True, width_ratios=ratios))
     measured_axes, names = panels[0], []
     for index, (result, (mean, _)) in enumerate(zip(results, ates, strict=True)):
-        lost = statistics.lost(result.seeds)
-        values_of = statistics.values(result.seeds, "ate")
+        lost = statistics.count_divergences(result.seeds)
+        values_of = statistics.collect_values(result.seeds, "ate")
         sequences = [values.mean() for name, values in values_of.items() if name not in lost]
         labels = ("sequence", "seed, mean over sequences") if index == 0 else (None, None)
         measured_axes.barh(index, mean.mean or 0.0, color=drawing.GREEN, alpha=0.35, height=0.6)

@@ -34,8 +34,8 @@ from gnio_jax.config import (
 )
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Displacements, Estimate, Trajectory
-from gnio_jax.evaluation.estimate import Inputs
+from gnio_jax.evaluation import Displacements, SequenceEstimate, Trajectory
+from gnio_jax.evaluation.estimate import FilterInputs
 from gnio_jax.evaluation.prepare import Start, prepare
 from gnio_jax.filtering.settings import free_parameters
 from gnio_jax.filtering.state import GYRO_BIAS
@@ -143,7 +143,7 @@ def estimate(error, std):
     path = Trajectory(np.arange(rows), np.zeros((rows, 3)), np.zeros((rows, 4)))
     before = np.full((2, 3), np.nan)
     value, std = (np.concatenate([before, each]) for each in (1.0 + error, std))
-    return Estimate("walk", path, path, Displacements(value, uncorrelated(std)))
+    return SequenceEstimate("walk", path, path, Displacements(value, uncorrelated(std)))
 
 
 def uncorrelated(std):
@@ -235,7 +235,7 @@ def test_displacements_and_truth_are_those_of_their_times(run, splits_read, tmp_
             value[row] = Rotation.from_euler("z", -yaw).apply(step)
         value += 0.01 * random.standard_normal(value.shape)
         rows = Displacements(value, np.tile(1e-4 * np.eye(3), (len(value), 1, 1)))
-        estimates.append(Estimate(recording.name, path, path, rows))
+        estimates.append(SequenceEstimate(recording.name, path, path, rows))
 
     def unfitted(walks, windows, settings, *_):
         inputs.append(walks)
@@ -301,7 +301,7 @@ def walks_and_truth():
     given = Displacements(
         runs.displacement, uncorrelated(np.full_like(runs.displacement, SIGMA / 3))
     )
-    return Inputs(start, runs.gyro, runs.accel, None, given), runs.position
+    return FilterInputs(start, runs.gyro, runs.accel, None, given), runs.position
 
 
 def fit(walks, settings, **options):

@@ -13,7 +13,7 @@ from gnio_jax.calibration.comparison import Change, Effect
 from gnio_jax.calibration.fit import Considered, Fit
 from gnio_jax.commands import app
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings
-from gnio_jax.evaluation import Displacements, Estimate, Recording, Trajectory
+from gnio_jax.evaluation import Displacements, PreparedRecording, SequenceEstimate, Trajectory
 from gnio_jax.evaluation.prepare import Start
 from gnio_jax.filtering.settings import filter_config
 from tests.support.filter_settings import changed
@@ -28,7 +28,9 @@ def recording(name, time, position, rotation, gyro, accel, start):
     quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1, axis=1)
     reference = Trajectory(time, position, quaternion)
     nothing = np.full((1, 3), np.nan)
-    return Recording(name, name, "", time, gyro, accel, None, start, None, reference, nothing, ())
+    return PreparedRecording(
+        name, name, "", time, gyro, accel, None, start, None, reference, nothing, ()
+    )
 
 
 def simulated():
@@ -103,7 +105,9 @@ def along_x(speeds, diverged=()):
     for number, speed in enumerate(speeds):
         position = time[:, None] * [1.0, 0.0, 0.0]
         path = np.where((time[:, None] > 5) & (number in diverged), np.nan, speed * position)
-        yield Estimate("walk", *(Trajectory(time, points, level) for points in (path, position)))
+        yield SequenceEstimate(
+            "walk", *(Trajectory(time, points, level) for points in (path, position))
+        )
 
 
 def test_a_mean_is_over_the_walks_on_which_neither_filter_diverges(monkeypatch):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gnio_jax.config import TrainConfig
-from gnio_jax.evaluation import Estimate, Trajectory, folder, page
+from gnio_jax.evaluation import SequenceEstimate, Trajectory, folder, page
 from gnio_jax.evaluation.views import ellipses, make_view
 from tests.support.estimates import SETTINGS, estimate, reported, with_covariance
 
@@ -19,7 +19,7 @@ EVIL = "</script><script>alert('x')</script><b onmouseover=alert(1)>&amp; $$x$$"
 
 def run_of(estimates, *more, **named):
     made = reported(estimates, notes={estimates[0].name: ["start: rough"]})
-    return page.of_report(made, [make_view(each) for each in estimates], *more, **named)
+    return page.describe_report(made, [make_view(each) for each in estimates], *more, **named)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,9 @@ def walks():
 @pytest.fixture(scope="module")
 def runs(walks):
     summed = [
-        Estimate(e.name, e.trajectory._replace(position=1.1 * e.trajectory.position), e.reference)
+        SequenceEstimate(
+            e.name, e.trajectory._replace(position=1.1 * e.trajectory.position), e.reference
+        )
         for e in walks
     ]
     ours = run_of(walks, "gnio evaluate --workdir 'a b'", "seed: 3")
@@ -51,7 +53,7 @@ def test_thinned_curves_keep_the_largest_innovation(walks):
     nis = np.full(400, 2.0)
     nis[[0, 201]], nis[3:6] = [np.nan, 70.0], np.nan
     seen = make_view(walks[0]._replace(filtered=walks[0].filtered._replace(nis=nis)))
-    found = page.columns(seen, 150)
+    found = page.make_columns(seen, 150)
     assert len(found["time"]) == 134 and found["time"][1] == pytest.approx(0.3)
     np.testing.assert_allclose(found["x"][:3], seen.position[:9:3, 0], rtol=1e-6)
     assert found["nis"][67] == 70.0 and found["nis"][0] == 2.0 and np.isnan(found["nis"][1])
@@ -107,7 +109,7 @@ def test_the_page_is_one_file_that_loads_nothing(written, runs):
 
 def test_without_a_reference_nothing_is_called_an_error(estimates):
     run = run_of([estimates[2]._replace(name="a<b_c-d e")])
-    run = run._replace(warnings=("it <moves>",), about={"weights": "of walks"})
+    run = run._replace(warnings=("it <moves>",), facts={"weights": "of walks"})
     text = page.render("blind", [run])
     assert text.count("of walks") == 1 and "warning: it &lt;moves&gt;" in text
     assert text.index("it &lt;moves&gt;") < text.index('class="figures"') < text.index("of walks")
@@ -141,13 +143,13 @@ def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
     (tmp_path / "broken" / "metrics.json").write_text("{")
     found = folder.read_others(tmp_path / "ours", settings)
     assert [*found] == ["again", "integrate, device orientation"]
-    first = page.of_report(*found["again"])
+    first = page.describe_report(*found["again"])
     assert first.figures == {name: own.values for name, own in made.scores.items()}
     seen = {view.name: view for view in first.views}
     whole = make_view(estimates[0])
     np.testing.assert_allclose(seen["room 1/walk"].position, whole.position, atol=1e-6)
     np.testing.assert_allclose(seen["room 1/walk"].reference, whole.reference, atol=1e-8)
-    assert not seen["blind"].known and first.remarks[0] == "blind: start: rough"
+    assert not seen["blind"].has_reference and first.remarks[0] == "blind: start: rough"
     assert first.summary["never moves"]["path_length_ratio"] == 0
 
 

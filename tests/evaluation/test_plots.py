@@ -105,7 +105,7 @@ def test_one_picture_for_each_sequence(tmp_path, estimates, made):
     assert pictures.keys() == {"error_cdf.png", "room_1_walk.png", "room_1_walk_.png"}
     assert all(each.startswith(b"\x89PNG") for each in pictures.values())
     seen = make_view(estimates[0])._replace(name="a$x^$\udcff")  # of any bytes, and short
-    kept = (x for x in seen._fields if x not in ("name", "waypoints", "passed"))
+    kept = (x for x in seen._fields if x not in ("name", "waypoints", "at_waypoints"))
     parts = {x: jax.tree.map(lambda rows: rows[:3], getattr(seen, x)) for x in kept}
     assert np.isnan(plots.speed(parts["position"], 0.1)).all()
     drawing.save(tmp_path / "p.png", plots.sequence(seen._replace(**parts)))
@@ -118,7 +118,7 @@ def test_rows_side_by_side():
     seeds = ({"a": 1.0, "b": 5.0}, {"a": 3.0, "b": 7.0})
     first = [report_of(ates, groups) for ates in seeds]
     second = [report_of({"a": LOST, "b": 2.0, "c": 4.0}, groups)]
-    figure = plots.paired({"a$x^$": first, "_under": second, "\udcff_x": second}, "ate")
+    figure = plots.sequence_dots({"a$x^$": first, "_under": second, "\udcff_x": second}, "ate")
     (axes,) = figure.axes
     assert axes.get_xlabel() == "ATE (m)" and axes.get_title() == "synthetic test"
     ticks = [label.get_text() for label in axes.get_yticklabels()]

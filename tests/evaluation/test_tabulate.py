@@ -6,7 +6,7 @@ from rich.console import Console
 
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.metrics import OF_WAYPOINTS
-from gnio_jax.evaluation.statistics import Cell, Difference, Summary
+from gnio_jax.evaluation.statistics import Cell, Difference, MetricSummary
 
 
 def text(report, width=80):
@@ -71,14 +71,14 @@ def test_a_difference_has_the_digits_of_its_interval_and_a_mean_its_seeds():
     assert tabulate.difference(found, 1) == "+0.0045 (+0.0021 to +0.0071)"
     assert tabulate.difference(found._replace(interval=None, sequences=3), 1) == "+0.0045 over 2"
     assert tabulate.difference(found._replace(mean=None, withheld=True), 1) == "– ‡"
-    mean = Summary(2.25, [1.5, 3.0], 2.0, None, 3, 2, 0, 8)
+    mean = MetricSummary(2.25, [1.5, 3.0], 2.0, None, 3, 2, 0, 8)
     assert tabulate.mean(mean, 2) == "2.25 ± 1.06"
     assert tabulate.mean(mean._replace(seeds=[2.25], diverged=1), 2) == "2.25 † 1/8"
     assert tabulate.mean(mean._replace(mean=None, seeds=[]), 2) == "–"
 
 
 def test_marks_are_explained():
-    mean = Summary(1.0, [1.0], 1.0, None, 3, 2, 0, 3)
+    mean = MetricSummary(1.0, [1.0], 1.0, None, 3, 2, 0, 3)
     less = Difference(-1, (-2, 0), 50, 2, 3, 3, 2)
     withheld = Difference(None, None, None, 0, 3, 3, 1, True)
     for cell, beginnings in (

@@ -6,7 +6,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate, Filtered, metrics
+from gnio_jax.evaluation import Filtered, SequenceEstimate, metrics
 from gnio_jax.evaluation.estimate import in_one_frame
 from gnio_jax.evaluation.trajectory import (
     Undefined,
@@ -38,7 +38,7 @@ def test_a_covariance_is_turned_with_its_trajectory():
     turned = Rotation.from_euler("z", 2.0).apply(spread.reshape(-1, 3)).reshape(spread.shape)
     wanted = np.einsum("nki,nkj->nij", turned, turned)
     filtered = Filtered(before, *np.full((2, len(before)), np.nan))
-    found = Estimate("walk", estimate, truth, filtered=filtered)
+    found = SequenceEstimate("walk", estimate, truth, filtered=filtered)
     covariance = in_one_frame(found).filtered.covariance
     np.testing.assert_allclose(covariance, wanted, atol=1e-9)
     assert in_one_frame(found, "none").filtered.covariance is before

@@ -207,20 +207,20 @@ def test_picture_and_page_show_where_the_estimate_is_at_the_waypoints(unseen_one
     seen = make_view(unseen_ones[0])
     aligned = in_one_frame(unseen_ones[0]).trajectory
     passed = positions_at(aligned, unseen_ones[0].waypoints.time)
-    np.testing.assert_allclose(seen.passed, passed)
+    np.testing.assert_allclose(seen.at_waypoints, passed)
     rms = np.sqrt(np.mean(seen.errors**2))
     assert rms == pytest.approx(made.scores["a/b"].values["waypoint_rms"])
     plan, error = plots.sequence(seen).axes[:2]
     lines = [line.get_xydata() for line in plan.lines]
-    joined = np.stack([seen.waypoints.position, seen.passed], 1)
+    joined = np.stack([seen.waypoints.position, seen.at_waypoints], 1)
     assert all(any(np.array_equal(ends, line) for line in lines) for ends in joined)
     (marks,) = (line for line in error.lines if line.get_label() == "at waypoints")
     np.testing.assert_array_equal(marks.get_ydata(), seen.errors)
     of_all = plots.error_cdf([make_view(each) for each in unseen_ones], made)
     assert "rms at waypoints" in of_all.axes[1].get_xlabel()
-    found = page.columns(seen, 150)  # of the page, each waypoint once
+    found = page.make_columns(seen, 150)  # of the page, each waypoint once
     rows = np.flatnonzero(np.isfinite(found["waypoint_x"]))
     np.testing.assert_allclose(found["time"][rows], seen.waypoints.time, atol=0.15)
     np.testing.assert_allclose(found["waypoint_error"][rows], seen.errors, rtol=1e-6)
-    corners = page.frame([page.Run("x", {}, [seen], {})], "a/b")
+    corners = page.frame([page.PageRun("x", {}, [seen], {})], "a/b")
     assert corners["x"][0] <= seen.waypoints.position[:, 0].min()

@@ -5,9 +5,9 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.evaluation import (
     Displacements,
-    Estimate,
     Filtered,
     Report,
+    SequenceEstimate,
     States,
     Trajectory,
     never_moves,
@@ -47,7 +47,7 @@ def estimate(name, seed, n=400, truth=True):
     covariance = np.tile(0.3**2 * np.eye(3), (n, 1, 1))
     spread = 0.03 * np.sqrt(np.arange(n) + 1)
     accepted = np.where(np.arange(n) < 11, np.nan, (np.arange(n) % 10 > 0).astype(float))
-    return Estimate(
+    return SequenceEstimate(
         name,
         Trajectory(time, moved, orientation),
         reference,

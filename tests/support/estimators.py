@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import evaluation
 from gnio_jax.config import DataConfig, FilterSettings
-from gnio_jax.evaluation import given_displacements, infer, no_displacements, perfect, prepare
+from gnio_jax.evaluation import infer, no_displacements, perfect, prepare, reference_displacements
 from gnio_jax.evaluation.estimate import PERFECT_STD
 from gnio_jax.filtering import filter_setup
 from gnio_jax.models import Network
@@ -83,7 +83,7 @@ def imu_only(recordings, config=CONFIG, options=OPTIONS):
 
 def with_truth(recordings, config=CONFIG, options=OPTIONS, filtered=True, **how):
     """The filter, or the sum of displacements, with those of the reference."""
-    truth = [given_displacements(each, PERFECT_STD) for each in recordings]
+    truth = [reference_displacements(each, PERFECT_STD) for each in recordings]
     ekf = perfect(filter_setup(config, options)) if filtered else None
     return evaluation.estimate(recordings, truth, config, ekf, **how)
 

@@ -7,7 +7,7 @@ import pytest
 from gnio_jax import config as configuration
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept, report
+from gnio_jax.evaluation import report, reuse
 from gnio_jax.evaluation.folder import read
 from gnio_jax.reporting import Lines
 from gnio_jax.training import checkpoint
@@ -40,15 +40,15 @@ def evaluation(run, **settings):
 
 
 def look(run, **options):
-    return kept.look(EvaluateConfig(str(run), plots=False, **options))
+    return reuse.find_existing(EvaluateConfig(str(run), plots=False, **options))
 
 
 def test_what_is_there_is_taken(run, monkeypatch):
     folder = evaluation(run)
     found = look(run)
     assert (found.folder, found.problem) == (folder, "")
-    monkeypatch.setattr(kept, "evaluate", None)
-    assert kept.made(found, Lines()) == read(folder)
+    monkeypatch.setattr(reuse, "evaluate", None)
+    assert reuse.load_or_evaluate(found, Lines()) == read(folder)
     (run / "checkpoints" / "best" / "7").rmdir()
     with pytest.raises(InputError, match="holds no checkpoint"):
         look(run)
@@ -71,11 +71,11 @@ def test_what_means_something_else_is_made_anew(run, monkeypatch, settings, prob
         made.append(config)
         evaluation(run)
 
-    monkeypatch.setattr(kept, "evaluate", evaluate)
+    monkeypatch.setattr(reuse, "evaluate", evaluate)
     monkeypatch.setattr(Lines, "line", lambda self, text: lines.append(text))
     found = look(run)
     assert problem in found.problem and found.report is None
-    assert kept.made(found, Lines()) == read(folder) and len(made) == 1
+    assert reuse.load_or_evaluate(found, Lines()) == read(folder) and len(made) == 1
     assert made[0].filter == BASE.filter and problem in lines[0]
     assert look(run).problem == ""
     (folder / "metrics.json").write_text("{}")
@@ -111,7 +111,7 @@ def test_a_run_whose_filter_was_trained_is_restored_once(run, monkeypatch):
         evaluation(folder, filter=configuration.plain(own.config.filter))
 
     folder = run
-    monkeypatch.setattr(kept, "evaluate", evaluate)
-    kept.made(look(run), Lines())
+    monkeypatch.setattr(reuse, "evaluate", evaluate)
+    reuse.load_or_evaluate(look(run), Lines())
     assert given == [(own.config.filter, own)] and restored == [(run, "best")]
     assert look(run).run is None  # nothing is left to be made

@@ -1,4 +1,4 @@
-"""Evaluations that a run has already, and whether they may replace new ones."""
+"""Existing evaluations of runs, which are used again if they are the requested ones."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ IDENTITY = ("dataset", "data_root", "split", "alignment")
 """Settings that two evaluations must share to have the same recordings and errors."""
 
 
-class Kept(NamedTuple):
-    """A requested evaluation of a run, and whether it has to be made."""
+class RequestedEvaluation(NamedTuple):
+    """A requested evaluation of a run, with its figures if they exist."""
 
     config: EvaluateConfig
     """The request, as `evaluate.resolve` completes it."""
     folder: Path
     report: Report | None
-    """The existing report, if it is the requested one."""
+    """The figures, if they exist."""
     problem: str
-    """The reason why it has to be made; empty if it exists."""
+    """The reason why the run has to be evaluated; empty if the figures exist."""
     run: Any = None
-    """The `training.checkpoint.Run`, if it is loaded already and the evaluation has to be made."""
+    """The `training.checkpoint.Run`, if it is loaded already and has to be evaluated."""
 
 
-def look(config: EvaluateConfig) -> Kept:
-    """The evaluation of a run that `config` asks for, with the run's own filter.
+def find_existing(config: EvaluateConfig) -> RequestedEvaluation:
+    """Find the figures of a run that match `config`, with the run's own filter.
 
-    Raises `InputError` for one that does not exist and cannot be made.
+    Raises `InputError` if they do not exist and the run cannot be evaluated.
     """
     workdir, run = Path(config.workdir or ""), None
     trained = configuration.load(workdir / "config.yaml")
@@ -49,39 +49,42 @@ def look(config: EvaluateConfig) -> Kept:
     if (folder / "metrics.json").exists():
         try:
             report = read(folder)
-            problem = _differs(report, config) or out_of_date(report, workdir)
+            problem = _find_difference(report, config) or find_missing_step(report, workdir)
         except InputError as error:
             problem = f"its figures cannot be used: {error}"
     best = workdir / "checkpoints" / config.checkpoint
     if problem and not any(best.glob("[0-9]*")):
         raise InputError(best, "holds no checkpoint", "let gnio train finish its first epoch")
-    return Kept(config, folder, None, problem, run) if problem else Kept(config, folder, report, "")
+    if problem:
+        return RequestedEvaluation(config, folder, None, problem, run)
+    return RequestedEvaluation(config, folder, report, "")
 
 
-def made(kept: Kept, reporter: Reporter, workers: int = 1) -> Report:
-    """The evaluation, which is made if necessary."""
-    if kept.report is not None:
-        return kept.report
-    config = kept.config
+def load_or_evaluate(request: RequestedEvaluation, reporter: Reporter, workers: int = 1) -> Report:
+    """The existing figures, or those of a new evaluation."""
+    if request.report is not None:
+        return request.report
+    config = request.config
     run = Path(config.workdir or "").name
-    reporter.line(f"evaluating {run} on {config.split} ({config.estimator}): {kept.problem}")
-    evaluate(config, reporter, workers, run=kept.run)
-    return read(kept.folder)
+    reporter.line(f"evaluating {run} on {config.split} ({config.estimator}): {request.problem}")
+    evaluate(config, reporter, workers, run=request.run)
+    return read(request.folder)
 
 
-def out_of_date(report: Report, workdir: Path) -> str:
-    """The reason why the figures are not those of the run in `workdir`; empty if they are."""
-    step, which = report.settings.get("step"), report.settings.get("checkpoint")
-    if step is not None and not (workdir / "checkpoints" / str(which) / str(step)).is_dir():
+def find_missing_step(report: Report, workdir: Path) -> str:
+    """The reason why the figures are not of a checkpoint of the run in `workdir`; empty if they
+    are."""
+    step, name = report.settings.get("step"), report.settings.get("checkpoint")
+    if step is not None and not (workdir / "checkpoints" / str(name) / str(step)).is_dir():
         return "its figures are of a checkpoint that the run has no more"
     return ""
 
 
-def _differs(report: Report, config: EvaluateConfig) -> str:
+def _find_difference(report: Report, config: EvaluateConfig) -> str:
     """The reason why the figures are not the requested ones; empty if they are."""
     for name in IDENTITY:
-        if (own := report.settings.get(name)) != (wanted := getattr(config, name)):
-            return f"its figures are of {name.replace('_', ' ')} {own}, not {wanted}"
+        if (value := report.settings.get(name)) != (request := getattr(config, name)):
+            return f"its figures are of {name.replace('_', ' ')} {value}, not {request}"
     if config.estimator != "integrate" and report.settings["filter"] != plain(config.filter):
         return "its figures are of another filter than the run's"
     return ""
