@@ -19,8 +19,8 @@ from scipy.optimize import OptimizeResult
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import calibration, data, filtering, models
-from gnio_jax.calibration import evidence
 from gnio_jax.calibration import fit as fitting
+from gnio_jax.calibration import predictions
 from gnio_jax.calibration import run as calibrating
 from gnio_jax.commands import app
 from gnio_jax.config import (
@@ -156,11 +156,11 @@ def test_the_factors_are_those_of_the_errors():
     error = std * np.array([1.5, 0.5, 3.0]) * rng.choice([-1.0, 1.0], (400, 3))
     truth = np.ones((400, 3))
     truth[:50, 1] = np.nan
-    found = fitting.std_factors([estimate(error, std)], [truth])
+    found = fitting.fit_std_factors([estimate(error, std)], [truth])
     np.testing.assert_allclose(found, [1.5, 0.5, 3.0], rtol=1e-12)
     with pytest.raises(ValueError, match="10 windows have a reference"):
         truth[:390] = np.nan
-        fitting.std_factors([estimate(error, std)], [truth])
+        fitting.fit_std_factors([estimate(error, std)], [truth])
 
 
 @pytest.fixture(scope="module")
@@ -180,11 +180,11 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(
     def asked_about(prepared, network, *_, **__):
         return [(each.name, network.variables) for each in prepared]
 
-    monkeypatch.setattr(evidence, "estimate", asked_about)
+    monkeypatch.setattr(predictions, "estimate", asked_about)
     loaded = checkpoint.load_run(run)
     config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
-    split, asked = evidence.sources(loaded, config)
-    found = evidence.gather(split, asked, config, loaded.config.filter, lambda *_: None, 1)
+    split, asked = predictions.choose_networks(loaded, config)
+    found = predictions.predict(split, asked, config, loaded.config.filter, lambda *_: None, 1)
     assert splits_read == ["train"] and len(found.estimates) == WALKS
     fold_of = data.folds(data.load("synthetic", None, "train"), 2)
     assert sorted(set(fold_of.values())) == [0, 1]
@@ -196,7 +196,7 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(
 
 def test_the_network_of_every_fold_is_averaged_over_headings(run, fold_runs):
     config = CalibrateConfig(str(run), out_of_fold=tuple(fold_runs), average_headings=True)
-    _, networks = evidence.sources(evidence.load_run(run, config), config)
+    _, networks = predictions.choose_networks(predictions.load_run(run, config), config)
     for source in networks:
         assert source.run.config.model.equivariance == "four_headings"
 
@@ -208,11 +208,11 @@ def test_walks_without_a_reference_are_left_out_and_raw_gyros_start_wide(run, mo
     raw = {**walks[1].attributes, "imu_compensated": "no"}
     walks[1] = walks[1]._replace(attributes=raw)
     monkeypatch.setattr(data, "load", lambda *_: walks)
-    monkeypatch.setattr(evidence, "estimate", lambda prepared, *_, **__: prepared)
+    monkeypatch.setattr(predictions, "estimate", lambda prepared, *_, **__: prepared)
     loaded, config = checkpoint.load_run(run), CalibrateConfig(str(run))
     settings = dataclasses.replace(loaded.config.filter, raw_gyro_bias=0.05)
-    split, networks = evidence.sources(loaded, config)
-    recordings, _ = evidence.gather(split, networks, config, settings, lambda *_: None, 1)
+    split, networks = predictions.choose_networks(loaded, config)
+    recordings, _ = predictions.predict(split, networks, config, settings, lambda *_: None, 1)
     assert [recording.name for recording in recordings] == [walk.name for walk in walks[1:]]
     stds = [recording.start.level_gyro_bias for recording in recordings]
     assert stds == [0.05, settings.start.gyro_bias]
@@ -239,16 +239,16 @@ def test_displacements_and_truth_are_those_of_their_times(run, splits_read, tmp_
 
     def unfitted(walks, windows, settings, *_):
         inputs.append(walks)
-        return fitting.Fit(settings, 0.0, 0.0, 1)
+        return fitting.InnovationFit(settings, 0.0, 0.0, 1)
 
-    def filtered_positions(*arguments):
-        positions.append(fitting.filtered_positions(*arguments))
+    def compare_positions(*arguments):
+        positions.append(fitting.compare_positions(*arguments))
         return positions[0]
 
-    pairs = evidence.Evidence(recordings, estimates)
-    monkeypatch.setattr(calibrating, "gather", lambda *_: pairs)
+    pairs = predictions.Predictions(recordings, estimates)
+    monkeypatch.setattr(calibrating, "predict", lambda *_: pairs)
     monkeypatch.setattr(calibrating, "fit_innovations", unfitted)
-    monkeypatch.setattr(calibrating, "filtered_positions", filtered_positions)
+    monkeypatch.setattr(calibrating, "compare_positions", compare_positions)
     calibration.calibrate(CalibrateConfig(str(run), out=str(tmp_path / "calibrated")))
     for value, walk in zip(inputs[0].given.value, estimates, strict=True):
         for interval in (CLONES, 100, STRIDES - 1):
@@ -272,7 +272,7 @@ def test_folds_that_do_not_make_a_whole_are_refused(run, splits_read, fold_runs)
     other = dataclasses.replace(loaded.config.model, width=5)
     changed = loaded._replace(config=dataclasses.replace(loaded.config, model=other))
     with pytest.raises(InputError, match="fold0: differs from the calibrated run in 'model'"):
-        evidence.sources(changed, config)
+        predictions.choose_networks(changed, config)
 
 
 PATHS = (*fitting.GROUPS["measurement"], *fitting.GROUPS["noise"], *fitting.GROUPS["window"])
@@ -344,7 +344,7 @@ def test_noises_are_fitted_with_the_whole_bias_of_a_raw_gyro_uncertain(raw, expe
     walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
     walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
     config = fitting.innovation_config(DATA, settings)
-    starts = fitting._wide_start(walk, settings), fitting.evaluated_start(walk.start, settings)
+    starts = fitting._wide_start(walk, settings), fitting.apply_start_settings(walk.start, settings)
     states = (start.state(config) for start in starts)
     spreads = (
         np.sqrt(np.linalg.eigvalsh(state.core_covariance[GYRO_BIAS, GYRO_BIAS])) for state in states
@@ -414,7 +414,9 @@ def test_searches_that_ended_too_early_are_told_of(monkeypatch, searches, proble
 def test_values_outside_what_is_physical_are_named():
     noise = {"accel_bias_walk": 2.656, "correlation": CorrelatedError(0.9999, 5.9e4)}
     names = ("noise.gyro_density", "noise.accel_bias_walk", "noise.correlation.share")
-    told = fitting.unphysical(changed(TRUE, noise=noise), (*names, "noise.correlation.seconds"))
+    told = fitting.find_implausible(
+        changed(TRUE, noise=noise), (*names, "noise.correlation.seconds")
+    )
     assert [line.split(" came out as ")[0] for line in told] == [
         "filter.noise.accel_bias_walk",
         "filter.noise.correlation.share",
@@ -473,7 +475,7 @@ def test_what_the_errors_were_drawn_with_is_found():
     wanted = np.array([2e-3, 2e-3, 2e-3, 0.1, np.deg2rad(8.0), 0.01])
     drawn = np.einsum("kij,kj->ki", root, rng.standard_normal((rows, 3)))
     error = drawn + np.einsum("kic,kc->ki", sensitivity, wanted * rng.standard_normal((rows, 6)))
-    positions = fitting.Positions(error, covariance, sensitivity, np.zeros((rows, 3)))
+    positions = fitting.PositionErrors(error, covariance, sensitivity, np.zeros((rows, 3)))
     options = changed(considered={"scale": 0.7, "raw_gyro_bias": 0.3})  # of an earlier calibration
     found = fitting.fit_considered(positions, 0.1, options)
     assert found.before > 2 and found.after == pytest.approx(1, abs=0.05)
@@ -487,7 +489,7 @@ def test_what_the_errors_were_drawn_with_is_found():
     with_bias = error + np.einsum("kib,kb->ki", sensitivity[:, :, :3], bias)
     # The errors of scale are larger in the raw ones, which must not change the others.
     with_bias += 0.15 * sensitivity[:, :, 3] * rng.standard_normal((rows, 1))
-    both = fitting.Positions(
+    both = fitting.PositionErrors(
         np.concatenate([error, with_bias]),
         *(np.concatenate([each, each]) for each in (covariance, sensitivity)),
         np.concatenate([0 * axis, axis]),
@@ -511,7 +513,7 @@ def test_the_prior_counts_as_many_independent_errors_as_there_are():
     covariance, sensitivity = np.tile(1e-4 * np.eye(3), (rows, 1, 1)), np.zeros((rows, 3, 6))
     sensitivity[:, 0, 5] = 1.0  # the slope alone, in metres for a unit
     found = fitting.fit_considered(
-        fitting.Positions(error, covariance, sensitivity, np.zeros((rows, 3))),
+        fitting.PositionErrors(error, covariance, sensitivity, np.zeros((rows, 3))),
         stride,
         FilterSettings(),
     )
@@ -544,16 +546,16 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     truth = truth.copy()
     options = changed(TRUE, noise={"measurement_scale": 9.0})  # σ is three times what is said
     truth[0, 300:] = np.nan
-    found = fitting.filtered_positions(walks, truth, DATA, options)
+    found = fitting.compare_positions(walks, truth, DATA, options)
     assert len(found.error) == np.isfinite(truth).all(2).sum()
     assert nees(found) == pytest.approx(1, abs=0.5)
-    off = fitting.filtered_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
+    off = fitting.compare_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
     assert nees(off) > 3 * nees(found)
 
     accel, raw = walks.accel.copy(), np.arange(WALKS) == 0
     accel[1, 100:] += 1e4
     marked = walks._replace(start=walks.start._replace(raw_gyro=raw), accel=accel)
-    some = fitting.filtered_positions(marked, truth, DATA, options)
+    some = fitting.compare_positions(marked, truth, DATA, options)
     assert np.isfinite(truth[0]).all(1).sum() < len(some.error) < len(found.error) - 100
     assert np.abs(some.error).max() < 50
     axes = np.where(raw[:, None], walks.start.rotation[:, 2], 0.0)
@@ -565,10 +567,10 @@ def test_positions_are_compared_with_the_truth_of_their_time():
 
 
 def test_no_positions_and_no_likelihood_are_named():
-    none = fitting.Positions(*(np.zeros((0, 3, *more)) for more in ((), (3,), (6,), ())))
+    none = fitting.PositionErrors(*(np.zeros((0, 3, *more)) for more in ((), (3,), (6,), ())))
     with pytest.raises(InputError, match="not healthy where these recordings have a reference"):
         fitting.fit_considered(none, 0.1, FilterSettings())
     ones = np.ones((9, 3))
-    lost = fitting.Positions(ones, np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)), ones)
+    lost = fitting.PositionErrors(ones, np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)), ones)
     with pytest.raises(InputError, match="no positive definite covariance"):
         fitting.fit_considered(lost, 0.1, FilterSettings())

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import calibration, filtering
 from gnio_jax.calibration import comparison
 from gnio_jax.calibration.comparison import Change, Effect
-from gnio_jax.calibration.fit import Considered, Fit
+from gnio_jax.calibration.fit import ConsiderFit, InnovationFit
 from gnio_jax.commands import app
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings
 from gnio_jax.evaluation import Displacements, PreparedRecording, SequenceEstimate, Trajectory
@@ -171,7 +171,10 @@ def test_an_error_that_grows_is_a_warning(metric, before, after, figures):
     ],
 )
 def test_a_group_of_fewer_than_five_recordings_is_a_warning(raw, others, few):
-    fit, worse = Fit(FilterSettings(), 0.0, 0.0, 3, ("the fit stopped",)), Change(1.0, 2.0)
+    fit, worse = (
+        InnovationFit(FilterSettings(), 0.0, 0.0, 3, ("the fit stopped",)),
+        Change(1.0, 2.0),
+    )
     result = calibration.Calibration(
         FilterSettings(),
         fit,
@@ -188,11 +191,11 @@ def test_a_group_of_fewer_than_five_recordings_is_a_warning(raw, others, few):
 
 def test_the_command_shows_what_diverged_and_what_the_recordings_are(monkeypatch, tmp_path, capsys):
     errors = {"ate": Change(3.05, 11.25), "path_length_ratio": Change(0.65, None)}
-    fit = Fit(FilterSettings(), 0.0, 0.0, 3)
+    fit = InnovationFit(FilterSettings(), 0.0, 0.0, 3)
     result = calibration.Calibration(
         FilterSettings(),
         fit,
-        Considered(FilterSettings(), 1.0, 1.0),
+        ConsiderFit(FilterSettings(), 1.0, 1.0),
         Effect(errors, Change(2, 1), 12),
         12,
         3,
