@@ -78,11 +78,11 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
         (run / name).write_text(f"{name} of the run")
     words = ["calibrate", "--workdir", str(run), "--out", str(out), "--average-headings"]
     app.main([*words, "--fit", "measurement", "noise", "window"])
-    told, warned = capsys.readouterr()
+    output, warned = capsys.readouterr()
     assert "warning: the fit stopped after 2 steps" in warned
     assert f"warning: only {WALKS} recordings without a raw gyro: fewer than 5" in warned
-    assert f"recordings: 0 with a raw gyro, {WALKS} without" in told
-    assert "noise.std_factor" in told and f"gnio evaluate --workdir {out}" in told
+    assert f"recordings: 0 with a raw gyro, {WALKS} without" in output
+    assert "noise.std_factor" in output and f"gnio evaluate --workdir {out}" in output
     assert splits_read == ["val"]
     before, after = (checkpoint.load_run(folder) for folder in (run, out))
     assert after.config.model.equivariance == "four_headings"
@@ -91,21 +91,21 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     jax.tree.map(np.testing.assert_array_equal, after.variables, before.variables)
     for name in ("splits.yaml", "metrics.jsonl"):
         assert (out / name).read_text() == f"{name} of the run"
-    found = after.config.filter
-    assert found.start == TRAINED.filter.start
-    assert found.noise.correlation.share > 0 and found.noise.std_factor[0] != 1
-    about = json.loads((out / "calibration.json").read_text())
-    likelihood = about["negative_log_likelihood_per_innovation"]
+    settings = after.config.filter
+    assert settings.start == TRAINED.filter.start
+    assert settings.noise.correlation.share > 0 and settings.noise.std_factor[0] != 1
+    record = json.loads((out / "calibration.json").read_text())
+    likelihood = record["negative_log_likelihood_per_innovation"]
     assert likelihood["after"] < likelihood["before"]
-    assert found.considered.gyro_bias > 0
-    nees = about["position_nees_per_axis"]
+    assert settings.considered.gyro_bias > 0
+    nees = record["position_nees_per_axis"]
     assert abs(np.log(nees["after"])) < abs(np.log(nees["before"]))
-    assert about["split"] == "val" and about["filter"] == plain(found)
-    assert about["recordings"] == WALKS and about["recordings_with_raw_gyro"] == 0
-    assert [f"warning: {line}" for line in about["warnings"]] == warned.splitlines()
-    change = about["trajectories"]["ate"]
-    assert f"ATE (m) │ {change['before']:.2f} │ {change['after']:.2f}" in re.sub(" +", " ", told)
-    assert change["before"] != change["after"] and "diverged" not in told
+    assert record["split"] == "val" and record["filter"] == plain(settings)
+    assert record["recordings"] == WALKS and record["recordings_with_raw_gyro"] == 0
+    assert [f"warning: {line}" for line in record["warnings"]] == warned.splitlines()
+    change = record["trajectories"]["ate"]
+    assert f"ATE (m) │ {change['before']:.2f} │ {change['after']:.2f}" in re.sub(" +", " ", output)
+    assert change["before"] != change["after"] and "diverged" not in output
 
 
 def test_a_network_is_averaged_over_four_headings_or_told_that_it_cannot_be(run):
@@ -142,7 +142,7 @@ def estimate(error, std):
     rows = len(error) + 2
     path = Trajectory(np.arange(rows), np.zeros((rows, 3)), np.zeros((rows, 4)))
     before = np.full((2, 3), np.nan)
-    value, std = (np.concatenate([before, each]) for each in (1.0 + error, std))
+    value, std = (np.concatenate([before, values]) for values in (1.0 + error, std))
     return SequenceEstimate("walk", path, path, Displacements(value, uncorrelated(std)))
 
 
@@ -156,8 +156,8 @@ def test_the_factors_are_those_of_the_errors():
     error = std * np.array([1.5, 0.5, 3.0]) * rng.choice([-1.0, 1.0], (400, 3))
     truth = np.ones((400, 3))
     truth[:50, 1] = np.nan
-    found = fitting.fit_std_factors([estimate(error, std)], [truth])
-    np.testing.assert_allclose(found, [1.5, 0.5, 3.0], rtol=1e-12)
+    factors = fitting.fit_std_factors([estimate(error, std)], [truth])
+    np.testing.assert_allclose(factors, [1.5, 0.5, 3.0], rtol=1e-12)
     with pytest.raises(ValueError, match="10 windows have a reference"):
         truth[:390] = np.nan
         fitting.fit_std_factors([estimate(error, std)], [truth])
@@ -178,17 +178,17 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(
     run, splits_read, fold_runs, monkeypatch
 ):
     def asked_about(prepared, network, *_, **__):
-        return [(each.name, network.variables) for each in prepared]
+        return [(recording.name, network.variables) for recording in prepared]
 
     monkeypatch.setattr(predictions, "estimate", asked_about)
     loaded = checkpoint.load_run(run)
     config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
-    split, asked = predictions.choose_networks(loaded, config)
-    found = predictions.predict(split, asked, config, loaded.config.filter, lambda *_: None, 1)
-    assert splits_read == ["train"] and len(found.estimates) == WALKS
+    split, networks = predictions.choose_networks(loaded, config)
+    result = predictions.predict(split, networks, config, loaded.config.filter, lambda *_: None, 1)
+    assert splits_read == ["train"] and len(result.estimates) == WALKS
     fold_of = data.folds(data.load("synthetic", None, "train"), 2)
     assert sorted(set(fold_of.values())) == [0, 1]
-    for recording, (name, variables) in zip(*found, strict=True):
+    for recording, (name, variables) in zip(*result, strict=True):
         of_fold = checkpoint.load_run(fold_runs[fold_of[recording.group]])
         network = models.Network.of(of_fold.model, of_fold.variables)
         assert recording.name == name and tiny_run.same(variables, network.variables)
@@ -298,10 +298,10 @@ def walks_and_truth():
     std = filtering.InitialStd(*np.ones((6, WALKS)))  # a fit takes that of the settings
     raw = np.zeros(WALKS, bool)
     start = Start(*runs[:3], np.zeros((WALKS, 3)), std, std.gyro_bias, raw)
-    given = Displacements(
+    displacements = Displacements(
         runs.displacement, uncorrelated(np.full_like(runs.displacement, SIGMA / 3))
     )
-    return FilterInputs(start, runs.gyro, runs.accel, None, given), runs.position
+    return FilterInputs(start, runs.gyro, runs.accel, None, displacements), runs.position
 
 
 def fit(walks, settings, **options):
@@ -310,15 +310,15 @@ def fit(walks, settings, **options):
 
 def test_the_noises_and_errors_of_simulated_walks_are_found():
     wrong = {"gyro_density": 8e-4, "accel_density": 6e-2, "correlation": CorrelatedError(0.6, 0.8)}
-    found = fit(walks_and_truth()[0], changed(TRUE, noise=wrong))
-    noise = found.settings.noise
-    assert found.after < found.before - 0.1
+    result = fit(walks_and_truth()[0], changed(TRUE, noise=wrong))
+    noise = result.settings.noise
+    assert result.after < result.before - 0.1
     assert noise.measurement_scale == pytest.approx(9.0, rel=0.15)
     assert noise.gyro_density == pytest.approx(2e-3, rel=0.4)
     assert noise.accel_density == pytest.approx(2e-2, rel=0.4)
     assert noise.correlation.share == pytest.approx(0.8, abs=0.1)
     assert noise.correlation.seconds == pytest.approx(0.5, rel=0.4)
-    assert found.warnings == () and found.steps < 60
+    assert result.warnings == () and result.steps < 60
 
 
 def test_the_gradient_is_that_of_the_likelihood():
@@ -327,8 +327,8 @@ def test_the_gradient_is_that_of_the_likelihood():
     free, rng = np.array(list(free.values())), np.random.default_rng(0)
 
     def at(vector):
-        given = vector, walks_and_truth()[0], free, TRUE
-        return jax.device_get(fitting._value_and_gradient(*given, **fixed))
+        arguments = vector, walks_and_truth()[0], free, TRUE
+        return jax.device_get(fitting._value_and_gradient(*arguments, **fixed))
 
     gradient = np.asarray(at(free)[1])
     assert (gradient != 0).all()
@@ -354,15 +354,15 @@ def test_noises_are_fitted_with_the_whole_bias_of_a_raw_gyro_uncertain(raw, expe
 
 
 def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told(monkeypatch):
-    given, _ = walks_and_truth()
+    walks, _ = walks_and_truth()
     monkeypatch.setitem(fitting.PHYSICAL, "noise.measurement_scale", (1e8, 1e9))
-    warning, outside = fit(given, TRUE, most_steps=1).warnings
+    warning, outside = fit(walks, TRUE, most_steps=1).warnings
     assert outside.startswith("filter.noise.measurement_scale came out as ")
     assert warning.startswith("the fit stopped after 1 steps, ") and "--fit" in warning
     options = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(CalibrateConfig)}
     assert set(re.findall(r"--[a-z-]+", warning)) <= options  # no remedy that there is not
     programs = fitting._value_and_gradient._cache_size()
-    others = given._replace(given=given.given._replace(value=1.01 * given.given.value))
+    others = walks._replace(given=walks.given._replace(value=1.01 * walks.given.value))
     settings = changed(TRUE, noise={"std_factor": (0.7, 1.0, 1.0)}, start={"velocity": 0.2})
     fit(others, settings, most_steps=1)
     assert programs > 0 and fitting._value_and_gradient._cache_size() == programs
@@ -377,11 +377,11 @@ def test_a_search_begins_anew_until_that_gains_nothing(monkeypatch):
         return OptimizeResult(x=at + 0.1, fun=-min(len(begun), 3.0), nit=5, success=True)
 
     monkeypatch.setattr(fitting, "minimize", minimize)
-    found = fit(walks_and_truth()[0], TRUE, most_steps=40)
+    result = fit(walks_and_truth()[0], TRUE, most_steps=40)
     start = next(iter(free_parameters(TRUE, PATHS).values()))
     assert begun == [(pytest.approx(start + 0.1 * k), 40 - 5 * k) for k in range(4)]
-    assert found.steps == 20 and found.warnings == ()
-    reached = next(iter(free_parameters(found.settings, PATHS).values()))
+    assert result.steps == 20 and result.warnings == ()
+    reached = next(iter(free_parameters(result.settings, PATHS).values()))
     assert reached == pytest.approx(start + 0.4, abs=1e-3)
 
 
@@ -414,41 +414,41 @@ def test_searches_that_ended_too_early_are_told_of(monkeypatch, searches, proble
 def test_values_outside_what_is_physical_are_named():
     noise = {"accel_bias_walk": 2.656, "correlation": CorrelatedError(0.9999, 5.9e4)}
     names = ("noise.gyro_density", "noise.accel_bias_walk", "noise.correlation.share")
-    told = fitting.find_implausible(
+    warnings = fitting.find_implausible(
         changed(TRUE, noise=noise), (*names, "noise.correlation.seconds")
     )
-    assert [line.split(" came out as ")[0] for line in told] == [
+    assert [line.split(" came out as ")[0] for line in warnings] == [
         "filter.noise.accel_bias_walk",
         "filter.noise.correlation.share",
         "filter.noise.correlation.seconds",
     ]
-    assert "5.9e+04, outside 0.05 to 60: these recordings do not determine it" in told[2]
+    assert "5.9e+04, outside 0.05 to 60: these recordings do not determine it" in warnings[2]
 
 
 def test_what_is_switched_off_and_has_no_start_cannot_be_fitted():
     off = changed(TRUE, start={"gyro_bias": 0.0})
     begun = fitting.start_of_fit(off, (*fitting.GROUPS["noise"], *fitting.GROUPS["window"]))
     assert begun.noise.correlation == CorrelatedError(0.8, 0.5)
-    own = changed(TRUE, noise={"correlation": CorrelatedError(0.3, 0.7)})
-    assert fitting.start_of_fit(own, fitting.GROUPS["window"]) == own
+    with_correlation = changed(TRUE, noise={"correlation": CorrelatedError(0.3, 0.7)})
+    assert fitting.start_of_fit(with_correlation, fitting.GROUPS["window"]) == with_correlation
     with pytest.raises(InputError, match=r"filter.start.gyro_bias: is 0 .*leave its group out"):
         fitting.start_of_fit(off, fitting.GROUPS["start"])
 
 
 def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
-    given, known = walks_and_truth()[0], STRIDES - 40
-    after = np.arange(N * STRIDES)[:, None] >= N * known
-    nothing = np.arange(STRIDES)[:, None] >= known
+    walks, strides = walks_and_truth()[0], STRIDES - 40
+    after = np.arange(N * STRIDES)[:, None] >= N * strides
+    nothing = np.arange(STRIDES)[:, None] >= strides
     rows = Displacements(
-        np.where(nothing, np.nan, given.given.value),
-        np.where(nothing[..., None], np.eye(3), given.given.covariance),
+        np.where(nothing, np.nan, walks.given.value),
+        np.where(nothing[..., None], np.eye(3), walks.given.covariance),
     )
     still, falling = [0.0, 0.0, 9.81], [90.0, 0.0, 9.81]  # to 360 m/s, beyond the filter's bound
     evidences = [
         fit(
-            given._replace(
-                gyro=np.where(after, 0.0, given.gyro),
-                accel=np.where(after, force, given.accel),
+            walks._replace(
+                gyro=np.where(after, 0.0, walks.gyro),
+                accel=np.where(after, force, walks.accel),
                 given=rows,
             ),
             TRUE,
@@ -458,9 +458,9 @@ def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
     ]
     np.testing.assert_allclose(*evidences, rtol=1e-9)
     # It is the mean over the rows that are there: of the last tenth too it is hardly another.
-    np.testing.assert_allclose(evidences[0], fit(given, TRUE, most_steps=1).before, rtol=0.03)
+    np.testing.assert_allclose(evidences[0], fit(walks, TRUE, most_steps=1).before, rtol=0.03)
     knock = np.arange(STRIDES * N)[:, None] == 900
-    broken = given._replace(accel=np.where(knock, 1e6, given.accel))
+    broken = walks._replace(accel=np.where(knock, 1e6, walks.accel))
     with pytest.raises(InputError, match="the filter: fails on these recordings"):
         fit(broken, TRUE)
 
@@ -472,15 +472,15 @@ def test_what_the_errors_were_drawn_with_is_found():
     covariance = root @ root.transpose(0, 2, 1)
     # Metres for a unit of each: bias rad/s, log scale, heading rad, slope.
     sensitivity = rng.standard_normal((rows, 3, 6)) * [200.0, 200.0, 5.0, 5.0, 5.0, 40.0]
-    wanted = np.array([2e-3, 2e-3, 2e-3, 0.1, np.deg2rad(8.0), 0.01])
+    expected = np.array([2e-3, 2e-3, 2e-3, 0.1, np.deg2rad(8.0), 0.01])
     drawn = np.einsum("kij,kj->ki", root, rng.standard_normal((rows, 3)))
-    error = drawn + np.einsum("kic,kc->ki", sensitivity, wanted * rng.standard_normal((rows, 6)))
+    error = drawn + np.einsum("kic,kc->ki", sensitivity, expected * rng.standard_normal((rows, 6)))
     positions = fitting.PositionErrors(error, covariance, sensitivity, np.zeros((rows, 3)))
     options = changed(considered={"scale": 0.7, "raw_gyro_bias": 0.3})  # of an earlier calibration
-    found = fitting.fit_considered(positions, 0.1, options)
-    assert found.before > 2 and found.after == pytest.approx(1, abs=0.05)
+    result = fitting.fit_considered(positions, 0.1, options)
+    assert result.before > 2 and result.after == pytest.approx(1, abs=0.05)
     np.testing.assert_allclose(
-        found.settings.considered, [2e-3, 0.1, np.deg2rad(8.0), 0.01, 0.0], rtol=0.1
+        result.settings.considered, [2e-3, 0.1, np.deg2rad(8.0), 0.01, 0.0], rtol=0.1
     )
 
     axis = rng.standard_normal((rows, 3))
@@ -489,14 +489,14 @@ def test_what_the_errors_were_drawn_with_is_found():
     with_bias = error + np.einsum("kib,kb->ki", sensitivity[:, :, :3], bias)
     # The errors of scale are larger in the raw ones, which must not change the others.
     with_bias += 0.15 * sensitivity[:, :, 3] * rng.standard_normal((rows, 1))
-    both = fitting.PositionErrors(
+    mixed_errors = fitting.PositionErrors(
         np.concatenate([error, with_bias]),
-        *(np.concatenate([each, each]) for each in (covariance, sensitivity)),
+        *(np.concatenate([part, part]) for part in (covariance, sensitivity)),
         np.concatenate([0 * axis, axis]),
     )
-    fit = fitting.fit_considered(both, 0.1, FilterSettings())
+    fit = fitting.fit_considered(mixed_errors, 0.1, FilterSettings())
     mixed = fit.settings.considered
-    assert mixed[:4] == found.settings.considered[:4]
+    assert mixed[:4] == result.settings.considered[:4]
     assert mixed.raw_gyro_bias == pytest.approx(0.02, rel=0.1)
     assert fit.before > 4 and fit.after == pytest.approx(1.2, abs=0.15)
     alone = positions._replace(error=with_bias, raw_axis=axis)
@@ -512,13 +512,13 @@ def test_the_prior_counts_as_many_independent_errors_as_there_are():
     error[:, 0] = 0.3 * np.where(np.arange(rows) % 2, 1.0, -1.0)
     covariance, sensitivity = np.tile(1e-4 * np.eye(3), (rows, 1, 1)), np.zeros((rows, 3, 6))
     sensitivity[:, 0, 5] = 1.0  # the slope alone, in metres for a unit
-    found = fitting.fit_considered(
+    result = fitting.fit_considered(
         fitting.PositionErrors(error, covariance, sensitivity, np.zeros((rows, 3))),
         stride,
         FilterSettings(),
     )
     for name in ("gyro_bias", "scale", "heading"):
-        assert getattr(found.settings.considered, name) == pytest.approx(
+        assert getattr(result.settings.considered, name) == pytest.approx(
             getattr(fitting.CONSIDERED, name), rel=1e-3
         )
 
@@ -528,14 +528,14 @@ def test_the_prior_counts_as_many_independent_errors_as_there_are():
         return likelihood + 0.5 * ((log_std - np.log(fitting.CONSIDERED.slope)) / 2.0) ** 2
 
     grid = np.linspace(np.log(0.05), np.log(0.5), 20001)
-    wanted = np.exp(grid[np.argmin(negative_log_posterior(grid))])
-    assert wanted < 0.28  # what the positions alone would say is 0.3
-    assert found.settings.considered.slope == pytest.approx(wanted, rel=2e-3)
+    expected = np.exp(grid[np.argmin(negative_log_posterior(grid))])
+    assert expected < 0.28  # what the positions alone would say is 0.3
+    assert result.settings.considered.slope == pytest.approx(expected, rel=2e-3)
 
 
-def nees(found):
-    inverse = np.linalg.inv(found.covariance)
-    return np.einsum("ki,kij,kj->k", found.error, inverse, found.error).mean() / 3
+def nees(positions):
+    inverse = np.linalg.inv(positions.covariance)
+    return np.einsum("ki,kij,kj->k", positions.error, inverse, positions.error).mean() / 3
 
 
 def test_positions_are_compared_with_the_truth_of_their_time():
@@ -546,24 +546,24 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     truth = truth.copy()
     options = changed(TRUE, noise={"measurement_scale": 9.0})  # σ is three times what is said
     truth[0, 300:] = np.nan
-    found = fitting.compare_positions(walks, truth, DATA, options)
-    assert len(found.error) == np.isfinite(truth).all(2).sum()
-    assert nees(found) == pytest.approx(1, abs=0.5)
+    positions = fitting.compare_positions(walks, truth, DATA, options)
+    assert len(positions.error) == np.isfinite(truth).all(2).sum()
+    assert nees(positions) == pytest.approx(1, abs=0.5)
     off = fitting.compare_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
-    assert nees(off) > 3 * nees(found)
+    assert nees(off) > 3 * nees(positions)
 
     accel, raw = walks.accel.copy(), np.arange(WALKS) == 0
     accel[1, 100:] += 1e4
     marked = walks._replace(start=walks.start._replace(raw_gyro=raw), accel=accel)
     some = fitting.compare_positions(marked, truth, DATA, options)
-    assert np.isfinite(truth[0]).all(1).sum() < len(some.error) < len(found.error) - 100
+    assert np.isfinite(truth[0]).all(1).sum() < len(some.error) < len(positions.error) - 100
     assert np.abs(some.error).max() < 50
     axes = np.where(raw[:, None], walks.start.rotation[:, 2], 0.0)
-    known = np.isfinite(truth).all(2)
+    trusted = np.isfinite(truth).all(2)
     np.testing.assert_allclose(
-        some.raw_axis[: known[0].sum()], np.tile(axes[0], (known[0].sum(), 1))
+        some.raw_axis[: trusted[0].sum()], np.tile(axes[0], (trusted[0].sum(), 1))
     )
-    assert not some.raw_axis[known[0].sum() :].any() and not found.raw_axis.any()
+    assert not some.raw_axis[trusted[0].sum() :].any() and not positions.raw_axis.any()
 
 
 def test_no_positions_and_no_likelihood_are_named():

@@ -23,7 +23,7 @@ SETTINGS = reports.SETTINGS | {
 
 def reported(estimates, groups=None, notes=None, left_out=None, settings=SETTINGS):
     """The report about estimates, each a group of its own."""
-    groups = groups or {each.name: each.name for each in estimates}
+    groups = groups or {estimate.name: estimate.name for estimate in estimates}
     still = {"never_moves": score(never_moves(estimates))}
     return Report(settings, score(estimates), still, groups, notes or {}, left_out or {})
 
