@@ -34,7 +34,7 @@ def recording(name, time, position, rotation, gyro, accel, start):
 
 
 def simulated():
-    """A walk with a raw gyro and one with another, and their displacements."""
+    """A walk with a raw gyro and one with a compensated gyro, and their displacements."""
     noise, std = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4), filtering.InitialStd(gyro_bias=5e-3)
     runs = simulate(7, 2, STRIDES, N, CLONES, 1 / DATA.rate, noise, std, SIGMA)
     time, walks, displacements = DATA.stride_seconds * np.arange(STRIDES + 1), [], []
@@ -78,7 +78,7 @@ def errors(walk, position, attitude):
 
 
 def test_both_filters_run_as_their_settings_say():
-    """The start has their uncertainty too, and nothing is correlated before the calibration."""
+    """The start has their uncertainty, and no error is correlated before the calibration."""
     walks, displacements = simulated()
     before = changed(noise={"gyro_density": 1e-3, "measurement_scale": 9.0})
     before = dataclasses.replace(before, raw_gyro_bias=0.05)
@@ -189,7 +189,7 @@ def test_a_group_of_fewer_than_five_recordings_is_a_warning(raw, others, few):
     assert [line.split(":")[0] for line in lines] == few
 
 
-def test_the_command_shows_what_diverged_and_what_the_recordings_are(monkeypatch, tmp_path, capsys):
+def test_the_command_shows_divergences_and_recordings(monkeypatch, tmp_path, capsys):
     errors = {"ate": Change(3.05, 11.25), "path_length_ratio": Change(0.65, None)}
     fit = InnovationFit(FilterSettings(), 0.0, 0.0, 3)
     result = calibration.Calibration(
