@@ -263,12 +263,14 @@ def lines(comparison: Comparison) -> list[list[str]]:
             row.recordings(metric) == comparison.rows[0].recordings(metric)
             for row in comparison.rows
         )
-        for index, (row, (mean, difference)) in enumerate(zip(comparison.rows, cells, strict=True)):
+        for index, (row, (summary, difference)) in enumerate(
+            zip(comparison.rows, cells, strict=True)
+        ):
             better = ""
             if difference and difference.compared and not difference.withheld:
                 better = f"{difference.better} of {difference.compared}"
-            text = tabulate.mean(mean, column.digits)
-            text += "" if alike else f" over {mean.sequences}"
+            text = tabulate.mean(summary, column.digits)
+            text += "" if alike else f" over {summary.sequences}"
             head = ["" if index else column.title, row.label, text]
             table.append([*head, tabulate.difference(difference, column.digits), better])
     return table
@@ -344,7 +346,7 @@ def write(path: Path, comparison: Comparison) -> None:
     drawable = [
         metric
         for metric, cells in comparison.cells.items()
-        if any(cell.mean.seeds for cell in cells)
+        if any(cell.summary.seeds for cell in cells)
     ]
     rows = {row.label: row.reports for row in comparison.rows}
     picture = plots.sequence_dots(rows, next(iter(drawable or comparison.cells)))

@@ -1,4 +1,4 @@
-"""The network's displacement of every window of the recordings, cut with a given attitude."""
+"""The network's displacement of every window of the recordings, cut with their attitudes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gnio_jax.windows import align_recording, cut_windows, window_starts, withou
 
 WINDOWS_PER_CALL = 512
 DIAGNOSTICS = ("gate", "scale")
-"""The network's diagnostics that are kept for every window. Attention is too large for that."""
+"""Diagnostics of the network that are stored for every window. Attention is too large."""
 
 
 class Displacements(NamedTuple):
@@ -62,7 +62,7 @@ def infer(
     them. `PreparedRecording.attitude` turns the windows. The results are float64 on the host.
 
     A window that touches a sample which was not measured has no displacement. `diagnostics` names
-    those that are kept, if the network has them. `least_std` is the smallest standard deviation
+    those that are stored, if the network has them. `least_std` is the smallest standard deviation
     that the estimator uses, m (`FilterConfig.log_std_min`).
     """
     parts, starts, turns = [], [], []

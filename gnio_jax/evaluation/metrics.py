@@ -363,7 +363,7 @@ class MetricInputs(NamedTuple):
         rows = finite_rows(position)
         return position[rows], self.waypoints.position[rows]
 
-    def of_filter(self) -> Filtered:
+    def filter_results(self) -> Filtered:
         assert self.filtered is not None
         return self.filtered
 
@@ -373,7 +373,7 @@ class MetricInputs(NamedTuple):
         as exact."""
         yaw = relative_yaw(self.raw.orientation[:1], self.started.orientation[:1])[0]
         error = (self.started.position - self.reference.position) @ rotation_z(yaw).T
-        covariance, dims = self.of_filter().covariance, self.dims
+        covariance, dims = self.filter_results().covariance, self.dims
         rows = finite_rows(error) & (np.einsum("nii->ni", covariance) != 0).all(1)
         squared = np.full(len(error), np.nan)
         squared[rows] = normalised_squared(error[rows, :dims], covariance[rows, :dims, :dims])
@@ -412,9 +412,9 @@ OTHERS: dict[str, Metric] = {
     "yaw_drift": lambda c: yaw_drift(c.raw.orientation, c.reference.orientation, c.step),
 }
 OF_FILTER: dict[str, Metric] = {
-    "nis": lambda c: mean_normalised(c.of_filter().nis, 3),
-    "nis_coverage": lambda c: coverage(c.of_filter().nis, 3),
-    "accepted": lambda c: 100.0 * mean_normalised(c.of_filter().accepted, 1),
+    "nis": lambda c: mean_normalised(c.filter_results().nis, 3),
+    "nis_coverage": lambda c: coverage(c.filter_results().nis, 3),
+    "accepted": lambda c: 100.0 * mean_normalised(c.filter_results().accepted, 1),
 }
 """Metrics that need no reference."""
 LEGS: dict[str, Metric] = {
@@ -520,12 +520,12 @@ def measure(
 
 def _metrics(inputs: MetricInputs) -> Iterator[tuple[str, Metric, MetricInputs]]:
     """Name, metric and its data, in the order of the files."""
-    nees, of_filter = ({}, {}) if inputs.filtered is None else (NEES, OF_FILTER)
+    nees, filter_metrics = ({}, {}) if inputs.filtered is None else (NEES, OF_FILTER)
     if inputs.waypoints is None:
         spatial = SPATIAL | nees
-        groups = [(3, "", PATH | spatial), (2, "_2d", spatial), (3, "", OTHERS | of_filter)]
+        groups = [(3, "", PATH | spatial), (2, "_2d", spatial), (3, "", OTHERS | filter_metrics)]
     else:
-        groups = [(3, "", LEGS | OF_WAYPOINTS | of_filter)]
+        groups = [(3, "", LEGS | OF_WAYPOINTS | filter_metrics)]
     for dims, tag, metrics in groups:
         for name, metric in metrics.items():
             yield name + tag, metric, inputs._replace(dims=dims)

@@ -84,7 +84,8 @@ class PageRun(NamedTuple):
 def describe_report(
     report: Report, views: list[View], command: str = "", settings: str = "", name: str = ""
 ) -> PageRun:
-    """The run of the page for an evaluation; `settings` is the configuration of its run."""
+    """Describe an evaluation as a run of the page; `settings` is the configuration with which it
+    was trained."""
     split = f"{report.settings['dataset']}, split {report.settings['split']}"
     facts = {"command": command, "recordings": split, **tabulate.describe(report.settings)}
     summary = report.summary()
@@ -155,8 +156,8 @@ def _file(name: str) -> str:
 
 
 def _collect_columns(run: PageRun, sequences: list[str], rows: int) -> list[Columns]:
-    """The columns of each sequence, all with the same names; a row of NaN if the run lacks the
-    sequence."""
+    """Collect the columns of each sequence, all with the same names; a row of NaN if the run lacks
+    the sequence."""
     columns_of = {view.name: make_columns(view, rows) for view in run.views}
     names = dict.fromkeys(name for columns in columns_of.values() for name in columns)
     collection = []

@@ -196,6 +196,6 @@ def _share_diverged(seeds: Sequence[Scores]) -> float:
 class Cell(NamedTuple):
     """A metric of one row of a table."""
 
-    mean: MetricSummary
+    summary: MetricSummary
     difference: Difference | None
     """Difference from the first row; None for the first row itself."""

@@ -176,7 +176,7 @@ def records(
 
 def marks(cells: Sequence[Cell]) -> list[str]:
     """The meaning of the marks of a table, and the way its intervals were computed."""
-    means = [cell.mean for cell in cells]
+    summaries = [cell.summary for cell in cells]
     differences = [cell.difference for cell in cells if cell.difference]
     counts = sorted({difference.groups for difference in differences if difference.interval})
     groups = " or ".join(map(str, counts))
@@ -190,13 +190,15 @@ def marks(cells: Sequence[Cell]) -> list[str]:
             difference.compared < difference.sequences for difference in differences
         ),
         "† This number of all estimates diverged. Their sequences are not in the mean.": any(
-            mean.diverged for mean in means
+            summary.diverged for summary in summaries
         ),
         "‡ Its remaining walks would be better than those of the first row, but it diverged more "
         "often, so no difference is shown.": any(difference.withheld for difference in differences),
-        "∞: an error is too large for a number.": any(np.isinf(mean.seeds).any() for mean in means),
+        "∞: an error is too large for a number.": any(
+            np.isinf(summary.seeds).any() for summary in summaries
+        ),
         "–: this value does not exist for every seed, or there is nothing to compare it with.": any(
-            mean.mean is None for mean in means
+            summary.mean is None for summary in summaries
         ),
     }
     return [line for line, applies in conditions.items() if applies]

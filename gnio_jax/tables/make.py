@@ -187,7 +187,7 @@ def figures_of(results: list[RowResult]) -> dict[str, list[Cell]]:
     return {
         metric: row_cells
         for metric, row_cells in cells.items()
-        if metric == "ate" or any(figure.mean.seeds for figure in row_cells)
+        if metric == "ate" or any(figure.summary.seeds for figure in row_cells)
     }
 
 
@@ -198,13 +198,13 @@ def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
     header += ["difference of ATE, m (95 %)", "published (m)", "its gain"]
     table, first = [], experiment.rows[0].published
     for index, row in enumerate(experiment.rows):
-        mean, difference = figures["ate"][index]
+        summary, difference = figures["ate"][index]
         means = [
-            tabulate.mean(figures[x][index].mean, column.digits) for x, column in columns.items()
+            tabulate.mean(figures[x][index].summary, column.digits) for x, column in columns.items()
         ]
         gain = arrow(difference and difference.gain) if index else ""
         published_gain = 100 * (1 - row.published / first) if row.published and first else None
-        measured = [tabulate.number(mean.median, 2), gain, tabulate.difference(difference, 2)]
+        measured = [tabulate.number(summary.median, 2), gain, tabulate.difference(difference, 2)]
         printed = [tabulate.number(row.published, 2), arrow(published_gain) if index else ""]
         table.append([row.label, *means, *measured, *printed])
     marks = "".join(f"\n{line}\n" for line in tabulate.marks(figures["ate"]))

@@ -42,17 +42,19 @@ def table(experiment: Experiment, results: list[RowResult], ates: list[Cell]) ->
     ratios = (2, 1) if has_published else (1,)
     panels = np.atleast_1d(figure.subplots(1, len(ratios), sharey=True, width_ratios=ratios))
     measured_axes, names = panels[0], []
-    for index, (result, (mean, _)) in enumerate(zip(results, ates, strict=True)):
+    for index, (result, (summary, _)) in enumerate(zip(results, ates, strict=True)):
         lost = statistics.count_divergences(result.seeds)
         values_of = statistics.collect_values(result.seeds, "ate")
         sequences = [values.mean() for name, values in values_of.items() if name not in lost]
         labels = ("sequence", "seed, mean over sequences") if index == 0 else (None, None)
-        measured_axes.barh(index, mean.mean or 0.0, color=drawing.GREEN, alpha=0.35, height=0.6)
+        measured_axes.barh(index, summary.mean or 0.0, color=drawing.GREEN, alpha=0.35, height=0.6)
         above = np.full(len(sequences), index) + 0.2
         measured_axes.plot(sequences, above, "|", color=drawing.GREY, ms=7, label=labels[0])
-        seeds = np.full(len(mean.seeds), index)
-        measured_axes.plot(mean.seeds, seeds, "o", color="black", ms=4, label=labels[1])
-        diverged = f"\n({mean.diverged} of {mean.estimates} diverged)" if mean.diverged else ""
+        seeds = np.full(len(summary.seeds), index)
+        measured_axes.plot(summary.seeds, seeds, "o", color="black", ms=4, label=labels[1])
+        diverged = (
+            f"\n({summary.diverged} of {summary.estimates} diverged)" if summary.diverged else ""
+        )
         names.append(result.row.label + diverged)
     measured_axes.set_yticks(range(len(results)), names)
     measured_axes.invert_yaxis()

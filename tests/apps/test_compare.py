@@ -48,8 +48,8 @@ def test_by_hand(runs, monkeypatch):
     found = compare(runs / "plain", runs / "new")
     plain, new = found.cells["ate"]
     assert [row.label for row in found.rows] == ["plain", "new"] and plain.difference is None
-    assert plain.mean.seeds == pytest.approx([8 / 3, 4.0])
-    assert new.mean.seeds == pytest.approx([7 / 3])
+    assert plain.summary.seeds == pytest.approx([8 / 3, 4.0])
+    assert new.summary.seeds == pytest.approx([7 / 3])
     difference = second(found)
     assert difference.mean == pytest.approx(-1.0) and difference.gain == pytest.approx(30.0)
     reach = 12.7062 * 4 / 3  # t of one degree of freedom
