@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flat
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import SequenceEstimate
-from gnio_jax.evaluation.estimate import FilterInputs
+from gnio_jax.evaluation.estimate import BatchInputs
 from gnio_jax.evaluation.prepare import Start
 from gnio_jax.filtering import (
     ConsideredStd,
@@ -143,7 +143,7 @@ def start_of_fit(settings: FilterSettings, paths: Sequence[str]) -> FilterSettin
 
 
 def fit_innovations(
-    walks: FilterInputs,
+    walks: BatchInputs,
     windows: DataConfig,
     settings: FilterSettings,
     paths: Sequence[str],
@@ -231,7 +231,7 @@ def innovation_config(windows: DataConfig, settings: FilterSettings) -> FilterCo
 
 def innovation_objective(
     free: Float[Array, "u"],
-    walks: FilterInputs,
+    walks: BatchInputs,
     start: Float[Array, "u"],
     settings: FilterSettings,
     *,
@@ -243,7 +243,7 @@ def innovation_objective(
     the prior about `start`, which keeps parameters in place that the walks do not determine."""
     chex.assert_equal_shape([free, start])
 
-    def of_walk(settings: FilterSettings, walk: FilterInputs) -> Array:
+    def of_walk(settings: FilterSettings, walk: BatchInputs) -> Array:
         run, displacement = _make_run(walk, settings, config)
         history = run(_wide_start(walk, settings).state(config), displacement)
         # The padding of the walk comes after its last displacement, where the filter may diverge.
@@ -272,7 +272,7 @@ def apply_start_settings(start: Start, settings: FilterSettings) -> Start:
     return start._replace(std=settings.start, level_gyro_bias=level)
 
 
-def _wide_start(walk: FilterInputs, settings: FilterSettings) -> Start:
+def _wide_start(walk: BatchInputs, settings: FilterSettings) -> Start:
     """The start with all components of a raw gyro's bias uncertain (ours). Otherwise the fit would
     explain an unknown vertical component by noise."""
     start = apply_start_settings(walk.start, settings)
@@ -280,7 +280,7 @@ def _wide_start(walk: FilterInputs, settings: FilterSettings) -> Start:
 
 
 def _make_run(
-    walk: FilterInputs, settings: FilterSettings, config: FilterConfig
+    walk: BatchInputs, settings: FilterSettings, config: FilterConfig
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], Array]:
     """The function that runs the filter over one walk, given a start and displacements, and the
     displacements of the walk."""
@@ -388,7 +388,7 @@ def _add_considered(positions: PositionErrors, std: ConsideredStd) -> Array:
 
 
 def compare_positions(
-    walks: FilterInputs,
+    walks: BatchInputs,
     truth: Float[np.ndarray, "w k 3"],
     windows: DataConfig,
     settings: FilterSettings,
@@ -407,12 +407,12 @@ def compare_positions(
 
 @functools.partial(jax.jit, static_argnames="config")
 def _run_walks(
-    walks: FilterInputs, settings: FilterSettings, *, config: FilterConfig
+    walks: BatchInputs, settings: FilterSettings, *, config: FilterConfig
 ) -> tuple[Array, Array, Array, Array, Array]:
     """For every walk: where the filter is healthy, its positions, their covariances and S, and the
     axis of a raw gyro."""
 
-    def of_walk(settings: FilterSettings, walk: FilterInputs) -> tuple[Any, ...]:
+    def of_walk(settings: FilterSettings, walk: BatchInputs) -> tuple[Any, ...]:
         start = apply_start_settings(walk.start, settings)
         state = start.state(config)
         run, displacement = _make_run(walk, settings, config)

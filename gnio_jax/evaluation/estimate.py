@@ -179,7 +179,7 @@ def in_one_frame(
 # --- the filter over many recordings
 
 
-class FilterInputs(NamedTuple):
+class BatchInputs(NamedTuple):
     """The inputs of the filter, with the recordings along the leading axis."""
 
     start: Start
@@ -212,7 +212,7 @@ def filter_inputs(
     given: list[Displacements] | None,
     strides: int,
     config: FilterConfig,
-) -> FilterInputs:
+) -> BatchInputs:
     """The recordings side by side, padded to the given number of strides by samples that change
     nothing before them. Rows of `given` without a displacement get a covariance of 1 m², which has
     a derivative but no effect."""
@@ -224,7 +224,7 @@ def filter_inputs(
             covariance = filled_up(np.where(known, each.covariance, np.eye(3)), strides)
             rows.append(Displacements(filled_up(each.value, strides, np.nan), covariance))
         stacked = _stacked(rows)
-    return FilterInputs(
+    return BatchInputs(
         _stacked([each.start for each in recordings]),
         *padded_signals(((each.gyro, each.accel) for each in recordings), samples),
         padded_masks((each.imu_valid for each in recordings), samples),
@@ -235,7 +235,7 @@ def filter_inputs(
 @functools.partial(jax.jit, static_argnames=("apply", "config"))
 def _run(
     variables: Any,
-    inputs: FilterInputs,
+    inputs: BatchInputs,
     noise: NoiseModel,
     considered: ConsideredStd | None,
     *,
@@ -245,7 +245,7 @@ def _run(
     """One compiled run over all recordings of a batch. Of its covariances only that of the position
     is kept, including the consider covariance."""
 
-    def run(own: FilterInputs) -> FilterHistory:
+    def run(own: BatchInputs) -> FilterHistory:
         signals, fixed = (own.gyro, own.accel), (config, noise, own.imu_valid)
         state = own.start.state(config)
         if apply is None:

@@ -36,7 +36,7 @@ from gnio_jax.config import (
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Displacements, SequenceEstimate, Trajectory
-from gnio_jax.evaluation.estimate import FilterInputs
+from gnio_jax.evaluation.estimate import BatchInputs
 from gnio_jax.evaluation.prepare import Start, prepare
 from gnio_jax.filtering.settings import free_parameters
 from gnio_jax.filtering.state import GYRO_BIAS
@@ -261,7 +261,7 @@ def walks_and_truth():
     displacements = Displacements(
         runs.displacement, uncorrelated(np.full_like(runs.displacement, SIGMA / 3))
     )
-    return FilterInputs(start, runs.gyro, runs.accel, None, displacements), runs.position
+    return BatchInputs(start, runs.gyro, runs.accel, None, displacements), runs.position
 
 
 def fit(walks, settings, **options):
