@@ -123,12 +123,10 @@ print("root mean square error of a second:", np.asarray(error).round(3), "m")
 # true pose here; `gnio track` starts from gravity.
 
 # %%
-setup = filtering.make_filter(run.config.data, run.config.filter)
+ekf = filtering.make_filter(run.config.data, run.config.filter)
 rotation = geometry.matrix_from_quaternion(jnp.asarray(walk.orientation[0]))
-start = filtering.initial_state(
-    filtering.Filter(setup.config), rotation, walk.velocity[0], walk.position[0]
-)
-n = setup.config.samples_per_clone
+start = filtering.initial_state(ekf, rotation, walk.velocity[0], walk.position[0])
+n = ekf.config.samples_per_clone
 whole = (len(walk.time) - 1) // n * n
 
 
@@ -136,7 +134,7 @@ whole = (len(walk.time) - 1) // n * n
 def odometry(variables, gyro, accel):
     return filtering.run_odometry(
         lambda imu: run.model.apply(variables, imu),
-        filtering.Filter(setup.config, setup.noise),
+        ekf,
         start,
         gyro,
         accel,

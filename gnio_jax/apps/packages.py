@@ -28,7 +28,8 @@ from safetensors.numpy import load, save
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.errors import InputError, did_you_mean
-from gnio_jax.evaluation import report, tabulate
+from gnio_jax.evaluation import folder as results
+from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import summarise
 from gnio_jax.files import file_stem, fingerprint, replacing, replacing_folder
@@ -378,7 +379,7 @@ def _has_manifest(path: Path) -> bool:
 def _figures(workdir: Path) -> dict[str, Report]:
     """Read every evaluation of a run, by its folder's name. Raises `InputError`."""
     folders = sorted(path.parent for path in workdir.glob("eval/*/metrics.json"))
-    return {folder.name: report.read(folder) for folder in folders}
+    return {folder.name: results.read(folder) for folder in folders}
 
 
 def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:

@@ -22,8 +22,8 @@ from jaxtyping import Float
 from gnio_jax.config import DataConfig
 from gnio_jax.evaluation.infer import Displacements, keep
 from gnio_jax.evaluation.metrics import Filtered
-from gnio_jax.evaluation.prepare import Recording, Start
-from gnio_jax.evaluation.trajectory import Alignment, Trajectory, in_frame_of, relative_yaw
+from gnio_jax.evaluation.prepare import PreparedRecording, Start
+from gnio_jax.evaluation.trajectory import Alignment, Trajectory, align_if_possible, relative_yaw
 from gnio_jax.filtering import (
     Filter,
     FilterConfig,
@@ -72,11 +72,11 @@ class States(NamedTuple):
     """Measured minus predicted displacement, m; NaN where there was no measurement."""
 
 
-class Estimate(NamedTuple):
+class SequenceEstimate(NamedTuple):
     """A trajectory with the estimator's other results: K + 1 rows for K strides.
 
-    Row k is at the end of stride k, which is `Recording.time[k]`. A measurement is in the row at
-    the end of its window.
+    Row k is at the end of stride k, which is `PreparedRecording.time[k]`. A measurement is in the
+    row at the end of its window.
     """
 
     name: str
@@ -96,13 +96,13 @@ class Estimate(NamedTuple):
 
 
 def estimate(
-    recordings: list[Recording],
+    recordings: list[PreparedRecording],
     source: Network | list[Displacements],
     windows: DataConfig,
     ekf: Filter | None,
     batch_size: int = 16,
     progress: Progress = silent,
-) -> list[Estimate]:
+) -> list[SequenceEstimate]:
     """Trajectories of the recordings, by the filter, or by the sum of displacements if `ekf` is
     None.
 
@@ -116,7 +116,7 @@ def estimate(
     network, given = (
         (source, None) if isinstance(source, Network) else (Network(None, None), source)
     )
-    found: dict[int, Estimate] = {}
+    found: dict[int, SequenceEstimate] = {}
     strides = [each.strides for each in recordings]
     for batch in _batches(strides, batch_size):
         displacements = None if given is None else [given[i] for i in batch.members]
@@ -133,14 +133,14 @@ def estimate(
     return [found[i] for i in range(len(recordings))]
 
 
-def never_moves(estimates: list[Estimate]) -> list[Estimate]:
+def never_moves(estimates: list[SequenceEstimate]) -> list[SequenceEstimate]:
     """Estimates that stay at the start pose. An estimator must be better than these, above all in a
     small room."""
     still = []
     for each in estimates:
         time, *poses = each.trajectory
         path = Trajectory(time, *(np.repeat(part[:1], len(part), 0) for part in poses))
-        still.append(Estimate(each.name, path, each.reference, waypoints=each.waypoints))
+        still.append(SequenceEstimate(each.name, path, each.reference, waypoints=each.waypoints))
     return still
 
 
@@ -152,17 +152,21 @@ def perfect(ekf: Filter) -> Filter:
     return dataclasses.replace(ekf, noise=noise, considered=considered)
 
 
-def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> Estimate:
+def in_one_frame(
+    estimate: SequenceEstimate, alignment: Alignment | None = "origin"
+) -> SequenceEstimate:
     """Estimate and reference in one frame, for drawing: the estimate is aligned with its
     covariance, or without an `alignment` the reference is moved to the start of the estimate. An
     estimate with waypoints is aligned with these. If that is impossible, nothing changes.
     Covariances are turned only about the vertical, because an alignment of a level world turns
     about it."""
     if alignment is None and estimate.waypoints is None:
-        return estimate._replace(reference=in_frame_of(estimate.reference, estimate.trajectory))
+        return estimate._replace(
+            reference=align_if_possible(estimate.reference, estimate.trajectory)
+        )
     reference = estimate.waypoints or estimate.reference
     path, filtered = estimate.trajectory, estimate.filtered
-    aligned = in_frame_of(path, reference, alignment or "origin")
+    aligned = align_if_possible(path, reference, alignment or "origin")
     if filtered is not None and aligned is not path:
         turn = rotation_z(relative_yaw(aligned.orientation, path.orientation))
         covariance = turn @ filtered.covariance @ np.swapaxes(turn, 1, 2)
@@ -202,7 +206,7 @@ def _batches(strides: list[int], batch_size: int) -> list[Batch]:
 
 
 def filter_inputs(
-    recordings: list[Recording],
+    recordings: list[PreparedRecording],
     given: list[Displacements] | None,
     strides: int,
     config: FilterConfig,
@@ -269,7 +273,9 @@ def _predict(apply: Callable, variables: Any, windows: Array) -> Prediction:
     return keep(apply(variables, windows))
 
 
-def _of_history(recording: Recording, history: FilterHistory, ekf: Filter) -> Estimate:
+def _of_history(
+    recording: PreparedRecording, history: FilterHistory, ekf: Filter
+) -> SequenceEstimate:
     """The estimate from the history of one recording, with a row for its start. It is invalid where
     the history is not healthy."""
     start, notes = recording.start, recording.notes
@@ -286,7 +292,7 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: Filter) -> Es
     if (considered := ekf.considered) is not None:
         std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], considered.gyro_bias)
         std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], considered.raw_gyro_bias * start.raw_axis)
-    return Estimate(
+    return SequenceEstimate(
         recording.name,
         Trajectory(recording.time, *poses),
         recording.reference,
@@ -325,7 +331,9 @@ def _stacked(trees: list[Any]) -> Any:
 # --- the sum of displacements
 
 
-def integrate(recording: Recording, found: Displacements, windows: DataConfig) -> Estimate:
+def integrate(
+    recording: PreparedRecording, found: Displacements, windows: DataConfig
+) -> SequenceEstimate:
     """The path in which every stride is the mean of the windows that cover it, as in RoNIN-type
     baselines."""
     n, clones = windows.stride, windows.window // windows.stride
@@ -336,7 +344,7 @@ def integrate(recording: Recording, found: Displacements, windows: DataConfig) -
     moved = np.cumsum(mean_over_windows(steps, clones), 0)
     position = recording.start.position + np.concatenate([np.zeros((1, 3)), moved])
     orientation = quaternion_from_matrix(recording.attitude[::n])
-    return Estimate(
+    return SequenceEstimate(
         recording.name,
         Trajectory(recording.time, position, orientation),
         recording.reference,

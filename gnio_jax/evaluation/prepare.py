@@ -82,7 +82,7 @@ class Start(NamedTuple):
         return initial_state(ekf, *pose, self.gyro_bias, 0, self.level_gyro_bias)
 
 
-class Recording(NamedTuple):
+class PreparedRecording(NamedTuple):
     """A sequence prepared for an estimator: K strides of n samples."""
 
     name: str
@@ -127,18 +127,18 @@ def prepare(
     gyro_bias: BiasSource = "zero",
     orientation: Orientation | None = None,
     from_first: bool = False,
-) -> tuple[list[Recording], dict[str, str]]:
+) -> tuple[list[PreparedRecording], dict[str, str]]:
     """Recordings to estimate, and the names of the sequences that are left out with the reason.
 
     A recording begins at the first sample with a trusted reference. With `from_first`, or without a
     reference, it begins at its first sample. `ekf` has the uncertainty of the start; None: the
-    defaults. A static start replaces the filter's standard
-    deviations of tilt and velocity. A sequence with waypoints has no pose to start from, so its
-    start is always static. The filter's `raw_gyro_bias` replaces the standard deviation of the
-    level components of the gyro's bias if neither the phone nor a rest gives a first estimate of
-    it: if `imu_compensated` is "no" and the bias starts from zero. `orientation` is the source of
-    `Recording.attitude`; None: there is none. Raises `InputError` for a sequence that lacks what
-    these choices need.
+    defaults. A static start replaces the standard deviations of tilt and velocity. A sequence with
+    waypoints has no pose to start from, so its start is always static. `ekf.raw_gyro_bias` replaces
+    the standard deviation of the level components of the gyro's bias if neither the phone nor a
+    rest gives a first estimate of it: if `imu_compensated` is "no" and the bias starts from
+    zero. `orientation` is the source of
+    `PreparedRecording.attitude`; None: there is none. Raises `InputError` for a sequence that lacks
+    what these choices need.
     """
     ekf = ekf or make_filter(windows, FilterSettings())
     recordings, left_out = [], {}
@@ -173,7 +173,7 @@ def prepare(
         ends = slice(None, None, windows.stride)
         placement = str(sequence.attributes.get("placement", "unknown"))
         recordings.append(
-            Recording(
+            PreparedRecording(
                 name=sequence.name,
                 group=str(data.group(sequence)),
                 placement="" if placement == "unknown" else placement,

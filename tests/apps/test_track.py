@@ -257,7 +257,7 @@ def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, m
     figures = shown[0].figures["part"]
     assert figures["ate"] == summary["errors"]["ate"]
     assert figures["path_length"] == summary["path_length"] != summary["errors"]["path_length"]
-    assert shown[0].about["reference"].startswith("known for 24% of the time")
+    assert shown[0].facts["reference"].startswith("known for 24% of the time")
 
 
 def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monkeypatch):

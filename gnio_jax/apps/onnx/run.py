@@ -22,7 +22,7 @@ from gnio_jax.config import DataConfig
 from gnio_jax.config.files import plain
 from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
+from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, estimate, prepare
 from gnio_jax.evaluation.metrics import ate
 from gnio_jax.files import fingerprint, replacing_folder
 from gnio_jax.filtering import Filter, make_filter
@@ -153,7 +153,7 @@ def _filter(ekf: Filter) -> dict[str, Any]:
     }
 
 
-def draw_walk(windows: DataConfig, ekf: Filter, seconds: float) -> Recording:
+def draw_walk(windows: DataConfig, ekf: Filter, seconds: float) -> PreparedRecording:
     """A pedestrian at the network's rate, with its true start."""
     length = seconds + 1.0 / windows.rate  # a stride ends with the sample after it
     sequence = pedestrian(SEED, PERSON, PLACEMENT, seconds=length, rate=windows.rate)
@@ -161,7 +161,7 @@ def draw_walk(windows: DataConfig, ekf: Filter, seconds: float) -> Recording:
     return walk
 
 
-def deviation_of(result: WalkResult, package_estimate: Estimate) -> Deviation:
+def deviation_of(result: WalkResult, package_estimate: SequenceEstimate) -> Deviation:
     """The deviation of the models' walk from the package's own."""
     position, true = (
         trajectory.position[1:]
