@@ -213,7 +213,7 @@ def test_a_command_line_is_understood(line, monkeypatch):
     for option in ("config", "base"):
         name = getattr(settings, option, None)
         if name is not None and name != "FILE":
-            configuration.find(name)
+            configuration.find_experiment(name)
 
 
 def test_a_command_line_of_yesterday_is_not():

@@ -349,6 +349,6 @@ def _draw(
         {seen.name: figures},
         warnings=summary.warnings,
         remarks=(summary.limits, *summary.notes),
-        settings=configuration.text(config),
+        settings=configuration.to_yaml(config),
     )
     page.write(folder / "report.html", summary.recording, [run])

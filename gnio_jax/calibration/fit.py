@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flat
+from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flatten
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import SequenceEstimate
 from gnio_jax.evaluation.estimate import BatchInputs
@@ -134,7 +134,7 @@ def start_of_fit(settings: FilterSettings, paths: Sequence[str]) -> FilterSettin
     if "noise.correlation" in paths and not (correlation and correlation.share):
         noise = settings.noise._replace(correlation=CorrelatedError())
         settings = dataclasses.replace(settings, noise=noise)
-    values = flat(settings)
+    values = flatten(settings)
     for path in paths:
         if values.get(path) == 0:
             remedy = "leave its group out of --fit, or give the run a small value"
@@ -207,7 +207,7 @@ def fit_innovations(
 
 def find_implausible(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
     """A sentence for each of these settings that is outside its plausible range."""
-    values, lines = flat(settings), []
+    values, lines = flatten(settings), []
     for name in (name for name in names if name in PHYSICAL):
         low, high = PHYSICAL[name]
         if not low <= values[name] <= high:

@@ -38,11 +38,11 @@ class FoldNetwork(NamedTuple):
 
 def load_run(workdir: Path, config: CalibrateConfig) -> Run:
     """A run with the network that is to be calibrated. Raises `InputError` as `checkpoint.load_run`
-    and `checkpoint.averaged_over_headings` do."""
+    and `checkpoint.average_over_headings` do."""
     run = checkpoint.load_run(workdir)
     if not config.average_headings:
         return run
-    return checkpoint.averaged_over_headings(run, f"--average-headings with {workdir}")
+    return checkpoint.average_over_headings(run, f"--average-headings with {workdir}")
 
 
 def choose_networks(run: Run, config: CalibrateConfig) -> tuple[str, list[FoldNetwork]]:

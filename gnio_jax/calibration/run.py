@@ -175,7 +175,7 @@ def _write(
             **{metric: change._asdict() for metric, change in effect.errors.items()},
             "diverged": effect.diverged._asdict(),
         },
-        "filter": configuration.plain(settings),
+        "filter": configuration.to_plain(settings),
     }
     with replacing_folder(calibration.folder) as new:
         experiment = dataclasses.replace(

@@ -38,8 +38,8 @@ def calibrate(request: CalibrateConfig, _call: options.Call) -> None:
     console.prepare_filter()
     with console.terminal() as terminal:
         result = calibration.calibrate(request, terminal.progress, usable_cores())
-    table, before = Table("filter", "before", "calibrated"), configuration.flat(result.before)
-    for name, value in configuration.flat(result.consider_fit.settings).items():
+    table, before = Table("filter", "before", "calibrated"), configuration.flatten(result.before)
+    for name, value in configuration.flatten(result.consider_fit.settings).items():
         if value != before.get(name):
             table.add_row(name, _spell(before.get(name)), _spell(value))
     console.say(table)

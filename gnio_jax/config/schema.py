@@ -16,21 +16,21 @@ from typing import Annotated, Any, Literal, NamedTuple, NoReturn
 from gnio_jax.errors import InputError
 
 
-class Place(NamedTuple):
-    """The place of a setting or a section in a file or on the command line."""
+class Location(NamedTuple):
+    """The location of a setting or a section in a file or on the command line."""
 
     source: str
     field: str = ""
     """Names joined by dots; empty at the top."""
 
-    def below(self, name: str) -> Place:
+    def child(self, name: str) -> Location:
         """The field `name` of this section."""
-        return Place(self.source, f"{self.field}.{name}" if self.field else name)
+        return Location(self.source, f"{self.field}.{name}" if self.field else name)
 
     def refuse(self, problem: str, remedy: str = "") -> NoReturn:
-        """Raise an `InputError` about this place."""
-        named = f"field '{self.field}' {problem}" if self.field else problem
-        raise InputError(self.source, named, remedy)
+        """Raise an `InputError` about this location."""
+        text = f"field '{self.field}' {problem}" if self.field else problem
+        raise InputError(self.source, text, remedy)
 
 
 class Bound(NamedTuple):
@@ -142,20 +142,20 @@ class DataConfig:
         """Samples between window starts in training."""
         return round(self.train_stride_seconds * self.rate)
 
-    def check(self, at: Place) -> None:
+    def check(self, location: Location) -> None:
         """Check that window, context and strides are whole samples, and that strides fill window
         and context."""
         for name in ("window_seconds", "context_seconds", "stride_seconds", "train_stride_seconds"):
             samples = getattr(self, name) * self.rate
             if not _is_whole(samples):
                 problem = f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
-                at.below(name).refuse(problem)
+                location.child(name).refuse(problem)
         if self.window % self.stride:
-            at.below("stride_seconds").refuse(
+            location.child("stride_seconds").refuse(
                 f"must divide the window of {self.window_seconds:g} s"
             )
         if self.context % self.stride:
-            at.below("stride_seconds").refuse(
+            location.child("stride_seconds").refuse(
                 f"must divide the context of {self.context_seconds:g} s"
             )
 
@@ -190,10 +190,10 @@ class AugmentConfig:
     rest_share: Annotated[Probability, FILE_ONLY] = 0.0
     """Share of the windows that are replaced by windows of a phone at rest (ours)."""
 
-    def check(self, at: Place) -> None:
+    def check(self, location: Location) -> None:
         """Check that the lowest cut-off is not above the highest."""
         if self.low_pass_hertz[0] > self.low_pass_hertz[1]:
-            at.below("low_pass_hertz").refuse(
+            location.child("low_pass_hertz").refuse(
                 "has the higher frequency first", "give the lower one first"
             )
 
@@ -517,7 +517,7 @@ class TrainConfig:
         """The datasets to learn from, one or several."""
         return (self.dataset,) if isinstance(self.dataset, str) else self.dataset
 
-    def check(self, at: Place) -> None:
+    def check(self, location: Location) -> None:
         """Check the sections together. Several datasets must differ, be in their usual folders and
         have a weight each, or none. Four headings are averaged only if training shows windows of
         every heading. Training through the filter needs weights to start from, and segments of
@@ -525,37 +525,37 @@ class TrainConfig:
         sample takes no context."""
         names, weights = self.datasets, self.data.weights
         if len(set(names)) < len(names) or not names:
-            at.below("dataset").refuse("is empty, or names a dataset twice", "name each once")
+            location.child("dataset").refuse("is empty, or names a dataset twice", "name each once")
         if len(names) > 1 and self.data_root is not None:
             problem = f"is the folder of one dataset, and there are {len(names)}"
             remedy = "leave it out and set $GNIO_DATA to the folder that holds theirs"
-            at.below("data_root").refuse(problem, remedy)
+            location.child("data_root").refuse(problem, remedy)
         if weights and len(weights) != len(names):
             problem = f"has {len(weights)} values for {len(names)} datasets"
-            at.below("data.weights").refuse(problem, "give one for each, or none")
+            location.child("data.weights").refuse(problem, "give one for each, or none")
         if self.data.context and self.model.name == "ctin":
             remedy = "it predicts every sample it sees: set it to 0"
-            at.below("data.context_seconds").refuse("is not for ctin", remedy)
+            location.child("data.context_seconds").refuse("is not for ctin", remedy)
         if self.model.equivariance == "four_headings" and not self.augment.yaw:
             problem = "is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"
-            at.below("model.equivariance").refuse(problem, remedy)
-        self._check_through_filter(at)
+            location.child("model.equivariance").refuse(problem, remedy)
+        self._check_through_filter(location)
 
-    def _check_through_filter(self, at: Place) -> None:
+    def _check_through_filter(self, location: Location) -> None:
         through = self.through_filter
         if not through.learn:
             return
         if not _is_whole(through.piece_seconds / self.data.stride_seconds):
             problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
-            at.below("through_filter.piece_seconds").refuse(problem)
+            location.child("through_filter.piece_seconds").refuse(problem)
         if through.piece_seconds < SHORTEST_HORIZON:
             problem = f"must be at least {SHORTEST_HORIZON:g} s, the shortest horizon of its losses"
-            at.below("through_filter.piece_seconds").refuse(problem)
+            location.child("through_filter.piece_seconds").refuse(problem)
         if self.filter.mahalanobis_fail_scale > 0:
             problem = "makes no sense beside the soft gate of training through the filter"
-            at.below("filter.mahalanobis_fail_scale").refuse(problem, "set it to 0")
-        seen = self.data.context_seconds + self.data.window_seconds
-        if through.piece_seconds < seen + 2 * self.data.stride_seconds:
-            problem = f"must be longer than the {seen:g} s that the network sees"
-            at.below("through_filter.piece_seconds").refuse(problem)
+            location.child("filter.mahalanobis_fail_scale").refuse(problem, "set it to 0")
+        input_seconds = self.data.context_seconds + self.data.window_seconds
+        if through.piece_seconds < input_seconds + 2 * self.data.stride_seconds:
+            problem = f"must be longer than the {input_seconds:g} s that the network sees"
+            location.child("through_filter.piece_seconds").refuse(problem)

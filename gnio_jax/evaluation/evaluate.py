@@ -83,7 +83,10 @@ def evaluate(
     missing data, and a split of which no sequence can be estimated.
     """
     _check(config)
-    from gnio_jax.training.checkpoint import learnt_from, load_run  # Orbax takes seconds to import
+    from gnio_jax.training.checkpoint import (  # Orbax takes seconds to import
+        load_run,
+        training_recordings,
+    )
 
     workdir = Path(config.workdir or configuration.newest_run())
     run = run or load_run(workdir, config.checkpoint)
@@ -99,7 +102,7 @@ def evaluate(
             problem = f"has waypoints, and no --alignment {config.alignment}"
             remedy = "leave it out: one turn about z and one shift are fitted"
             raise InputError(each.name, problem, remedy)
-    learnt = learnt_from(workdir, run.config, config.dataset)
+    learnt = training_recordings(workdir, run.config, config.dataset)
     if seen := [each.name for each in sequences if each.name in learnt]:
         count = f"{len(seen)} of {len(sequences)} recordings, e.g. {seen[0]}"
         reporter.line(f"warning: the network has learnt from {count}: its errors there are smaller")
@@ -240,7 +243,7 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     parts = [config.dataset, config.split, config.estimator]
     parts += [text.format(own[x]) for x, text in NAMED.items() if own[x] != usual[x]]
     if config.estimator != "integrate":
-        trained, own = configuration.flat(run.filter), configuration.flat(config.filter)
+        trained, own = configuration.flatten(run.filter), configuration.flatten(config.filter)
         for name in {**trained, **own}:
             if (value := own.get(name)) != trained.get(name):
                 numbers = value if isinstance(value, tuple) else (value,)
@@ -271,7 +274,7 @@ def _settings(
         "model": run.model.name,
         "checkpoint": config.checkpoint,
         **{name: getattr(run.data, name) for name in WINDOWS},
-        "filter": configuration.plain(config.filter),
+        "filter": configuration.to_plain(config.filter),
         "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,
         "definitions": DEFINITIONS,
         "device": jax.devices()[0].device_kind,

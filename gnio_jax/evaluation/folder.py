@@ -87,7 +87,7 @@ def write(
             alignment = report.settings["alignment"]
             views = [make_view(estimate, alignment) for estimate in estimates]
             pictures.save_all(new / "plots", views, report, progress)
-            run = page.describe_report(report, views, command, configuration.text(trained))
+            run = page.describe_report(report, views, command, configuration.to_yaml(trained))
             title = f"{report.settings['dataset']} {report.settings['split']}: {run.name}"
             others = read_others(folder, report.settings)
             runs = [page.describe_report(*other, name=name) for name, other in others.items()]

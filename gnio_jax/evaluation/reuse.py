@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gnio_jax import config as configuration
-from gnio_jax.config import EvaluateConfig, plain
+from gnio_jax.config import EvaluateConfig, to_plain
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import evaluate, folder_of, resolve
 from gnio_jax.evaluation.folder import read
@@ -85,6 +85,6 @@ def _find_difference(report: Report, config: EvaluateConfig) -> str:
     for name in IDENTITY:
         if (value := report.settings.get(name)) != (request := getattr(config, name)):
             return f"its figures are of {name.replace('_', ' ')} {value}, not {request}"
-    if config.estimator != "integrate" and report.settings["filter"] != plain(config.filter):
+    if config.estimator != "integrate" and report.settings["filter"] != to_plain(config.filter):
         return "its figures are of another filter than the run's"
     return ""

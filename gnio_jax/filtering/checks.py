@@ -19,7 +19,7 @@ from jax.core import Tracer
 from jax.tree_util import keystr, tree_map_with_path
 from jaxtyping import Int
 
-from gnio_jax.config.files import bounds, named
+from gnio_jax.config.files import bounds, iterate_settings
 from gnio_jax.config.schema import Bound
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.filter import Filter
@@ -142,7 +142,7 @@ def check_bounds(name: str, number: Any, limits: Iterable[Bound]) -> None:
 def check_numbers(name: str, settings: Any) -> None:
     """Refuse a tuple of settings (`NoiseModel`, `InitialStd`, `ConsideredStd`) with a number
     outside the bounds of its field."""
-    for field, hint, value in named(settings, f"{name}."):
+    for field, hint, value in iterate_settings(settings, f"{name}."):
         for number in value if isinstance(value, tuple | list) else (value,):
             check_bounds(field, number, bounds(hint))
 

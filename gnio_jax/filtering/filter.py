@@ -11,7 +11,7 @@ import jax
 from jax.core import Tracer
 
 from gnio_jax.config import ConsideredStd, DataConfig, FilterSettings, InitialStd, NoiseModel
-from gnio_jax.config.schema import TLIO_STD, Place
+from gnio_jax.config.schema import TLIO_STD, Location
 from gnio_jax.filtering.measurements import create_measurements
 from gnio_jax.filtering.settings import FilterConfig, filter_config
 from gnio_jax.filtering.update import Measurement
@@ -57,5 +57,5 @@ def make_filter(windows: DataConfig, settings: FilterSettings) -> Filter:
         start=settings.start,
         considered=considered,
         raw_gyro_bias=settings.raw_gyro_bias,
-        measurements=create_measurements(settings.measurements, Place("filter", "measurements")),
+        measurements=create_measurements(settings.measurements, Location("filter", "measurements")),
     )

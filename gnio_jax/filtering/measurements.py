@@ -13,8 +13,8 @@ from typing import Any, get_type_hints
 from jax.core import Tracer
 
 from gnio_jax import plugins
-from gnio_jax.config.files import checked_value
-from gnio_jax.config.schema import Place
+from gnio_jax.config.files import check_value
+from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.filtering.update import Measurement
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
@@ -51,7 +51,7 @@ def register(measurement: type) -> None:
 
 
 def create_measurements(
-    numbers: Mapping[str, Mapping[str, Any] | None], place: Place
+    numbers: Mapping[str, Mapping[str, Any] | None], place: Location
 ) -> tuple[Measurement, ...]:
     """The measurements of these names with their numbers, in their order. Numbers may be traced.
 
@@ -59,13 +59,13 @@ def create_measurements(
     out of its bounds.
     """
     return tuple(
-        _create(name, fields, place.below(name))
+        _create(name, fields, place.child(name))
         for name, fields in numbers.items()
         if fields is not None
     )
 
 
-def _create(name: str, numbers: Mapping[str, Any], place: Place) -> Measurement:
+def _create(name: str, numbers: Mapping[str, Any], place: Location) -> Measurement:
     if name not in _MEASUREMENTS:
         plugins.load()
     if name not in _MEASUREMENTS:
@@ -76,10 +76,10 @@ def _create(name: str, numbers: Mapping[str, Any], place: Place) -> Measurement:
     values = dict(numbers)
     for field, value in numbers.items():
         if field not in hints:
-            place.below(field).refuse("is unknown", f"known numbers: {', '.join(hints)}")
+            place.child(field).refuse("is unknown", f"known numbers: {', '.join(hints)}")
         if not isinstance(value, Tracer):
-            values[field] = checked_value(hints[field], value, place.below(field))
+            values[field] = check_value(hints[field], value, place.child(field))
     for field in kind._fields:
         if field not in numbers and field not in kind._field_defaults:
-            place.below(field).refuse("is missing", f"write {field}: NUMBER")
+            place.child(field).refuse("is missing", f"write {field}: NUMBER")
     return kind(**values)

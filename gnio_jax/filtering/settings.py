@@ -17,8 +17,8 @@ import numpy as np
 from jax.tree_util import keystr, tree_leaves_with_path
 
 from gnio_jax.config import DataConfig, FilterOptions, FilterSettings
-from gnio_jax.config.files import checked_value
-from gnio_jax.config.schema import Count, NonNegative, NonNegativeCount, Place, Positive
+from gnio_jax.config.files import check_value
+from gnio_jax.config.schema import Count, Location, NonNegative, NonNegativeCount, Positive
 from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
 _NUMBERS = ("noise", "start", "considered", "measurements")
@@ -76,10 +76,10 @@ class FilterConfig(FilterOptions):
             value = getattr(self, name)
             if isinstance(value, np.ndarray | np.generic) and value.ndim == 0:
                 value = value.item()
-            object.__setattr__(self, name, checked_value(hint, value, Place("FilterConfig", name)))
+            object.__setattr__(self, name, check_value(hint, value, Location("FilterConfig", name)))
         if self.gate_softness and self.mahalanobis_fail_scale:
             problem = "makes no sense beside mahalanobis_fail_scale"
-            Place("FilterConfig", "gate_softness").refuse(problem, "set one of them to 0")
+            Location("FilterConfig", "gate_softness").refuse(problem, "set one of them to 0")
 
     @property
     def window(self) -> int:

@@ -18,8 +18,8 @@ from jaxtyping import PRNGKeyArray
 
 from gnio_jax import plugins
 from gnio_jax.config import ModelConfig
-from gnio_jax.config.files import checked_value
-from gnio_jax.config.schema import Place
+from gnio_jax.config.files import check_value
+from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.models.convolution import winograd_pays
 from gnio_jax.models.ctin import CTIN
@@ -97,7 +97,7 @@ def create(name: str, **values: Any) -> nn.Module:
     for option, value in values.items():
         kind = kinds[_check_word(option, kinds, subject, f"unknown option '{option}'", "options")]
         if get_origin(kind) in (Literal, Annotated):
-            values[option] = checked_value(kind, value, Place(subject, option))
+            values[option] = check_value(kind, value, Location(subject, option))
     if "winograd" in kinds:
         values.setdefault("winograd", winograd_pays())
     equivariance = values.pop("equivariance", "none")

@@ -13,7 +13,7 @@ from gnio_jax.evaluation import reuse, tabulate
 from tests.support.reports import LOST, report_of, write_report, write_run
 
 GROUPS = {"a": "ann", "b": "ann", "c": "bob"}
-FILTER = configuration.plain(TrainConfig().filter)
+FILTER = configuration.to_plain(TrainConfig().filter)
 
 
 def write(run, ates, name="synthetic_test_ekf", drop=(), groups=GROUPS, more=None, **settings):

@@ -31,7 +31,7 @@ from gnio_jax.config import (
     FilterSettings,
     ModelConfig,
     TrainConfig,
-    plain,
+    to_plain,
 )
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
@@ -101,7 +101,7 @@ def test_the_calibrated_run_differs_only_in_its_filter_and_average(
     assert settings.considered.gyro_bias > 0
     nees = record["position_nees_per_axis"]
     assert abs(np.log(nees["after"])) < abs(np.log(nees["before"]))
-    assert record["split"] == "val" and record["filter"] == plain(settings)
+    assert record["split"] == "val" and record["filter"] == to_plain(settings)
     assert record["recordings"] == WALKS and record["recordings_with_raw_gyro"] == 0
     assert [f"warning: {line}" for line in record["warnings"]] == warned.splitlines()
     change = record["trajectories"]["ate"]
@@ -111,7 +111,7 @@ def test_the_calibrated_run_differs_only_in_its_filter_and_average(
 
 def test_a_network_is_averaged_over_four_headings(run):
     loaded = checkpoint.load_run(run)
-    averaged = checkpoint.averaged_over_headings(loaded, "the run")
+    averaged = checkpoint.average_over_headings(loaded, "the run")
     assert averaged.config.model.equivariance == "four_headings"
     assert averaged.model == models.from_config(averaged.config.model) != loaded.model
 
@@ -172,7 +172,7 @@ def test_each_session_has_the_predictions_of_the_network_that_left_it_out(
         assert recording.name == name and tiny_run.same(variables, network.variables)
 
 
-def test_the_network_of_every_fold_is_averaged_over_headings(run, fold_runs):
+def test_the_network_of_every_fold_is_average_over_headings(run, fold_runs):
     config = CalibrateConfig(str(run), out_of_fold=tuple(fold_runs), average_headings=True)
     _, networks = predictions.choose_networks(predictions.load_run(run, config), config)
     for source in networks:

@@ -31,7 +31,7 @@ def evaluation(run, **settings):
         "dataset": "tlio",
         "data_root": str(run.parent / "data"),
         "step": 7,
-        "filter": configuration.plain(BASE.filter),
+        "filter": configuration.to_plain(BASE.filter),
         **settings,
     }
     folder = run / "eval" / f"tlio_test_{settings.get('estimator', 'ekf')}"
@@ -55,7 +55,7 @@ def test_existing_figures_are_used(run, monkeypatch):
     [
         ({"definitions": report.DEFINITIONS - 1}, "another version"),
         ({"step": 6}, "of a checkpoint that the run has no more"),
-        ({"filter": {**configuration.plain(BASE.filter), "gravity": 9.0}}, "of another filter"),
+        ({"filter": {**configuration.to_plain(BASE.filter), "gravity": 9.0}}, "of another filter"),
         ({"alignment": "se3"}, "of alignment se3"),
     ],
 )
@@ -106,7 +106,7 @@ def test_a_run_with_a_trained_filter_is_loaded_once(run, monkeypatch):
 
     def evaluate(config, progress, workers, run):
         calls.append((config.filter, run))
-        evaluation(folder, filter=configuration.plain(trained.config.filter))
+        evaluation(folder, filter=configuration.to_plain(trained.config.filter))
 
     folder = run
     monkeypatch.setattr(reuse, "evaluate", evaluate)

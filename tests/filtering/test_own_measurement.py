@@ -209,7 +209,7 @@ def test_numbers_of_measurements_in_settings():
     try:
         ekf = filtering.make_filter(config.data, config.filter)
         assert ekf.measurements == (SteadyHeight(1.0), filtering.ZeroVelocity(0.02))
-        text = configuration.text(config)
+        text = configuration.to_yaml(config)
         assert parse(text) == config and text.index("height") < text.index("zero_velocity")
         changed = configuration.assign(config, ["filter.measurements.height=null"])
         changed = configuration.assign(changed, ["filter.measurements.zero_velocity.std=0.5"])

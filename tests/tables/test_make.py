@@ -117,7 +117,7 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
 
 def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys):
     root, arguments = made
-    monkeypatch.setattr(loop, "train_all", lambda *_, **__: [loop.Outcome(root, None, 15)])
+    monkeypatch.setattr(loop, "train_all", lambda *_, **__: [loop.TrainingResult(root, None, 15)])
     with pytest.raises(SystemExit) as left:
         gnio("tables", "gates", *arguments, "--out", str(root / "elsewhere"))
     assert left.value.code == 128 + 15 and "continues from here" in capsys.readouterr().err

@@ -19,7 +19,7 @@ from gnio_jax.apps.onnx import conversion, driver
 from gnio_jax.apps.onnx.driver import WalkResult
 from gnio_jax.apps.onnx.programs import programs, start_arrays
 from gnio_jax.config import DataConfig
-from gnio_jax.config.files import plain
+from gnio_jax.config.files import to_plain
 from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, estimate, prepare
@@ -147,8 +147,8 @@ def _filter(ekf: Filter) -> dict[str, Any]:
         "log_std_min": config.log_std_min,
         "filter": {
             "config": dataclasses.asdict(config),
-            "noise": plain(ekf.noise),
-            "initial_std": plain(ekf.start),
+            "noise": to_plain(ekf.noise),
+            "initial_std": to_plain(ekf.start),
         },
     }
 
