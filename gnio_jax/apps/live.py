@@ -597,7 +597,7 @@ def line(found: Followed) -> str:
     walked = 0.0
     if len(time) > 1:
         walked = path_length(path.position[:, :2], float(np.median(np.diff(time))))
-    health = "" if found.pose.healthy else "  THE FILTER DIVERGED"
+    health = "" if found.pose.healthy else f"  THE FILTER DIVERGED ({found.pose.failure})"
     return (
         f"{found.pose.time - time[0]:7.1f} s  x {x:+8.2f}  y {y:+8.2f}  z {z:+7.2f} m  "
         f"± {sigma:.2f} m  walked {walked:.1f} m{health}"

@@ -36,7 +36,7 @@ from gnio_jax.filtering import (
     sensitivity,
 )
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
-from gnio_jax.filtering.history import GYRO_BIAS, POSITION
+from gnio_jax.filtering.history import GYRO_BIAS, POSITION, explain_failure
 from gnio_jax.filtering.state import gyro_bias_covariance
 from gnio_jax.models import Network
 from gnio_jax.numerics import (
@@ -282,7 +282,9 @@ def _of_history(
     healthy = _after(1.0, history.healthy) > 0
     if not healthy.all():
         since = recording.time[np.argmin(healthy)] - recording.time[0]
-        notes = (*notes, f"filter: diverged at {since:.1f} s; the poses from then on are invalid")
+        cause = explain_failure(history, ekf.config)
+        problem = f"filter: diverged at {since:.1f} s ({cause})"
+        notes = (*notes, f"{problem}; the poses from then on are invalid")
     position = _after(start.position, history.position)
     orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
     poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))

@@ -10,7 +10,7 @@ from gnio_jax.filtering.consider import considered_covariance, sensitivity
 from gnio_jax.filtering.displacement import displacements
 from gnio_jax.filtering.filter import Filter, make_filter
 from gnio_jax.filtering.fix import Fix, fixes_on_intervals
-from gnio_jax.filtering.history import FilterHistory
+from gnio_jax.filtering.history import FilterHistory, explain_failure
 from gnio_jax.filtering.measurements import register
 from gnio_jax.filtering.scan import run_filter, run_odometry
 from gnio_jax.filtering.settings import FilterConfig
@@ -45,6 +45,7 @@ __all__ = [
     "considered_covariance",
     "cores_as_devices",
     "displacements",
+    "explain_failure",
     "fixes_on_intervals",
     "initial_state",
     "level_state",

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax.config import NoiseModel
@@ -65,7 +66,8 @@ class FilterHistory(NamedTuple):
     healthy: Float[Array, "k"]
     """0 from the first row on whose state is not finite, has a negative variance or a speed above
     `FilterConfig.speed_limit`. The input was bad, and all rows from there on are invalid. The final
-    state remembers this, and a later run from it begins with 0."""
+    state remembers this, and a later run from it begins with 0. `explain_failure` names the
+    cause."""
     outcomes: dict[str, Outcome]
     """The outcomes of all other measurements by their names, stacked over K: of those of the
     filter, as "zero_velocity", and of those of the run, as "fix"."""
@@ -85,6 +87,39 @@ class FilterHistory(NamedTuple):
         factor = jnp.stack([jnp.asarray(value) for value in noise.std_factor])
         scale = noise.measurement_scale * factor[:, None] * factor[None]
         return jnp.asarray(self.displacement), self.measurement_covariance / scale[None]
+
+
+def explain_failure(history: FilterHistory, config: FilterConfig) -> str:
+    """The reason why the first row that is not healthy is not, in words; empty if all rows of this
+    one run are healthy."""
+    healthy = np.asarray(history.healthy) > 0
+    if healthy.all():
+        return ""
+    row = int(np.argmin(healthy))
+    mean, variances = (
+        jax.tree.map(lambda rows: np.asarray(rows[row]), part)
+        for part in (
+            Mean(*(getattr(history, name) for name in Mean._fields)),
+            history.covariance_diagonal,
+        )
+    )
+    gaps = np.asarray(history.imu_gap)[: row + 1]
+    cause = describe_failure(mean, variances, config)
+    coasted = gaps > config.bridge_seconds
+    if coasted.any():
+        cause += f", behind a hole of {gaps.max():.1f} s in the IMU's samples"
+    return cause
+
+
+def describe_failure(mean: Mean, variances: Float[np.ndarray, "15"], config: FilterConfig) -> str:
+    """What makes an estimate impossible, in words."""
+    if not all(np.isfinite(part).all() for part in (*mean, variances)):
+        return "a value is not finite"
+    if (variances < 0).any():
+        return "a variance is below 0"
+    if (speed := float(np.linalg.norm(mean.velocity))) > config.speed_limit:
+        return f"a speed of {speed:.0f} m/s, above the limit of {config.speed_limit:g} m/s"
+    return "an earlier estimate was impossible"
 
 
 class StepRecord(NamedTuple):

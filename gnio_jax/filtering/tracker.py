@@ -36,7 +36,7 @@ from gnio_jax.filtering.consider import (
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.gaps import Imu, bridge
-from gnio_jax.filtering.history import FilterHistory, finished_history
+from gnio_jax.filtering.history import FilterHistory, describe_failure, finished_history
 from gnio_jax.filtering.network import Predict, network_measurement
 from gnio_jax.filtering.propagation import integrate
 from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid
@@ -74,6 +74,8 @@ class Pose(NamedTuple):
     healthy: bool
     """False from the first clone step on whose state is not finite, has a negative variance or a
     speed above `FilterConfig.speed_limit`. All poses from there on are invalid."""
+    failure: str = ""
+    """What made the first pose that is not healthy impossible; empty before it."""
 
 
 class DevicePose(NamedTuple):
@@ -135,7 +137,7 @@ class Tracker:
         check_filter(ekf)
         dt = ekf.config.dt
         check_number("rest_seconds", rest_seconds, 1.5 * dt, "s")
-        self._rest = round(rest_seconds / dt)
+        self._rest, self._failure = round(rest_seconds / dt), ""
         self._stream = Stream(create_grid(dt, hole, imu_rate))
         dtype = jax.dtypes.canonicalize_dtype(np.float64) if state is None else state.offset.dtype
         self._ekf = converted_filter(ekf, dtype)
@@ -249,9 +251,11 @@ class Tracker:
         ahead, estimate, _ = self._ahead
         mean, covariance, numbers = jax.tree.map(np.array, estimate)
         accepted, nis, healthy = numbers.tolist()
+        if not healthy and not self._failure:
+            self._failure = describe_failure(mean, np.diag(covariance), self._ekf.config)
         time = self._stream.origin + (self._stream.taken + ahead) * self._ekf.config.dt
         flags = {"accepted": accepted, "nis": nis, "healthy": healthy > 0}
-        return Pose(time, *mean, covariance=covariance, **flags)
+        return Pose(time, *mean, covariance=covariance, **flags, failure=self._failure)
 
 
 def compile_programs(

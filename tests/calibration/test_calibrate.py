@@ -549,7 +549,7 @@ def average(runs, model=None, augment=None):
     model = dataclasses.replace(loaded.config.model, **(model or {}))
     augment = dataclasses.replace(loaded.config.augment, **(augment or {}))
     config = dataclasses.replace(loaded.config, model=model, augment=augment)
-    return checkpoint.averaged_over_headings(loaded._replace(config=config), "the run")
+    return checkpoint.average_over_headings(loaded._replace(config=config), "the run")
 
 
 def compare_with_another_model(runs):

@@ -217,7 +217,9 @@ def test_an_unhealthy_filter_has_diverged(walks):
     assert np.argmax(np.linalg.norm(void.states.velocity, axis=1) > 100) == row
     for field in void.trajectory[1:]:
         assert np.isfinite(field[:row]).all() and np.isnan(field[row:]).all()
-    words = f"filter: diverged at {row / 10:.1f} s; the poses from then on are invalid"
+    speed = np.linalg.norm(void.states.velocity[row])
+    cause = f"a speed of {speed:.0f} m/s, above the limit of 100 m/s"
+    words = f"filter: diverged at {row / 10:.1f} s ({cause}); the poses from then on are invalid"
     assert void.notes == (words,) and whole.notes == ()
     scores = evaluation.score([void, whole])
     assert [name for name, measures in scores.items() if measures.diverged] == [void.name]

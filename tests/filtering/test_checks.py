@@ -1,6 +1,7 @@
 """Values that cannot be: refused by name at the door, and reported inside `jit`."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.filtering.checks import checked_inputs
+from gnio_jax.filtering.history import describe_failure
 from gnio_jax.filtering.state import CLONE, with_correlated_error
 from tests.support.checks import unchecked
 from tests.support.random_walk import random_walk
@@ -190,6 +192,32 @@ def test_inside_jit_the_history_reports_it(correlation):
         spoilt = next(changes for words, changes in wrong() if words.startswith(f"{name}: 1 of"))
         history = run(arguments(**spoilt, ekf=filtering.Filter(config, noise)))
         np.testing.assert_array_equal(history.healthy, np.arange(INTERVALS) < bad)
+
+
+def test_the_cause_of_what_is_not_healthy_is_told():
+    """A force of 50 m/s² for a second, a value that is not finite, a hole, a start that was bad."""
+    limited = dataclasses.replace(CONFIG, speed_limit=20.0)
+    valid = np.ones(SAMPLES, bool)
+    valid[50:75] = False
+    run = jax.jit(lambda arguments: filtering.run_filter(**arguments)[1])
+
+    def cause(config, **changes):
+        ekf, missing = filtering.Filter(config, NOISE), np.full((INTERVALS, 3), NAN)
+        history = run(arguments(**{"ekf": ekf, "displacement": missing, **changes}))
+        return filtering.explain_failure(history, config)
+
+    pushed = put(ACCEL, np.s_[100:200, 0], 50.0)
+    too_fast = r"a speed of 2\d m/s, above the limit of 20 m/s"
+    assert cause(CONFIG) == ""
+    assert cause(CONFIG, gyro=put(GYRO, (7, 1), NAN)) == "a value is not finite"
+    assert re.fullmatch(too_fast, cause(limited, accel=pushed))
+    behind = rf"{too_fast}, behind a hole of 0\.5 s in the IMU's samples"
+    assert re.fullmatch(behind, cause(limited, accel=pushed, imu_valid=valid))
+    bad = start()._replace(healthy=jnp.bool_(False))
+    assert cause(CONFIG, state=bad) == "an earlier estimate was impossible"
+    mean, variances = start().mean, np.full(15, 1e-3)
+    variances[4] = -1e-9
+    assert describe_failure(mean, variances, CONFIG) == "a variance is below 0"
 
 
 def test_what_a_run_in_float32_leaves_is_a_state():
