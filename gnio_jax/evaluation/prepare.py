@@ -135,10 +135,9 @@ def prepare(
     defaults. A static start replaces the standard deviations of tilt and velocity. A sequence with
     waypoints has no pose to start from, so its start is always static. `ekf.raw_gyro_bias` replaces
     the standard deviation of the level components of the gyro's bias if neither the phone nor a
-    rest gives a first estimate of it: if `imu_compensated` is "no" and the bias starts from
-    zero. `orientation` is the source of
-    `PreparedRecording.attitude`; None: there is none. Raises `InputError` for a sequence that lacks
-    what these choices need.
+    rest gives a first estimate of it: if `imu_compensated` is "no" and the bias starts from zero.
+    `orientation` is the source of `PreparedRecording.attitude`; None: there is none. Raises
+    `InputError` for a sequence that lacks what these choices need.
     """
     ekf = ekf or make_filter(windows, FilterSettings())
     recordings, left_out = [], {}

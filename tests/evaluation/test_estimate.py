@@ -4,6 +4,8 @@ perfect inputs.
 The filter runs over two recordings of one length at a time: two programs serve nearly all tests.
 """
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -256,7 +258,8 @@ def test_every_estimator_keeps_the_waypoints(walks, way):
 def test_the_filter_starts_with_the_uncertainty_of_its_options(walks, how):
     """A start from the reference has all of it, a static start what it does not measure."""
     std = TLIO_STD._replace(yaw=0.3, gyro_bias=0.02, accel_bias=0.2)
-    recordings = ready(walks[:2], std=std, **how)
+    ekf = make_filter(CONFIG, dataclasses.replace(OPTIONS, start=std))
+    recordings = ready(walks[:2], ekf=ekf, **how)
     (estimate, _), start_std = imu_only(recordings), recordings[0].start.std
     assert (start_std.yaw, start_std.gyro_bias) == (0.3, 0.02)
     expected = np.repeat(np.array(start_std), [2, 1, 3, 3, 3, 3])

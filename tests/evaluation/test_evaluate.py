@@ -135,9 +135,9 @@ def test_uncertainties_of_the_filter_reach_the_stages(workdir, walks, monkeypatc
     module, arguments = sys.modules[evaluate.__module__], {}
     original = module.prepare
 
-    def prepare(sequences, windows, std, **how):
-        arguments.update(how, std=std)
-        return original(sequences, windows, std, **how)
+    def prepare(sequences, windows, ekf, **how):
+        arguments.update(ekf=ekf)
+        return original(sequences, windows, ekf, **how)
 
     def infer(*_, **how):
         arguments.update(how)
@@ -148,7 +148,7 @@ def test_uncertainties_of_the_filter_reach_the_stages(workdir, walks, monkeypatc
     monkeypatch.setattr(data, "load", lambda *_: walks[:1])
     with pytest.raises(Reached):
         evaluate(EvaluateConfig(str(workdir), set=("filter.raw_gyro_bias=0.02",), **choice))
-    assert arguments["std"].velocity == 0.7 and arguments["raw_gyro_bias"] == 0.02
+    assert arguments["ekf"].start.velocity == 0.7 and arguments["ekf"].raw_gyro_bias == 0.02
     assert arguments["least_std"] == pytest.approx(least)
 
 

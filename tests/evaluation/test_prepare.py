@@ -1,15 +1,18 @@
 """Starts, biases and cuts of recordings against those of simulated walks."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from gnio_jax import evaluation
-from gnio_jax.config.schema import TLIO_STD
+from gnio_jax.config import FilterSettings
 from gnio_jax.data.simulated import walks as simulated
-from gnio_jax.filtering import FilterConfig
+from gnio_jax.filtering import make_filter
 from gnio_jax.filtering.state import GYRO_BIAS
 from gnio_jax.numerics import yaw
 from tests.support.estimators import CONFIG, RATE, ready, rotations
+from tests.support.filter_settings import changed
 
 
 def test_a_recording_starts_at_its_first_trusted_sample_or_at_its_first(walks):
@@ -92,12 +95,13 @@ def test_a_raw_gyro_starts_with_a_wider_bias(walks, swaying, compensated):
     """It does not if the phone subtracts a bias, or if a rest has shown the bias."""
     attributes = {"imu_compensated": compensated, "placement": "unknown"}
     walk = walks[0]._replace(attributes=attributes)
-    (recording,) = ready([walk], raw_gyro_bias=0.05)
+    ekf = dataclasses.replace(make_filter(CONFIG, FilterSettings()), raw_gyro_bias=0.05)
+    (recording,) = ready([walk], ekf=ekf)
     std = evaluation.prepare([walk], CONFIG)[0][0].start.level_gyro_bias
     expected = 0.05 if compensated == "no" else std
     assert recording.start.level_gyro_bias == expected and std < 0.01
     assert recording.start.std.gyro_bias == std
-    state = recording.start.state(FilterConfig(1 / RATE, 10, 10))
+    state = recording.start.state(ekf)
     up, covariance = np.asarray(state.rotation)[2], state.core_covariance[GYRO_BIAS, GYRO_BIAS]
     assert 0.01 < up[2] < 0.99  # no axis of the phone is vertical
     spreads = np.sqrt(np.linalg.eigvalsh(covariance))
@@ -105,7 +109,7 @@ def test_a_raw_gyro_starts_with_a_wider_bias(walks, swaying, compensated):
     np.testing.assert_allclose(up @ covariance @ up, std**2, rtol=1e-6)
     assert recording.start.raw_gyro == (compensated == "no") and recording.placement == ""
     resting_walk = resting(swaying, BIAS)._replace(attributes=attributes)
-    (recording,) = ready([resting_walk], gyro_bias="rest", raw_gyro_bias=0.05)
+    (recording,) = ready([resting_walk], ekf=ekf, gyro_bias="rest")
     assert recording.start.level_gyro_bias == std
 
 
@@ -148,7 +152,8 @@ def test_a_rest_may_lack_some_samples(swaying):
 def test_the_tilt_of_a_static_start_has_the_uncertainty_of_the_accelerometer(clean):
     tilts = []
     for bias in (0.02, 0.2):
-        (recording,) = ready([clean], std=TLIO_STD._replace(accel_bias=bias), init="static")
+        ekf = make_filter(CONFIG, changed(start={"accel_bias": bias}))
+        (recording,) = ready([clean], ekf=ekf, init="static")
         tilts.append(recording.start.std.tilt)
         assert recording.start.std.accel_bias == bias
     spread = np.sqrt(tilts[0] ** 2 - (0.02 / 9.81) ** 2)
