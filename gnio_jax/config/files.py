@@ -8,7 +8,6 @@ import re
 import reprlib
 import types
 import typing
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
@@ -19,6 +18,7 @@ from yaml.constructor import ConstructorError
 
 from gnio_jax.config.schema import (
     Bound,
+    Entries,
     Location,
     TrainConfig,
 )
@@ -211,7 +211,7 @@ def check_value(hint: Any, content: Any, location: Location, base: Any = None) -
     if content is None and type(None) in kinds:
         return None
     fitting = (kind for kind in kinds if (typing.get_origin(kind) is tuple) == is_list)
-    kind = next(fitting, kinds[0])
+    kind = type(content) if type(content) in kinds else next(fitting, kinds[0])
     origin, members = typing.get_origin(kind), typing.get_args(kind)
     if is_section(kind):
         return _read_section(kind() if base is None else base, content, location)
@@ -238,19 +238,17 @@ def check_value(hint: Any, content: Any, location: Location, base: Any = None) -
     return value
 
 
-def _read_mapping(
-    hint: Any, content: Any, location: Location, base: Mapping
-) -> OrderedDict[str, Any]:
+def _read_mapping(hint: Any, content: Any, location: Location, base: Mapping) -> Entries:
     """The mapping `base` with the entries of another one, whose values have the type `hint`; an
     entry that is null goes."""
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         location.refuse(f"must be a mapping of names, found {_show(content)}")
-    entries = OrderedDict(base)
+    entries = dict(base)
     for key, value in content.items():
         entries[key] = check_value(hint, value, location.child(key), entries.get(key))
         if entries[key] is None:
             del entries[key]
-    return entries
+    return Entries(entries)
 
 
 def _check_bounds(hint: Any, value: Any, location: Location) -> None:

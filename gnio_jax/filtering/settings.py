@@ -14,17 +14,27 @@ from typing import Any, Literal, no_type_check
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import keystr, tree_leaves_with_path
+from jax.tree_util import GetAttrKey, keystr, tree_leaves_with_path
 
 from gnio_jax.config import DataConfig, FilterOptions, FilterSettings
 from gnio_jax.config.files import check_value
-from gnio_jax.config.schema import Count, Location, NonNegative, NonNegativeCount, Positive
+from gnio_jax.config.schema import Count, Entries, Location, NonNegative, NonNegativeCount, Positive
 from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
 _NUMBERS = ("noise", "start", "considered", "measurements")
 _OPTIONS = tuple(field.name for field in dataclasses.fields(FilterOptions))
 _OTHERS = [field.name for field in dataclasses.fields(FilterSettings) if field.name not in _NUMBERS]
 jax.tree_util.register_dataclass(FilterSettings, list(_NUMBERS), _OTHERS)
+
+
+jax.tree_util.register_pytree_with_keys(
+    Entries,
+    lambda entries: (
+        [(GetAttrKey(name), value) for name, value in entries.items()],
+        tuple(entries),
+    ),
+    lambda names, values: Entries(dict(zip(names, values, strict=True))),
+)
 
 YawFrame = Literal["own", "given"]
 """The yaw frame in which a displacement is expressed: that of the filter's own attitude of the

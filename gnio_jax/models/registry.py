@@ -80,7 +80,9 @@ def options(name: str) -> dict[str, Any]:
 def from_config(config: ModelConfig) -> nn.Module:
     """The network that these settings describe; options that are not set take the network's own
     defaults."""
-    return create(**{option: value for option, value in vars(config).items() if value is not None})
+    values = {**vars(config), **config.options}
+    del values["options"]
+    return create(**{option: value for option, value in values.items() if value is not None})
 
 
 def create(name: str, **values: Any) -> nn.Module:
