@@ -10,7 +10,8 @@ from pathlib import Path
 
 from gnio_jax import networks
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import report, tabulate
+from gnio_jax.evaluation import folder as results
+from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import summarise
 from gnio_jax.files import file_stem
@@ -85,7 +86,7 @@ def _read_figures(path: Path | None) -> dict[str, Report]:
     """Read every evaluation of a network, by its folder's name. Raises `InputError`."""
     files = () if path is None else evaluations_folder(path).glob("*/metrics.json")
     folders = sorted(file.parent for file in files)
-    return {folder.name: report.read(folder) for folder in folders}
+    return {folder.name: results.read(folder) for folder in folders}
 
 
 def _describe_error(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:

@@ -8,7 +8,7 @@ import re
 import reprlib
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -18,6 +18,7 @@ from yaml.constructor import ConstructorError
 
 from gnio_jax.config.schema import (
     Bound,
+    Entries,
     Location,
     TrainConfig,
 )
@@ -194,10 +195,12 @@ def check_value(hint: Any, content: Any, location: Location, base: Any = None) -
     if content is None and type(None) in kinds:
         return None
     fitting = (kind for kind in kinds if (typing.get_origin(kind) is tuple) == is_list)
-    kind = next(fitting, kinds[0])
+    kind = type(content) if type(content) in kinds else next(fitting, kinds[0])
     origin, members = typing.get_origin(kind), typing.get_args(kind)
     if is_section(kind):
         return _read_section(kind() if base is None else base, content, location)
+    if origin is Mapping:
+        return _read_mapping(members[1], content, location, base or {})
     if origin is tuple and isinstance(content, list | tuple):
         if ... not in members and len(content) != len(members):
             location.refuse(f"must be a list of {len(members)} values, found {_show(content)}")
@@ -217,6 +220,19 @@ def check_value(hint: Any, content: Any, location: Location, base: Any = None) -
         location.refuse(problem, remedy.strip())
     _check_bounds(hint, value, location)
     return value
+
+
+def _read_mapping(hint: Any, content: Any, location: Location, base: Mapping) -> Entries:
+    """The mapping `base` with the entries of another one, whose values have the type `hint`; an
+    entry that is null goes."""
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        location.refuse(f"must be a mapping of names, found {_show(content)}")
+    entries = dict(base)
+    for key, value in content.items():
+        entries[key] = check_value(hint, value, location.child(key), entries.get(key))
+        if entries[key] is None:
+            del entries[key]
+    return Entries(entries)
 
 
 def _check_bounds(hint: Any, value: Any, location: Location) -> None:
@@ -282,8 +298,20 @@ def iterate_settings(section: Any, prefix: str = "") -> Iterator[tuple[str, Any,
         name, value = prefix + field, getattr(section, field)
         if is_section(type(value)):
             yield from iterate_settings(value, f"{name}.")
+        elif isinstance(value, Mapping):
+            yield from _iterate_entries(value, kind_of(hint), f"{name}.")
         else:
             yield name, hint, value
+
+
+def _iterate_entries(entries: Mapping, hint: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
+    """`iterate_settings` of a mapping whose type is `hint`."""
+    inner = typing.get_args(hint)[1]
+    for key, value in entries.items():
+        if isinstance(value, Mapping):
+            yield from _iterate_entries(value, kind_of(inner), f"{prefix}{key}.")
+        else:
+            yield prefix + key, inner, value
 
 
 def flatten(section: Any) -> dict[str, Any]:
@@ -325,6 +353,8 @@ def to_plain(value: Any) -> Any:
     """Settings as the dictionaries, lists and numbers that YAML and JSON know."""
     if is_section(type(value)):
         return {name: to_plain(getattr(value, name)) for name in typing.get_type_hints(type(value))}
+    if isinstance(value, Mapping):
+        return {name: to_plain(entry) for name, entry in value.items()}
     return list(value) if isinstance(value, tuple) else value
 
 

@@ -7,7 +7,7 @@ A section that relates several fields to each other checks them in `check`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn
@@ -58,6 +58,35 @@ FILE_ONLY = "file only"
 UNNAMED = Words(named=False)
 Number = Any
 """A float in a file. Inside a JAX program it may be an array, so type checkers accept any type."""
+
+
+class Entries(Mapping[str, Any]):
+    """A mapping that cannot change, with its entries in the order in which they are written."""
+
+    def __init__(self, entries: Mapping[str, Any] | None = None) -> None:
+        self._entries = {
+            name: Entries(value) if isinstance(value, dict) else value
+            for name, value in (entries or {}).items()
+        }
+
+    def __getitem__(self, name: str) -> Any:
+        return self._entries[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self._entries.items()))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Mapping) and list(self.items()) == list(other.items())
+
+    def __repr__(self) -> str:
+        return repr(self._entries)
+
 
 ABOVE_ZERO = Bound(lambda value: 0 < value < math.inf, "must be positive and finite")
 NOT_NEGATIVE = Bound(lambda value: 0 <= value < math.inf, "must be finite and not negative")
@@ -200,8 +229,9 @@ class AugmentConfig:
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The network and its options. An option that is not given takes the network's own default,
-    which is the published one. An option that the network does not have is refused."""
+    """The network and its options: those that networks of this package have, and `options`. An
+    option that is not given takes the network's own default, which is the published one. An option
+    that the network does not have is refused."""
 
     name: str = "gnio"
     """Network in the registry of `gnio_jax.models`."""
@@ -230,6 +260,15 @@ class ModelConfig:
     """How a network is made equivariant, so that its displacement turns with a window that is
     turned about the vertical. four_headings is the mean over four headings of the window, at
     inference; canonical_frame uses a frame that a small network finds in the window (EqNIO)."""
+    options: Annotated[Mapping[str, float | int | bool | str | None], FILE_ONLY] = field(
+        default_factory=Entries
+    )
+    """Options that only a network of a plugin has, by their names; --set model.options.NAME=VALUE
+    gives one."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.options, dict):
+            object.__setattr__(self, "options", Entries(self.options))
 
 
 @dataclass(frozen=True)
@@ -397,17 +436,12 @@ class FilterOptions:
     """When the last success is older than this, the gate pauses: everything passes, s."""
     pause_seconds: NonNegative = 1.0
     """Length of such a pause, s."""
-    zero_velocity_std: NonNegative = 0.0
-    """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
-    quiet; 0 for no such update. If a displacement is tested in the same interval and its gate is
-    active, a rest that fails the χ² test is refused, independently of `mahalanobis_fail_scale` and
-    `gate_softness`."""
     rest_gyro: NonNegative = 0.05
     """Bound of |gyro − b_g| in every sample of a quiet IMU, rad/s."""
     rest_accel: NonNegative = 0.3
     """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
     rest_seconds: NonNegative = 0.5
-    """How long the IMU is quiet before its velocity is measured as zero, s."""
+    """How long the IMU is quiet before it rests, s."""
     bridge_seconds: NonNegative = 0.1
     """For this long, s, the last IMU sample stands in for missing ones; then the filter coasts with
     constant attitude and velocity, and windows are no measurements."""
@@ -437,6 +471,11 @@ class FilterSettings(FilterOptions):
     """Standard deviations of the initial state."""
     considered: ConsideredStd = field(default_factory=ConsideredStd)
     """Errors that are not estimated but included in the covariance (Schmidt's consider states)."""
+    measurements: Mapping[str, Mapping[str, float] | None] = field(default_factory=Entries)
+    """Measurements besides the displacement, by their names, each with its numbers; they are taken
+    after the displacement of a clone interval, in this order. zero_velocity: {std: 0.02} measures a
+    velocity of zero with a standard deviation of 0.02 m/s while the IMU rests. `null` takes one
+    away. Others are those that a plugin registers (ours)."""
     window_rotation: Literal["per_sample", "single", "tlio"] | None = None
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
@@ -447,6 +486,10 @@ class FilterSettings(FilterOptions):
     two components that are level at the start, and the vertical one keeps that of `start`. In
     calibration, and for the poses of walks with waypoints, it is that of each axis. By default that
     of `start` is taken for every IMU."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.measurements, dict):  # A hash needs entries that cannot change.
+            object.__setattr__(self, "measurements", Entries(self.measurements))
 
 
 SHORTEST_HORIZON = 1.0
@@ -464,9 +507,9 @@ class ThroughFilter:
     learn: Annotated[tuple[Part, ...], Words("PART")] = ()
     """Parts that are trained through the filter. Without this option the network is trained on
     windows. noise: the filter's densities and bias walks; measurement: the factors of the network's
-    covariance and the correlation of its errors; start: the standard deviations at the start;
-    uncertainty, head, encoder: the network's; all: everything. A filter option that is 0 stays
-    0."""
+    covariance, the correlation of its errors, and the numbers of `filter.measurements`; start: the
+    standard deviations at the start; uncertainty, head, encoder: the network's; all: everything. A
+    filter option that is 0 stays 0."""
     piece_seconds: Positive = 60.0
     """Length of the segments of recordings that are filtered, s."""
     filter_learning_rate: Positive = 0.03

@@ -24,13 +24,20 @@ from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.config import EvaluateConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.estimate import PERFECT_STD, Estimate, estimate, never_moves, perfect
-from gnio_jax.evaluation.infer import given_displacements, infer, no_displacements
+from gnio_jax.evaluation.estimate import (
+    PERFECT_STD,
+    SequenceEstimate,
+    estimate,
+    never_moves,
+    perfect,
+)
+from gnio_jax.evaluation.folder import write
+from gnio_jax.evaluation.infer import infer, no_displacements, reference_displacements
 from gnio_jax.evaluation.metrics import score
-from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
-from gnio_jax.evaluation.report import DEFINITIONS, Report, write
-from gnio_jax.evaluation.trajectory import Alignment, Undefined, paired, read_tum
-from gnio_jax.filtering.settings import filter_setup
+from gnio_jax.evaluation.prepare import Orientation, PreparedRecording, prepare
+from gnio_jax.evaluation.report import DEFINITIONS, Report
+from gnio_jax.evaluation.trajectory import Alignment, Undefined, pair, read_tum
+from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
 from gnio_jax.networks import TrainedNetwork, find_network, newest_run, read_network
 from gnio_jax.networks.folder import evaluations_folder, training_recordings
@@ -55,8 +62,8 @@ class Evaluation(NamedTuple):
     """The result of `evaluate`."""
 
     report: Report
-    estimates: list[Estimate]
-    recordings: list[Recording]
+    estimates: list[SequenceEstimate]
+    recordings: list[PreparedRecording]
     folder: Path
     """Folder of the results."""
 
@@ -84,7 +91,7 @@ def evaluate(
     else:
         trained = read_network(path)
     config = resolve(config, trained.config)
-    windows, ekf = trained.config.data, filter_setup(trained.config.data, config.filter)
+    windows, ekf = trained.config.data, make_filter(trained.config.data, config.filter)
 
     def stage(name: str) -> Progress:
         return functools.partial(reporter.progress, name)
@@ -102,11 +109,10 @@ def evaluate(
     recordings, left_out = prepare(
         sequences,
         windows,
-        ekf.initial_std,
+        ekf,
         init=config.init,
         gyro_bias=config.gyro_bias,
         orientation=config.orientation if _infers(config) else None,
-        raw_gyro_bias=ekf.raw_gyro_bias,
     )
     if not recordings:
         name, reason = next(iter(left_out.items()))
@@ -122,7 +128,7 @@ def evaluate(
     else:
         source = network
     posed = [each for each in recordings if each.waypoints is None]
-    truth = [given_displacements(each, PERFECT_STD) for each in posed]
+    truth = [reference_displacements(each, PERFECT_STD) for each in posed]
 
     own, ideal = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
     batch, perfecting = config.batch_size, stage("estimating with perfect displacements")
@@ -148,11 +154,11 @@ def score_files(reference: Path, estimate: Path, alignment: Alignment = "origin"
     """The report about two trajectories in TUM format, written by any program, at the stamps that
     they share. Raises `InputError` if these are too few."""
     try:
-        path, truth = paired(read_tum(estimate), read_tum(reference))
+        path, truth = pair(read_tum(estimate), read_tum(reference))
     except Undefined as problem:
         remedy = "give both the stamps of one clock, in s"
         raise InputError(estimate, f"{problem} as in {reference}", remedy) from None
-    found = [Estimate(estimate.stem, path, truth)]
+    found = [SequenceEstimate(estimate.stem, path, truth)]
     count = f"{np.isfinite(truth.position).all(axis=1).sum():,} poses"
     settings = {"dataset": estimate.name, "split": f"against {count} of {reference.name}"}
     settings |= {"estimator": "given poses", "alignment": alignment}

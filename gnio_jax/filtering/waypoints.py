@@ -12,6 +12,7 @@ freedom, and the path is smoothed again from the start that was found.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from typing import NamedTuple
@@ -25,10 +26,11 @@ from gnio_jax import geometry
 from gnio_jax.config import CorrelatedError
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.batch import padded_masks, padded_signals
+from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.fix import fixes_on_intervals
 from gnio_jax.filtering.network import Predict
 from gnio_jax.filtering.scan import run_odometry
-from gnio_jax.filtering.settings import FilterConfig, FilterSetup
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import Mean
@@ -69,19 +71,19 @@ class WaypointPoses(NamedTuple):
 def waypoint_poses(
     sequence: Sequence,
     predict: Predict,
-    setup: FilterSetup,
+    ekf: Filter,
     place_std: float = PLACE_STD,
     time_std: float = TIME_STD,
 ) -> WaypointPoses:
     """Poses of a walk with waypoints.
 
-    predict: the displacements, as in `run_odometry`; setup: the filter, at the rate of `sequence`;
+    predict: the displacements, as in `run_odometry`; ekf: the filter, at the rate of `sequence`;
     place_std m, time_std s: the standard deviations of a waypoint. Programs are compiled for each
     `predict` and for a few lengths. Raises `InputError` for a sequence of another rate, shorter
     than `START_SECONDS`, or with fewer than two waypoints or one outside, and where the filter
     fails.
     """
-    config, noise = setup.config, setup.noise
+    config, noise = ekf.config, ekf.noise
     waypoints = _checked_waypoints(sequence, config)
     count = -(-len(sequence.time) // config.samples_per_clone)
     padded = math.ceil(LONGER ** math.ceil(math.log(count, LONGER)))
@@ -100,8 +102,8 @@ def waypoint_poses(
 
     # The path without the waypoints, aligned with them.
     first = slice(_first(config))
-    level = level_state(config, signals[0][first], signals[1][first], setup.initial_std)
-    _, history = _odometry(predict, level, *signals, config, noise, valid)
+    level = level_state(ekf, signals[0][first], signals[1][first])
+    _, history = _odometry(predict, ekf, level, *signals, valid)
     covariance = history.measurement_covariance  # with the factors of `noise`
     displacement = jnp.where(jnp.arange(padded)[:, None] < count, history.displacement, jnp.nan)
     turn, origin, weight, missed = _aligned(at_taps(history.position), place, after, place_std)
@@ -112,18 +114,19 @@ def waypoint_poses(
     covariance = covariance + jnp.diag(jnp.array([short, short, 0.0]) ** 2)[None]
     given_noise = {"measurement_scale": 1.0, "std_factor": (1.0, 1.0, 1.0)}
     noise = noise._replace(**given_noise, correlation=CORRELATION)
-    given = displacement, covariance, config, noise, valid, config.displacement_frame
-    std = setup.initial_std._replace(**START_STD)
+    rows = displacement, covariance, valid, config.displacement_frame
+    std = ekf.start._replace(**START_STD)
     raw = sequence.attributes.get("imu_compensated") == "no" and not level.gyro_bias.any()
-    if raw and setup.raw_gyro_bias is not None:
-        std = std._replace(gyro_bias=setup.raw_gyro_bias)
+    if raw and ekf.raw_gyro_bias is not None:
+        std = std._replace(gyro_bias=ekf.raw_gyro_bias)
+    ekf = dataclasses.replace(ekf, noise=noise, start=std)
     for _ in range(PASSES):
         rotation, position = rotation_z(yaw) @ level.rotation, np.append(origin, 0.0)
-        start = initial_state(config, rotation, np.zeros(3), position, level.gyro_bias, std=std)
+        start = initial_state(ekf, rotation, np.zeros(3), position, level.gyro_bias)
         spread = (place_std**2 / weight)[:, None, None] * np.eye(2)
         late = {"time_std": time_std / np.sqrt(weight), "threshold": math.inf}
         fixes = fixes_on_intervals(after, place, spread, padded, config, **late)
-        smoothed = _smooth(start, *signals, *given, (fixes,))
+        smoothed = _smooth(ekf, start, *signals, *rows, (fixes,))
         off, speed = place - at_taps(smoothed.position), time_std * at_taps(smoothed.velocity)
         spread = place_std**2 * np.eye(2) + speed[:, :, None] * speed[:, None]
         squares = np.einsum("fi,fij,fj->f", off, np.linalg.inv(spread), off)
@@ -168,8 +171,8 @@ def _checked_waypoints(sequence: Sequence, config: FilterConfig) -> Waypoints:
     return waypoints
 
 
-_odometry = jax.jit(run_odometry, static_argnames=("predict", "config"))
-_smooth = jax.jit(smooth, static_argnames=("config", "frame"))
+_odometry = jax.jit(run_odometry, static_argnames="predict")
+_smooth = jax.jit(smooth, static_argnames="frame")
 _planar_alignment = jax.jit(geometry.planar_alignment)
 
 

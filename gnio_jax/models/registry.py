@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import PRNGKeyArray
 
+from gnio_jax import plugins
 from gnio_jax.config import ModelConfig
 from gnio_jax.config.files import check_value
 from gnio_jax.config.schema import Location
@@ -47,7 +48,8 @@ _EQUIVARIANT: dict[str, type[nn.Module]] = {
 
 
 def names() -> list[str]:
-    """Names of the networks that `create` knows."""
+    """Names of the networks that `create` knows, with those of plugins."""
+    plugins.load()
     return sorted(_MODELS)
 
 
@@ -66,8 +68,9 @@ def register(name: str, network: type[nn.Module]) -> None:
 def options(name: str) -> dict[str, Any]:
     """The options of the network `name` and their types. Raises `InputError` for an unknown
     name."""
-    more = "; the program that registers one of your own knows that one, too"
-    network = _MODELS[_check_word(name, names(), f"model '{name}'", "unknown", "models", more)]
+    if name not in _MODELS:
+        _check_word(name, names(), f"model '{name}'", "unknown", "models", "; plugins add others")
+    network = _MODELS[name]
     types = get_type_hints(network, include_extras=True)
     kinds = {field.name: types[field.name] for field in dataclasses.fields(network)}
     kinds |= {"equivariance": Literal["none", *_EQUIVARIANT]}
@@ -77,7 +80,9 @@ def options(name: str) -> dict[str, Any]:
 def from_config(config: ModelConfig) -> nn.Module:
     """The network that these settings describe; options that are not set take the network's own
     defaults."""
-    return create(**{option: value for option, value in vars(config).items() if value is not None})
+    values = {**vars(config), **config.options}
+    del values["options"]
+    return create(**{option: value for option, value in values.items() if value is not None})
 
 
 def create(name: str, **values: Any) -> nn.Module:

@@ -22,7 +22,13 @@ from jaxtyping import Int, PRNGKeyArray
 
 from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
-from gnio_jax.filtering import FilterConfig, initial_state, over_sequences, run_odometry
+from gnio_jax.filtering import (
+    FilterConfig,
+    initial_state,
+    make_filter,
+    over_sequences,
+    run_odometry,
+)
 from gnio_jax.filtering.settings import filter_config, with_free_parameters
 from gnio_jax.training.filter_losses import HORIZON_SECONDS, FilterLosses, filter_losses
 from gnio_jax.training.segments import (
@@ -106,7 +112,8 @@ class FilterTask(Task):
         return BatchLosses(figures, variables["batch_stats"], jnp.all(losses.healthy))
 
     def training_filter(self) -> FilterConfig:
-        """The filter in training: its gate has a slope, and its gradient is cut."""
+        """The settings of the filter in training: its gate has a slope, and its gradient is
+        cut."""
         return dataclasses.replace(
             filter_config(self.config.data, self.config.filter),
             gate_softness=GATE_SOFTNESS,
@@ -131,7 +138,7 @@ class FilterTask(Task):
         return segments, start(jax.random.split(start_key, rows.shape[0]), segments.truth)
 
     def filter_segments(
-        self, variables: Any, segments: Segment, starts: StartEstimate, ekf: FilterConfig
+        self, variables: Any, segments: Segment, starts: StartEstimate, config: FilterConfig
     ) -> FilterLosses:
         """The losses of each segment of a batch, with the network in the filter's loop; the
         segments are divided among the devices."""
@@ -141,17 +148,17 @@ class FilterTask(Task):
         def one(program: Any, segment: Segment, start: StartEstimate) -> FilterLosses:
             frozen, numbers = program
             settings = with_free_parameters(self.config.filter, numbers)
-            first = initial_state(ekf, *start, settings.start)
+            ekf = dataclasses.replace(make_filter(self.config.data, settings), config=config)
+            first = initial_state(ekf, *start)
             predict = functools.partial(models.Inference(self.model), frozen)
-            signals = segment.gyro, segment.accel
-            _, history = run_odometry(predict, first, *signals, ekf, settings.noise)
+            _, history = run_odometry(predict, ekf, first, segment.gyro, segment.accel)
             path = MotionPath(
                 *(
                     jnp.concatenate([getattr(first, name)[None], getattr(history, name)])
                     for name in MotionPath._fields
                 )
             )
-            return filter_losses(path, segment, history, ekf, self.config.through_filter)
+            return filter_losses(path, segment, history, config, self.config.through_filter)
 
         return over_sequences(one, shared=1)((frozen, variables["filter"]), segments, starts)
 
@@ -206,11 +213,11 @@ def validate(
     # The last batch is filled up with segments of weight zero.
     which = jnp.minimum(jnp.arange(batches * size), count - 1)
     weight = (jnp.arange(batches * size) < count).astype(jnp.float64) / count
-    ekf = filter_config(task.config.data, task.config.filter)
+    config = filter_config(task.config.data, task.config.filter)
     drawn = task.segments(key, source, jnp.asarray(source.earliest)[which], turned=False)
 
     def one_batch(batch: tuple[Segment, StartEstimate, jax.Array]) -> FilterLosses:
-        losses = task.filter_segments(state.variables, batch[0], batch[1], ekf)
+        losses = task.filter_segments(state.variables, batch[0], batch[1], config)
         losses = losses._replace(healthy=losses.healthy.astype(jnp.float64))
         return jax.tree.map(lambda values: jnp.tensordot(batch[2], values, 1), losses)
 

@@ -39,7 +39,12 @@ FILTER_PARTS = {
         "noise.gyro_bias_walk",
         "noise.accel_bias_walk",
     ),
-    "measurement": ("noise.measurement_scale", "noise.std_factor", "noise.correlation"),
+    "measurement": (
+        "noise.measurement_scale",
+        "noise.std_factor",
+        "noise.correlation",
+        "measurements",
+    ),
     "start": ("start",),
 }
 """Paths of the numbers of `FilterSettings` that belong to each part of the filter."""

@@ -209,18 +209,18 @@ def smooth_poses(walk: Sequence, pose_network: PoseNetwork) -> Reading:
     point ahead, and the taps may belong to another walk.
     """
     with jax.enable_x64(True):
-        rate, predict, setup = _load_smoother(pose_network)
+        rate, predict, ekf = _load_smoother(pose_network)
         try:
             resampled = data.resample(walk, rate)
             legs = data.with_poses(resampled)
-            poses = filtering.waypoint_poses(resampled, predict, setup).sequence
+            poses = filtering.waypoint_poses(resampled, predict, ekf).sequence
         except InputError as error:
             return Reading([], refusals=(str(error),))
     return Reading([poses.with_reference_where(legs.valid & poses.valid)])
 
 
 @functools.cache
-def _load_smoother(pose_network: PoseNetwork) -> tuple[float, Predict, filtering.FilterSetup]:
+def _load_smoother(pose_network: PoseNetwork) -> tuple[float, Predict, filtering.Filter]:
     """A network's rate (Hz), the network and its filter. They are made once, because programs are
     compiled for each network object. Raises `InputError` if the run has changed."""
     trained = networks.load(pose_network.name)
@@ -230,7 +230,7 @@ def _load_smoother(pose_network: PoseNetwork) -> tuple[float, Predict, filtering
         )
     network, windows = Network.of(trained.model, trained.variables), trained.config.data
     predict = functools.partial(network.apply, network.variables)
-    return windows.rate, predict, filtering.filter_setup(windows, trained.config.filter)
+    return windows.rate, predict, filtering.make_filter(windows, trained.config.filter)
 
 
 def digest_network(network: TrainedNetwork) -> str:

@@ -26,7 +26,7 @@ from tests.support.rerun_files import columns_of
 CONFIG = TrainConfig(
     data=DataConfig(rate=50.0),
     model=ModelConfig(name="tiny"),
-    filter=FilterSettings(zero_velocity_std=0.02),
+    filter=FilterSettings(measurements={"zero_velocity": {"std": 0.02}}),
 )
 RATE = 50.0
 PATIENCE = 120

@@ -41,12 +41,16 @@ def run_and_sensitivity(c, more, rotation, velocity, position, gyro, accel, disp
     """A filter that is disturbed by `c` and then by `more`: its history, sensitivity, and what is
     considered of it."""
     bias = c[:3] + more[:3]
-    start = filtering.initial_state(CONFIG, rotation, velocity, position, bias, std=START)
+    start = filtering.initial_state(
+        filtering.Filter(CONFIG, start=START), rotation, velocity, position, bias
+    )
     given = disturbed(disturbed(displacement, c), more), jax.vmap(jnp.diag)(std**2)
 
     def repeated(start, displacement, covariance):
-        given = gyro, accel, displacement, covariance, CONFIG, NOISE
-        return filtering.run_filter(start, *given, frame="own")[1]
+        ekf = filtering.Filter(CONFIG, NOISE)
+        return filtering.run_filter(ekf, start, gyro, accel, displacement, covariance, frame="own")[
+            1
+        ]
 
     history = repeated(start, *given)
     displacement, covariance = history.given(NOISE)
@@ -171,7 +175,7 @@ TOLD = Told()
 
 @pytest.fixture(scope="module")
 def ready():
-    tracker = filtering.Tracker(TOLD, CONFIG, NOISE, started(0), considered=STD)
+    tracker = filtering.Tracker(TOLD, filtering.Filter(CONFIG, NOISE, considered=STD), started(0))
     return tracker._advance, tracker._look_ahead
 
 
@@ -183,7 +187,7 @@ def built(monkeypatch, ready):
 def started(r):
     runs, _ = walks()
     pose = runs.rotation0[r], runs.velocity0[r], runs.position0[r]
-    return filtering.initial_state(CONFIG, *pose, drawn()[r, :3], std=START)
+    return filtering.initial_state(filtering.Filter(CONFIG, start=START), *pose, drawn()[r, :3])
 
 
 def test_the_tracker_has_the_covariance_of_the_whole_run(built):
@@ -191,7 +195,9 @@ def test_the_tracker_has_the_covariance_of_the_whole_run(built):
     (runs, _), wanted = walks(), history.covariance + added
     TOLD.calls = 0
     for r in range(TRACKED):
-        tracker = filtering.Tracker(TOLD, CONFIG, NOISE, started(r), considered=STD)
+        tracker = filtering.Tracker(
+            TOLD, filtering.Filter(CONFIG, NOISE, considered=STD), started(r)
+        )
         told = np.nan_to_num(disturbed(runs.displacement[r], drawn()[r]))
         poses = []
         for k in checked_at_first(range(N * STRIDES), 30):
@@ -208,7 +214,7 @@ def test_the_tracker_has_the_covariance_of_the_whole_run(built):
 
 
 def test_a_start_from_rest_considers_from_its_first_pose_on(built):
-    waiting = filtering.Tracker(TOLD, CONFIG, NOISE, considered=STD)
+    waiting = filtering.Tracker(TOLD, filtering.Filter(CONFIG, NOISE, considered=STD))
     rest = [[0.0, 0.0, 0.0], [0.0, 0.0, 9.81]]
     pose = [waiting.push(k * DT, *rest) for k in range(50)][-1]
     variance = np.diag(pose.covariance)[9:12]

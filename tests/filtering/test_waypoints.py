@@ -15,7 +15,7 @@ from gnio_jax.types import GRAVITY, Prediction, Sequence, Waypoints
 
 RATE, N, SECONDS, LEGS = 50.0, 10, 25.6, 4
 BEGIN, YAW = 50.0, 0.4
-SETUP = filtering.FilterSetup(
+EKF = filtering.Filter(
     filtering.FilterConfig(1 / RATE, N, 5),
     filtering.NoiseModel(3e-3, 3e-2, measurement_scale=1.0),
     filtering.InitialStd(),
@@ -89,7 +89,7 @@ def test_truer_than_curves_between_the_waypoints(taken, wrong):
     """In place and speed, of legs whose waypoints within are left out, and with one waypoint in a
     wrong place, which loses its weight. The attitude is that of the map."""
     truth, sequence = walk(), tapped(taken, wrong)
-    found, smoothed, weight = filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+    found, smoothed, weight = filtering.waypoint_poses(sequence, predict, EKF, 0.1, 0.2)
     stamps, place = sequence.waypoints
     line = np.stack([np.interp(truth.time, stamps, x) for x in place.T], axis=1)
     paths = [found.position[:, :2], PchipInterpolator(stamps, place)(truth.time), line]
@@ -126,24 +126,24 @@ def test_truer_than_curves_between_the_waypoints(taken, wrong):
 )
 def test_what_has_no_poses_is_refused_in_one_line(change, text):
     with pytest.raises(InputError, match=f"^{text}"):
-        filtering.waypoint_poses(tapped(ALL)._replace(**change), predict, SETUP)
+        filtering.waypoint_poses(tapped(ALL)._replace(**change), predict, EKF)
 
 
 def test_less_trust_in_network_or_gyro_and_a_tap_beside_the_last_stamp():
     """The uniform clock ends up to a sample before the tap that ended the recording; a raw gyro
     starts with the wide prior of its bias."""
     sequence = tapped(ALL)
-    _, smoothed, _ = filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+    _, smoothed, _ = filtering.waypoint_poses(sequence, predict, EKF, 0.1, 0.2)
     variances = smoothed.covariance_diagonal
     late = np.append(sequence.waypoints.time[:-1], sequence.time[-1] + 0.5 / RATE)
     raw = sequence._replace(attributes={"imu_compensated": "no"})
     late = sequence._replace(waypoints=sequence.waypoints._replace(time=late))
-    less = SETUP._replace(noise=SETUP.noise._replace(measurement_scale=9.0))
+    less = dataclasses.replace(EKF, noise=EKF.noise._replace(measurement_scale=9.0))
     horizontal, bias = slice(6, 8), 11  # of the position, and of the gyro about z
     _, smoothed, _ = filtering.waypoint_poses(late, predict, less, 0.1, 0.2)
     found = smoothed.covariance_diagonal[:, horizontal].mean()
     assert found > 1.02 * variances[:, horizontal].mean()
-    wide = SETUP._replace(raw_gyro_bias=0.05)
+    wide = dataclasses.replace(EKF, raw_gyro_bias=0.05)
     _, smoothed, _ = filtering.waypoint_poses(raw, predict, wide, 0.1, 0.2)
     assert smoothed.covariance_diagonal[0, bias] > 1.5 * variances[0, bias]
 
@@ -155,7 +155,7 @@ def test_what_is_behind_the_end_is_no_rest():
     arrays = {name: getattr(whole, name)[:end] for name in fields}
     known = whole.waypoints.time < whole.time[end - 1]
     waypoints = Waypoints(whole.waypoints.time[known], whole.waypoints.position[known])
-    setup = SETUP._replace(config=dataclasses.replace(SETUP.config, zero_velocity_std=0.02))
+    ekf = dataclasses.replace(EKF, measurements=(filtering.ZeroVelocity(0.02),))
     cut = whole._replace(**arrays, waypoints=waypoints)
-    found, _, _ = filtering.waypoint_poses(cut, predict, setup, 0.1, 0.2)
+    found, _, _ = filtering.waypoint_poses(cut, predict, ekf, 0.1, 0.2)
     np.testing.assert_allclose(found.velocity[-1, :2], walk().velocity[end - 1, :2], atol=0.2)

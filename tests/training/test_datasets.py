@@ -11,7 +11,7 @@ import yaml
 
 from gnio_jax import config as configuration
 from gnio_jax import data
-from gnio_jax.calibration import evidence
+from gnio_jax.calibration import predictions
 from gnio_jax.config import CalibrateConfig, DataConfig, EvaluateConfig, TrainConfig
 from gnio_jax.data import windows
 from gnio_jax.data.readers import DATASETS
@@ -154,12 +154,12 @@ def test_an_evaluation_says_of_which_dataset(run):
 def test_a_calibration_takes_a_folder_for_each_dataset(run, monkeypatch):
     read = []
     monkeypatch.setattr(data, "load", lambda name, root, *_: read.append((name, root)) or [])
-    asked = [evidence.Source(read_network(run), None)]
+    asked = [predictions.FoldNetwork(read_network(run), None)]
 
     def gather(*roots):
         config = CalibrateConfig(data_root=roots)
         with pytest.raises(InputError) as refused:  # also where there is nothing to be fitted
-            evidence.gather("val", asked, config, TrainConfig().filter, lambda *_: None, 1)
+            predictions.predict("val", asked, config, TrainConfig().filter, lambda *_: None, 1)
         return str(refused.value)
 
     assert "has no recording with a reference" in gather() + gather("one", "two")

@@ -58,16 +58,16 @@ def smoothed(earlier, monkeypatch):
     of the last three seconds. The walks that it was asked for."""
     asked, run = [], read_network(earlier)
     network = Network.of(run.model, run.variables)
-    wanted = filtering.filter_setup(run.config.data, run.config.filter)
+    wanted = filtering.make_filter(run.config.data, run.config.filter)
 
-    def waypoint_poses(walk, predict, setup):
+    def waypoint_poses(walk, predict, ekf):
         asked.append(walk.name)
         assert jnp.ones(()).dtype == np.float64
         if len(asked) == 1:
             expected = network.apply(network.variables, jnp.float32(WINDOW))
             found = predict(jnp.float32(WINDOW))
             np.testing.assert_array_equal(found.displacement, expected.displacement)
-            assert setup == wanted and setup.raw_gyro_bias == 0.03
+            assert ekf == wanted and ekf.raw_gyro_bias == 0.03
         if walk.name == "survey 1":
             raise InputError(walk.name, "the filter fails on it")
         poses = data.with_poses(walk)

@@ -1,4 +1,4 @@
-"""Evaluations that a network has already, and whether they may replace new ones."""
+"""Existing evaluations of networks, which are used again if they are the requested ones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import NamedTuple
 from gnio_jax.config import EvaluateConfig, to_plain
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import evaluate, folder_of, resolve
-from gnio_jax.evaluation.report import Report, read
+from gnio_jax.evaluation.folder import read
+from gnio_jax.evaluation.report import Report
 from gnio_jax.networks import find_network, newest_run
 from gnio_jax.networks.folder import name_of, read_settings
 from gnio_jax.reporting import Reporter
@@ -17,22 +18,22 @@ IDENTITY = ("dataset", "data_root", "split", "alignment")
 """Settings that two evaluations must share to have the same recordings and errors."""
 
 
-class Kept(NamedTuple):
-    """A requested evaluation of a network, and whether it has to be made."""
+class RequestedEvaluation(NamedTuple):
+    """A requested evaluation of a network, with its figures if they exist."""
 
     config: EvaluateConfig
     """The request, as `evaluate.resolve` completes it."""
     folder: Path
     report: Report | None
-    """The existing report, if it is the requested one."""
+    """The figures, if they exist."""
     problem: str
-    """The reason why it has to be made; empty if it exists."""
+    """The reason why the network has to be evaluated; empty if the figures exist."""
 
 
-def look(config: EvaluateConfig) -> Kept:
-    """The evaluation of a network that `config` asks for, with the network's own filter.
+def find_existing(config: EvaluateConfig) -> RequestedEvaluation:
+    """Find the figures of a network that match `config`, with the network's own filter.
 
-    Raises `InputError` for one that does not exist and cannot be made.
+    Raises `InputError` if the network cannot be evaluated.
     """
     path = find_network(config.network or newest_run())
     if config.checkpoint == "latest":
@@ -47,25 +48,26 @@ def look(config: EvaluateConfig) -> Kept:
     if (folder / "metrics.json").exists():
         try:
             report = read(folder)
-            problem = _differs(report, config) or out_of_date(report, path)
+            problem = _find_difference(report, config) or find_change(report, path)
         except InputError as error:
             problem = f"its figures cannot be used: {error}"
-    return Kept(config, folder, None if problem else report, problem)
+    return RequestedEvaluation(config, folder, None if problem else report, problem)
 
 
-def made(kept: Kept, reporter: Reporter, workers: int = 1) -> Report:
-    """The evaluation, which is made if necessary."""
-    if kept.report is not None:
-        return kept.report
-    config = kept.config
+def load_or_evaluate(request: RequestedEvaluation, reporter: Reporter, workers: int = 1) -> Report:
+    """The existing figures, or those of a new evaluation."""
+    if request.report is not None:
+        return request.report
+    config = request.config
     name = name_of(find_network(config.network or newest_run()))
-    reporter.line(f"evaluating {name} on {config.split} ({config.estimator}): {kept.problem}")
+    reporter.line(f"evaluating {name} on {config.split} ({config.estimator}): {request.problem}")
     evaluate(config, reporter, workers)
-    return read(kept.folder)
+    return read(request.folder)
 
 
-def out_of_date(report: Report, path: Path) -> str:
-    """The reason why the figures are not those of the network in `path`; empty if they are."""
+def find_change(report: Report, path: Path) -> str:
+    """The reason why the figures are not of the weights of the network in `path`; empty if they
+    are."""
     if report.settings.get("checkpoint") == "latest":
         step = str(report.settings.get("step"))
         current = (path / "checkpoints" / "latest" / step).is_dir()
@@ -74,11 +76,11 @@ def out_of_date(report: Report, path: Path) -> str:
     return "" if current else "its figures are of weights that the network has no more"
 
 
-def _differs(report: Report, config: EvaluateConfig) -> str:
+def _find_difference(report: Report, config: EvaluateConfig) -> str:
     """The reason why the figures are not the requested ones; empty if they are."""
     for name in IDENTITY:
-        if (own := report.settings.get(name)) != (wanted := getattr(config, name)):
-            return f"its figures are of {name.replace('_', ' ')} {own}, not {wanted}"
+        if (value := report.settings.get(name)) != (request := getattr(config, name)):
+            return f"its figures are of {name.replace('_', ' ')} {value}, not {request}"
     if config.estimator != "integrate" and report.settings["filter"] != to_plain(config.filter):
         return "its figures are of another filter than the network's"
     return ""

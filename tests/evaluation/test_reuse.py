@@ -1,4 +1,4 @@
-"""Which evaluations that are there may stand for a run."""
+"""Existing evaluations are used if they are the requested ones."""
 
 import dataclasses
 
@@ -6,8 +6,8 @@ import pytest
 
 from gnio_jax import config as configuration
 from gnio_jax.config import EvaluateConfig
-from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept, report
+from gnio_jax.evaluation import report, reuse
+from gnio_jax.evaluation.folder import read
 from gnio_jax.networks.folder import write_weights
 from gnio_jax.reporting import Lines
 from tests.support.filter_settings import changed
@@ -16,7 +16,7 @@ from tests.support.reports import BASE, digest, report_of, write_report, write_r
 
 @pytest.fixture
 def run(tmp_path):
-    """A run on the recordings of a folder, and what its evaluation says of itself."""
+    """A run that has learnt from the recordings of a folder."""
     (tmp_path / "data").mkdir()
     config = dataclasses.replace(BASE, data_root=str(tmp_path / "data"))
     write_run(tmp_path / "run")
@@ -25,8 +25,8 @@ def run(tmp_path):
 
 
 def evaluation(run, **settings):
-    """As it is when it may stand for the run."""
-    own = {
+    """Write an evaluation of the run; without other settings it is the requested one."""
+    all_settings = {
         "dataset": "tlio",
         "data_root": str(run.parent / "data"),
         "weights": digest(run),
@@ -34,22 +34,19 @@ def evaluation(run, **settings):
         **settings,
     }
     folder = run / "eval" / f"tlio_test_{settings.get('estimator', 'ekf')}"
-    return write_report(folder, report_of({"a": 1.0}, {"a": "x"}, **own))
+    return write_report(folder, report_of({"a": 1.0}, {"a": "x"}, **all_settings))
 
 
-def look(run, **options):
-    return kept.look(EvaluateConfig(str(run), plots=False, **options))
+def find(run, **options):
+    return reuse.find_existing(EvaluateConfig(str(run), plots=False, **options))
 
 
-def test_what_is_there_is_taken(run, monkeypatch):
+def test_existing_figures_are_used(run, monkeypatch):
     folder = evaluation(run)
-    found = look(run)
-    assert (found.folder, found.problem) == (folder, "")
-    monkeypatch.setattr(kept, "evaluate", None)
-    assert kept.made(found, Lines()) == report.read(folder)
-    (run / "weights.safetensors").unlink()
-    with pytest.raises(InputError, match=r"holds no weights .*; let gnio train finish"):
-        look(run)
+    request = find(run)
+    assert (request.folder, request.problem) == (folder, "")
+    monkeypatch.setattr(reuse, "evaluate", None)
+    assert reuse.load_or_evaluate(request, Lines()) == read(folder)
 
 
 @pytest.mark.parametrize(
@@ -62,37 +59,37 @@ def test_what_is_there_is_taken(run, monkeypatch):
         ({"alignment": "se3"}, "of alignment se3"),
     ],
 )
-def test_what_means_something_else_is_made_anew(run, monkeypatch, settings, problem):
+def test_figures_with_another_meaning_are_made_again(run, monkeypatch, settings, problem):
     folder = evaluation(run, **settings)
-    lines, made = [], []
+    lines, requests = [], []
 
     def evaluate(config, progress, workers, **_):
-        made.append(config)
+        requests.append(config)
         evaluation(run)
 
-    monkeypatch.setattr(kept, "evaluate", evaluate)
+    monkeypatch.setattr(reuse, "evaluate", evaluate)
     monkeypatch.setattr(Lines, "line", lambda self, text: lines.append(text))
-    found = look(run)
-    assert problem in found.problem and found.report is None
-    assert kept.made(found, Lines()) == report.read(folder) and len(made) == 1
-    assert made[0].filter == BASE.filter and problem in lines[0]
-    assert look(run).problem == ""
+    request = find(run)
+    assert problem in request.problem and request.report is None
+    assert reuse.load_or_evaluate(request, Lines()) == read(folder) and len(requests) == 1
+    assert requests[0].filter == BASE.filter and problem in lines[0]
+    assert find(run).problem == ""
     (folder / "metrics.json").write_text("{}")
-    assert "is not a metrics.json" in look(run).problem
+    assert "is not a metrics.json" in find(run).problem
 
 
-def test_recordings_of_another_folder_are_never_taken(run, tmp_path):
-    """A run that was evaluated on A has no figures on B, whatever the recordings are called. Those
-    of `integrate` are of no filter: other options mean the same."""
+def test_figures_of_another_folder_are_never_used(run, tmp_path):
+    """A run that was evaluated on A has no figures on B, whatever the names of the recordings. The
+    figures of `integrate` have no filter, so its options do not matter."""
     evaluation(run)
     (tmp_path / "other").mkdir()
-    found = look(run, data_root=str(tmp_path / "other"))
-    assert found.report is None and found.config.data_root == str(tmp_path / "other")
-    assert found.folder.name.startswith("tlio_test_ekf_other-")  # those of A stay where they are
+    request = find(run, data_root=str(tmp_path / "other"))
+    assert request.report is None and request.config.data_root == str(tmp_path / "other")
+    assert request.folder.name.startswith("tlio_test_ekf_other-")  # the figures of A stay
     (tmp_path / "link").symlink_to(tmp_path / "data")
-    assert look(run, data_root=str(tmp_path / "link")).problem == ""
+    assert find(run, data_root=str(tmp_path / "link")).problem == ""
     evaluation(run, estimator="integrate", filter={"gravity": 9.0})
-    assert look(run, estimator="integrate").problem == ""
+    assert find(run, estimator="integrate").problem == ""
 
 
 def test_a_filter_that_was_trained_is_that_of_the_weights(run, monkeypatch):
@@ -103,6 +100,6 @@ def test_a_filter_that_was_trained_is_that_of_the_weights(run, monkeypatch):
         requests.append(config.filter)
         evaluation(run, filter=configuration.to_plain(trained))
 
-    monkeypatch.setattr(kept, "evaluate", evaluate)
-    kept.made(look(run), Lines())
-    assert requests == [trained] and look(run).problem == ""
+    monkeypatch.setattr(reuse, "evaluate", evaluate)
+    reuse.load_or_evaluate(find(run), Lines())
+    assert requests == [trained] and find(run).problem == ""
