@@ -271,6 +271,7 @@ def _settings(
         "gyro_bias": config.gyro_bias,
         "imu_compensated": " and ".join(sorted(compensated)),
         "alignment": config.alignment,
+        "network": trained.name,
         "model": trained.config.model.name,
         "checkpoint": config.checkpoint,
         "weights": trained.digest or None,
