@@ -396,9 +396,6 @@ class FilterOptions:
     """When the last success is older than this, the gate pauses: everything passes, s."""
     pause_seconds: NonNegative = 1.0
     """Length of such a pause, s."""
-    gate_softness: NonNegative = 0.0
-    """0 accepts or rejects; above 0 the gate has a slope, for training: a measurement's information
-    is weighted by the logistic function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
     zero_velocity_std: NonNegative = 0.0
     """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
     quiet; 0 for no such update. If a displacement is tested in the same interval and its gate is
@@ -418,12 +415,6 @@ class FilterOptions:
     its age and reaches this value at `bridge_seconds`."""
     gap_accel_std: NonNegative = 3.0
     """Standard deviation of the acceleration that a gap may hide, m/s²."""
-    checkpoint_every: NonNegativeCount = 0
-    """Clone intervals between the states kept for the backward pass, which computes everything else
-    again: less memory, more time. 0 keeps everything."""
-    truncate_every: NonNegativeCount = 0
-    """Number of clone intervals after which the state continues without gradient, for training on
-    long recordings. Values do not change. The final state then has no gradient. 0: never."""
     error: Literal["invariant", "additive"] | None = None
     """The error of velocity and positions. invariant: after an update it is expressed at the new
     estimate, so that no later displacement shows a yaw that nobody measured (right-invariant EKF,
@@ -432,12 +423,6 @@ class FilterOptions:
     speed_limit: Positive = 100.0
     """Largest plausible speed, m/s: an estimate that exceeds it has diverged, and is not `healthy`
     from then on (ours)."""
-
-    def check(self, at: Place) -> None:
-        """Check that a refused measurement is not both weighted and enlarged."""
-        if self.gate_softness and self.mahalanobis_fail_scale:
-            problem = "makes no sense beside mahalanobis_fail_scale"
-            at.below("gate_softness").refuse(problem, "set one of them to 0")
 
 
 @dataclass(frozen=True)

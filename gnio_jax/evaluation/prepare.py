@@ -17,7 +17,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.filtering import FilterConfig, FilterState, InitialStd, initial_state, level_state
 from gnio_jax.filtering.settings import filter_config
-from gnio_jax.filtering.start import level_rows, rest_at_start
+from gnio_jax.filtering.start import rest_at_start
 from gnio_jax.numerics import (
     cumulative_rotation,
     finite_rows,
@@ -227,7 +227,9 @@ def _start(
         velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
         rotation = matrix_from_quaternion(sequence.orientation[0])
         return rotation, velocity, sequence.position[0], std, ""
-    second = level_rows(measured, round(windows.rate))
+    second = measured[measured < round(windows.rate)]
+    if 2 * len(second) < round(windows.rate):  # most of the first second was not measured
+        second = measured[: round(windows.rate)]
     config = filter_config(windows, FilterSettings())
     level = level_state(config, sequence.gyro[second], sequence.accel[second], std)
     found = np.sqrt(np.diag(level.core_covariance))

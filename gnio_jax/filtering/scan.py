@@ -185,7 +185,7 @@ def clone_steps(
         return taken[0], keep(slot, *taken)
 
     rows = jnp.arange(len(age)), by_interval, given, inputs.measurements
-    start = invariant_clones(inputs.state) if config.invariant else inputs.state
+    start = invariant_clones(inputs.state, config)
     state, kept = blocked_scan(step, start, rows, config.checkpoint_every, config.truncate_every)
     return state._replace(imu=memory._replace(quiet=state.imu.quiet)), kept, age
 

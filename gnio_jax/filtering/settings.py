@@ -25,7 +25,7 @@ from gnio_jax.config import (
     NoiseModel,
 )
 from gnio_jax.config.files import checked_value
-from gnio_jax.config.schema import Count, NonNegativeCount, Place, Positive
+from gnio_jax.config.schema import Count, NonNegative, NonNegativeCount, Place, Positive
 from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
 _NUMBERS = ("noise", "start", "considered")
@@ -62,6 +62,15 @@ class FilterConfig(FilterOptions):
     """Rotate each sample of the network's window with its own attitude, or all with that of the
     start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
     earlier, and without subtracting the biases."""
+    gate_softness: NonNegative = 0.0
+    """0 accepts or rejects; above 0 the gate has a slope, for training: a measurement's information
+    is weighted by the logistic function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
+    checkpoint_every: NonNegativeCount = 0
+    """Clone intervals between the states kept for the backward pass, which computes everything else
+    again: less memory, more time. 0 keeps everything."""
+    truncate_every: NonNegativeCount = 0
+    """Number of clone intervals after which the state continues without gradient, for training on
+    long recordings. Values do not change. The final state then has no gradient. 0: never."""
     allow_float32: bool = False
     """Run in float32 if the state is float32: every standard deviation keeps about four digits over
     an hour. Without this setting float32 is refused. Smoothing and derivatives need float64 in any
@@ -75,7 +84,9 @@ class FilterConfig(FilterOptions):
             if isinstance(value, np.ndarray | np.generic) and value.ndim == 0:
                 value = value.item()
             object.__setattr__(self, name, checked_value(hint, value, Place("FilterConfig", name)))
-        self.check(Place("FilterConfig"))
+        if self.gate_softness and self.mahalanobis_fail_scale:
+            problem = "makes no sense beside mahalanobis_fail_scale"
+            Place("FilterConfig", "gate_softness").refuse(problem, "set one of them to 0")
 
     @property
     def window(self) -> int:
@@ -175,6 +186,9 @@ FIXED = {
     "clones_per_window": "data.window_seconds",
     "context_samples": "data.context_seconds",
     "history": "core: reports and calibration read whole covariances",
+    "gate_softness": "training through the filter has a slope of its own; other runs have none",
+    "checkpoint_every": "training and calibration bound their memory; other runs have no gradient",
+    "truncate_every": "training cuts the gradient; consider covariance needs the whole one",
     "allow_float32": "False: commands run the filter in float64",
 }
 """The fields of `FilterConfig` that are no options of an experiment, each with the setting from

@@ -150,7 +150,7 @@ def _backward(
     turn, *others = jnp.split(error, 5)
     if config.invariant:
         covariance = covariance + arc_covariance(covariance)
-        others[:2] = (geometry.right_jacobian(-turn) @ part for part in others[:2])
+        others[:2] = (geometry.left_jacobian_product(turn, part) for part in others[:2])
     rotation = matmul(geometry.exp(turn), step.mean.rotation)
     mean = Mean(rotation, *map(jnp.add, step.mean[1:], others))
     oldest = (step.slot + 1) % config.clones

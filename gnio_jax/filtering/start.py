@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from gnio_jax import geometry
 from gnio_jax.config import InitialStd
@@ -119,14 +119,6 @@ def level_state(
         raise ValueError(f"accel: {problem}; it must be in m/s² and include gravity")
     std, nothing = std._replace(tilt=tilt_std, velocity=velocity_std), np.zeros(3, accel.dtype)
     return initial_state(config, rotation, nothing, nothing, gyro_bias, std=std)
-
-
-def level_rows(measured: Int[np.ndarray, "m"], second: int) -> Int[np.ndarray, "k"]:
-    """Rows from which a level start is made: those of the first `second` samples that were
-    measured, because samples that were interpolated across a gap look like rest. Where these are
-    less than half of that second, they are the first `second` measured rows."""
-    rows = measured[measured < second]
-    return rows if 2 * len(rows) >= second else measured[:second]
 
 
 # One program, as in `without_clones`.

@@ -254,9 +254,11 @@ def turned(theta: Float[Array, "3 k"], lever: Float[Array, "3"]) -> Float[Array,
     return matmul(hat(lever), theta)
 
 
-def invariant_clones(state: FilterState) -> FilterState:
-    """The state at the start of a run: the clones' errors in the invariant form, about a pivot at
-    the anchor."""
+def invariant_clones(state: FilterState, config: FilterConfig) -> FilterState:
+    """The state at the start of a run: the clones' errors in the form of `config`, the invariant
+    one about a pivot at the anchor. `unroll_clones` is the way back."""
+    if not config.invariant:
+        return state
     state = state._replace(pivot=state.anchor)
     return turned_clones(state, state.clone_offset)
 

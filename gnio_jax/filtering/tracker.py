@@ -232,10 +232,9 @@ class Tracker:
         state = checked_state(state, self._config, self._noise)
         window = jnp.zeros((self._config.reach, 7), state.offset.dtype)
         tangents = None if self._considered is None else start_tangents(state)
+        state = invariant_clones(state, self._config)
         # Copies, because the compiled step takes the memory of its argument, which no other array,
         # nor two of its fields, may share.
-        if self._config.invariant:
-            state = invariant_clones(state)
         core = _copied(Core(state, window, jnp.int32(0), tangents))
         flags = jnp.stack([jnp.nan, jnp.nan, state.healthy]).astype(window.dtype)
         self._core: Core | None = core

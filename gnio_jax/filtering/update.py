@@ -257,10 +257,8 @@ def project(state: FilterState, linear: Linearised, step: Step) -> tuple[Outcome
     by_part = dict(linear.jacobian)
     if step.config.invariant and "since_oldest" in by_part:
         # δo_i = ξ_i − hat(p_i − c) θ_i
-        apart = anchors_apart(step.oldest, state.move.dtype)
-        lever = state.anchor - apart * state.move + state.clone_offset[step.oldest] - state.pivot
-        lever = jnp.broadcast_to(lever, (len(linear.residual), 3))
-        of_turn = jnp.cross(by_part["since_oldest"], lever)
+        lever = state.position - since_oldest(state, step.oldest) - state.pivot
+        of_turn = matmul(by_part["since_oldest"], geometry.hat(lever))
         by_part["oldest_rotation"] = by_part.get("oldest_rotation", 0.0) + of_turn
     jacobian = jnp.concatenate(list(by_part.values()), axis=1)
     touched = functools.partial(measurable_errors, by_part, oldest=step.oldest)

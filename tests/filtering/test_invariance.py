@@ -7,8 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from gnio_jax import filtering
+from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.state import invariant_clones, unroll_clones
+from gnio_jax.filtering.update import Step
 from tests.support.compiling import optimised, quick
 from tests.support.walks import errors, simulate
 from tests.support.whole_covariance import covariance
@@ -110,6 +114,15 @@ def test_the_smoother_is_as_uncertain_as_it_may_be():
         assert nees(result, PLACE, row) < 1.6, row
 
 
+def test_the_smoother_turns_back_through_displacements_and_fixes():
+    """A fix turns the error before its update, a displacement behind it."""
+    std = filtering.InitialStd(velocity=1.0, yaw=0.2, position=10.0)
+    result = monte_carlo("invariant", std, 60, fix_every=10, fix_std=0.3, smoothed=True)
+    for row in (9, 20, 40, 59):
+        assert 0.6 < nees(result, YAW, row) < 1.4, row
+        assert 0.6 < nees(result, PLACE, row) < 1.4, row
+
+
 @functools.cache
 def one_walk():
     return simulate(3, 1, 40, N, CLONES, DT, NOISE, filtering.InitialStd(yaw=0.4), SIGMA)
@@ -160,3 +173,74 @@ def test_a_turned_world_turns_the_estimate():
     np.testing.assert_allclose(turned.rotation, world @ state.rotation, atol=1e-10)
     np.testing.assert_allclose(turned.position, world @ state.position, atol=1e-9)
     np.testing.assert_allclose(turned.velocity, world @ state.velocity, atol=1e-9)
+
+
+@quick
+def updated(state, residual, spread):
+    """A run's state before and after an update with a position in the world, or with the velocity
+    in the body, both with additive errors again."""
+    config = config_of("invariant")
+    step = Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), CLONES, 0, config, NOISE)
+    inside, eye, results = invariant_clones(state, config), np.eye(3), []
+    for jacobian, frame in (
+        ({"position": eye}, "world"),
+        ({"velocity": eye, "since_oldest": 0.5 * eye}, "carrier"),
+    ):
+        linear = filtering.linearise(inside, residual, spread, **jacobian)
+        after, _, _ = filtering.measure(inside, linear, step, frame=frame)
+        results.append(unroll_clones(after, 0, config))
+    return results
+
+
+def dense_update(state, rows, residual, spread, world):
+    """The same in the whole error θ, v, p, b_g, b_a | θ_i, p_i, with the exponential of SE(3) by
+    SciPy: mean (rotation, velocity, position, positions of the clones) and covariance."""
+    whole = np.asarray(covariance(state))
+    innovation = rows @ whole @ rows.T + spread
+    error = whole @ rows.T @ np.linalg.solve(innovation, residual)
+    size = len(whole)
+
+    def turned(theta, position, change):
+        block = np.zeros((4, 4))
+        block[:3, :3], block[:3, 3] = np.cross(np.eye(3), theta), change
+        return expm(block)[:3, :3], position + expm(block)[:3, 3]
+
+    poses = [(0, state.velocity, 3), (0, state.position, 6)]
+    clones = np.asarray(state.anchor) + np.asarray(state.clone_offset)
+    poses += [(15 + 6 * i, clone, 18 + 6 * i) for i, clone in enumerate(clones)]
+    new, reset = [], np.eye(size)
+    for theta, value, part in poses:
+        turn, moved = turned(error[theta : theta + 3], value, error[part : part + 3])
+        new.append(moved)
+        lever = -np.cross(np.eye(3), np.asarray(moved - value))  # −hat of the move
+        reset[part : part + 3, theta : theta + 3] = lever
+    turn, _ = turned(error[:3], np.zeros(3), np.zeros(3))
+    if world:
+        whole = reset @ whole @ reset.T
+        innovation = rows @ whole @ rows.T + spread
+    whole = whole - whole @ rows.T @ np.linalg.solve(innovation, rows @ whole)
+    if not world:
+        whole = reset @ whole @ reset.T
+    return turn @ np.asarray(state.rotation), new, whole
+
+
+def test_an_update_is_that_of_the_group():
+    """By large corrections, of which the second order is seen: a position in the world, before
+    which the covariance turns, and a quantity that turns with the carrier, behind which it does."""
+    state = run_pieces("invariant", [24])
+    size = len(covariance(state))
+    position, carrier = np.zeros((3, size)), np.zeros((3, size))
+    position[:, 6:9] = carrier[:, 3:6] = np.eye(3)
+    carrier[:, 6:9], carrier[:, 18:21] = 0.5 * np.eye(3), -0.5 * np.eye(3)
+    residual, spread = np.array([0.8, -0.6, 0.2]), 0.01 * np.eye(3)
+    results = updated(state, residual, spread)
+    for rows, world, after in zip((position, carrier), (True, False), results, strict=True):
+        rotation, (velocity, place, *clones), whole = dense_update(
+            state, rows, residual, spread, world
+        )
+        np.testing.assert_allclose(after.rotation, rotation, atol=1e-10)
+        np.testing.assert_allclose(after.velocity, velocity, atol=1e-10)
+        np.testing.assert_allclose(after.position, place, atol=1e-10)
+        offsets = np.asarray(after.anchor) + np.asarray(after.clone_offset)
+        np.testing.assert_allclose(offsets, clones, atol=1e-10)
+        np.testing.assert_allclose(covariance(after), whole, atol=1e-9)
