@@ -5,8 +5,9 @@ The world of the filter is level, and its yaw is 0 at the start; its rotation an
 the map are not known. So the filter first runs without the waypoints, and the rotation and shift
 that align its path with them (`geometry.planar_alignment`) are applied to its start. From there,
 with an uncertain yaw and position, the smoother takes the waypoints and the displacements of the
-first run. The aligned yaw is only where it linearises: it comes from the same waypoints, and the
-covariances do not count it as another measurement of them (`_without_yaw_prior`).
+first run. The aligned yaw comes from the same waypoints and must not count as another measurement:
+it is only the point at which the smoother is linear, and the covariances are those without it
+(`_without_yaw_prior`).
 
 A tap may be too early, too late or in the wrong place. So a waypoint far from the smoothed path
 gets a larger covariance, with the weight of Student's t with `FREEDOM` degrees of freedom, and the
@@ -35,7 +36,7 @@ from gnio_jax.filtering.network import Predict
 from gnio_jax.filtering.scan import run_odometry
 from gnio_jax.filtering.settings import FilterConfig, FilterSetup
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth
-from gnio_jax.filtering.start import initial_state, level_rows, level_state
+from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import THETA, FilterState, Mean
 from gnio_jax.numerics import (
     filled_up,
@@ -61,10 +62,10 @@ added to the network's own."""
 FREEDOM, PASSES = 4.0, 4
 """Degrees of freedom of the weights, and number of smoothings."""
 LEAST_WEIGHT = 0.5
-"""Weight below which a waypoint does not agree with the smoothed path: it is more than 2.8 standard
-deviations off."""
+"""A waypoint with a smaller weight, more than 2.8 standard deviations from the smoothed path, does
+not agree with it."""
 MOST_YAW_STD = 0.5
-"""Largest standard deviation of the yaw that the waypoints give, rad. Beyond it the yaw is not
+"""Largest standard deviation of the yaw that the waypoints show, rad. Beyond it the yaw is not
 known, and the smoother is not linear."""
 FEWEST_WAYPOINTS = 2
 """Smallest number of waypoints that determine a rotation and a shift."""
@@ -101,8 +102,8 @@ def waypoint_poses(
 
     Raises `InputError` for a sequence of another rate, with samples that are not finite, or without
     `START_SECONDS` and a window that were measured; for waypoints that have a `Waypoints.problem`,
-    or are so near each other that they do not show the yaw; and where the filter fails, or most
-    waypoints are far from the smoothed path.
+    or do not show the yaw; and where the filter fails, or most waypoints are far from the smoothed
+    path.
     """
     config = dataclasses.replace(setup.config, history="core")
     taps = _checked_waypoints(sequence, config)
@@ -124,40 +125,34 @@ def waypoint_poses(
     # The path without the waypoints, aligned with them.
     level = _level_start(sequence, setup)
     _, history = _odometry(predict, level, *walk[:2], config, setup.noise, walk.imu_valid)
-    _, velocity, position = poses_of(history)
-    path = at_taps(position)
-    turn, shift, weight, speed_error = _aligned(path, taps, place_std)
-    yaw, origin = np.arctan2(turn[1, 0], turn[0, 0]), np.append(shift, 0.0)
-
+    _, _, position = poses_of(history)
+    turn, origin, weight, speed_error = _aligned(at_taps(position), taps, place_std, config)
+    yaw = np.arctan2(turn[1, 0], turn[0, 0])
     displacement, covariance = _displacements(history, speed_error, walk.count, config)
-    speed_std = _speed_std(displacement, covariance, sequence, config)
-    tap_std = np.hypot(place_std, time_std * np.linalg.norm(at_taps(velocity), axis=1))
-    tap_std = tap_std / np.sqrt(weight)
-    if (yaw_std := _yaw_std(path @ turn.T, taps, tap_std, speed_std)) > MOST_YAW_STD:
-        problem = f"its waypoints show its yaw to {np.degrees(min(yaw_std, np.pi)):.0f}° only"
-        remedy = "add waypoints that are farther from each other, or leave out the walk"
-        raise InputError(sequence.name, problem, remedy)
+    if not finite_rows(displacement).any():
+        problem = f"has no {config.window * config.dt:g} s that were measured without a gap"
+        raise InputError(sequence.name, problem, "leave out the walk")
 
     unscaled = {"measurement_scale": 1.0, "std_factor": (1.0, 1.0, 1.0)}
     noise = setup.noise._replace(**unscaled, correlation=CORRELATION)
     settings = config, noise, walk.imu_valid, config.displacement_frame
     std = _start_std(sequence, setup, level)
     for _ in range(PASSES):
-        rotation = rotation_z(yaw) @ level.rotation
-        start = initial_state(config, rotation, np.zeros(3), origin, level.gyro_bias, std=std)
+        rotation, position = rotation_z(yaw) @ level.rotation, np.append(origin, 0.0)
+        start = initial_state(config, rotation, np.zeros(3), position, level.gyro_bias, std=std)
         fixes = _fixes(sequence, taps, weight, place_std, time_std, walk, config)
         smoothed = _smooth(start, *walk[:2], displacement, covariance, *settings, (fixes,))
         rotation, velocity, position = poses_of(smoothed)
-        error, late = taps.position - at_taps(position), time_std * at_taps(velocity)
-        spread = place_std**2 * np.eye(2) + late[:, :, None] * late[:, None]
+        error, travel = taps.position - at_taps(position), time_std * at_taps(velocity)
+        spread = place_std**2 * np.eye(2) + travel[:, :, None] * travel[:, None]
         squares = np.einsum("fi,fij,fj->f", error, np.linalg.inv(spread), error)
         weight = (FREEDOM + 2) / (FREEDOM + squares)
-        turn, origin = rotation[0] @ np.asarray(level.rotation).T, np.append(position[0, :2], 0.0)
+        turn, origin = rotation[0] @ np.asarray(level.rotation).T, position[0, :2]
         yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-    if 2 * (distant := int((weight < LEAST_WEIGHT).sum())) > len(weight):
-        problem = f"{distant} of its {len(weight)} waypoints are far from the smoothed path"
-        remedy = "check that they are of this walk and on its clock, or leave out the walk"
-        raise InputError(sequence.name, problem, remedy)
+
+    smoothed = jax.tree.map(lambda rows: np.asarray(rows)[: walk.count], smoothed)
+    smoothed = _without_yaw_prior(smoothed, std.yaw)
+    _check_result(sequence.name, smoothed, weight)
     poses = sequence._replace(
         orientation=quaternion_from_matrix(rotation),
         position=position,
@@ -166,8 +161,7 @@ def waypoint_poses(
         waypoints=None,
         attributes=sequence.attributes | {"reference": "waypoints, smoothed"},
     )
-    smoothed = jax.tree.map(lambda rows: np.asarray(rows)[: walk.count], smoothed)
-    return WaypointPoses(poses, _without_yaw_prior(smoothed, std.yaw), weight)
+    return WaypointPoses(poses, smoothed, weight)
 
 
 _odometry = jax.jit(run_odometry, static_argnames=("predict", "config"))
@@ -230,7 +224,10 @@ def _filled_walk(sequence: Sequence, config: FilterConfig) -> _Walk:
 
 def _level_start(sequence: Sequence, setup: FilterSetup) -> FilterState:
     """The level start from the first second that was measured. Raises `InputError`."""
-    rows = level_rows(sequence.measured_rows, round(START_SECONDS / setup.config.dt))
+    measured, count = sequence.measured_rows, round(START_SECONDS / setup.config.dt)
+    rows = measured[measured < count]
+    if 2 * len(rows) < count:  # most of it was not measured
+        rows = measured[:count]
     signals = sequence.gyro[rows], sequence.accel[rows]
     try:
         return level_state(setup.config, *signals, setup.initial_std)
@@ -248,23 +245,29 @@ def _start_std(sequence: Sequence, setup: FilterSetup, level: FilterState) -> In
     return std
 
 
-# What the taps say of the path
+# What the taps say of the path, and the path of the taps
 # ------------------------------------------------------------------------------------------------
 
 
 def _aligned(
-    path: Float[np.ndarray, "f 2"], taps: Waypoints, least: float
+    path: Float[np.ndarray, "f 2"], taps: Waypoints, least: float, config: FilterConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """The rotation and shift that align a path with the waypoints, the weights of the waypoints
-    (Cauchy's, with the median distance as the scale, or `least` m if that is larger), and the
-    median error of the path over the legs between them, m/s."""
+    (Cauchy's, whose scale is a distance that half of them and one more do not exceed, or `least` m
+    if that is larger), and the median error of the path over the legs between them, m/s.
+
+    A leg that is shorter than a window counts as if it took as long, because it shows no speed.
+    """
     weight = np.ones(len(path))
     for _ in range(10):
         turn, shift = jax.device_get(_planar_alignment(path, taps.position, weight))
         error = path @ turn.T + shift - taps.position
         distance = np.linalg.norm(error, axis=1)
-        weight = 1 / (1 + (distance / max(np.median(distance), least)) ** 2)
-    leg_error = np.linalg.norm(np.diff(error, axis=0), axis=1) / np.diff(taps.time)
+        # Two waypoints can always be fitted, so the median would make outliers of some of a few.
+        scale = np.sort(distance)[(len(path) + 1) // 2]
+        weight = 1 / (1 + (distance / max(scale, least)) ** 2)
+    seconds = np.maximum(np.diff(taps.time), config.window * config.dt)
+    leg_error = np.linalg.norm(np.diff(error, axis=0), axis=1) / seconds
     return turn, shift, weight, float(np.median(leg_error))
 
 
@@ -275,50 +278,9 @@ def _displacements(
     factors of the noise and with the error of the path, m/s."""
     whole = np.arange(len(history.displacement)) < count
     displacement = np.where(whole[:, None], history.displacement, np.nan)
-    error = speed_error * config.clones_per_window * config.clone_seconds
+    error = speed_error * config.window * config.dt
     added = np.diag([error, error, 0.0]) ** 2
     return displacement, np.asarray(history.measurement_covariance) + added[None]
-
-
-def _speed_std(
-    displacement: np.ndarray, covariance: np.ndarray, sequence: Sequence, config: FilterConfig
-) -> float:
-    """Standard deviation of the displacements as a speed, m/s, in the median. Raises `InputError`
-    if there is none."""
-    seconds = config.clones_per_window * config.clone_seconds
-    measured = covariance[finite_rows(displacement)]
-    if not len(measured):
-        problem = f"has no {seconds:g} s that were measured without a gap"
-        raise InputError(sequence.name, problem, "leave out the walk")
-    return float(np.sqrt(np.median(measured[:, [0, 1], [0, 1]]))) / seconds
-
-
-def _yaw_std(
-    path: Float[np.ndarray, "f 2"],
-    taps: Waypoints,
-    tap_std: Float[np.ndarray, "f"],
-    speed_std: float,
-) -> float:
-    """Standard deviation of the yaw that the taps show, rad: by the second derivative of the
-    weighted squares when the path is turned, with the best shift.
-
-    The errors of the taps are independent. That of the path is the integral of the displacements'
-    (`CORRELATION`), whose covariance is, at the times t and u ≥ t after the first tap,
-
-        s² (2 τ t − τ² (1 + e^{−(u − t)/τ} − e^{−t/τ} − e^{−u/τ})).
-
-    Infinite for taps in one place.
-    """
-    memory = CORRELATION.seconds
-    time = (taps.time - taps.time[0]) / memory
-    earlier = np.minimum(time[:, None], time[None])
-    decay = np.exp(-np.abs(time[:, None] - time[None])) - np.exp(-time)[:, None] - np.exp(-time)
-    covariance = (speed_std * memory) ** 2 * (2 * earlier - 1 - decay)
-    inverse = np.linalg.inv(covariance + np.diag(tap_std**2))
-    share = inverse.sum(axis=0) / inverse.sum()
-    path, target = (rows - share @ rows for rows in (path, taps.position))
-    information = float(np.einsum("fi,fg,gi->", path, inverse, target))
-    return 1 / math.sqrt(information) if information > 0 else math.inf
 
 
 def _fixes(
@@ -365,6 +327,21 @@ def _without_yaw_prior(smoothed: SmoothedHistory, yaw_std: float) -> SmoothedHis
     covariance = covariance + growth * regression[:, :, None] * regression[:, None]
     diagonal = np.diagonal(covariance, axis1=1, axis2=2)
     return smoothed._replace(covariance=covariance, covariance_diagonal=diagonal)
+
+
+def _check_result(name: str, smoothed: SmoothedHistory, weight: np.ndarray) -> None:
+    """Refuse smoothed estimates whose yaw the waypoints do not show, or with which most of them do
+    not agree. Raises `InputError`."""
+    yaw_std = np.sqrt(smoothed.covariance_diagonal[:, THETA.stop - 1].min())
+    if not yaw_std <= MOST_YAW_STD:
+        problem = f"its waypoints show its yaw to {np.degrees(yaw_std):.0f}° only"
+        remedy = "add waypoints that are farther from each other, or leave out the walk"
+        raise InputError(name, problem, remedy)
+    distant = int((weight < LEAST_WEIGHT).sum())
+    if 2 * distant > len(weight):
+        problem = f"{distant} of its {len(weight)} waypoints are far from the smoothed path"
+        remedy = "check that they are of this walk and on its clock, or leave out the walk"
+        raise InputError(name, problem, remedy)
 
 
 # Poses at every sample
