@@ -116,6 +116,22 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
             assert np.nanmax(np.abs(other - wanted["displacement"])) > 1e-4
 
 
+def test_where_it_coasted_no_window_is_a_measurement():
+    """Nor where it coasted in the context before the window."""
+    config = dataclasses.replace(CONFIG, bridge_seconds=2 * DT)
+    gyro, accel = recording(0)
+    valid = np.ones(len(gyro), bool)
+    valid[32:40] = False  # the first two of these are held
+    _, history = filtering.run_odometry(
+        predict, start(config), gyro, accel, config, NOISE, imu_valid=valid
+    )
+    measured = np.isfinite(np.asarray(history.displacement)).all(axis=1)
+    for k in range(INTERVALS):
+        first, stop = (k - CLONES + 1) * N - config.context_samples, (k + 1) * N
+        coasted = first < 40 and stop > 34
+        assert measured[k] == (k >= FIRST and not coasted), k
+
+
 def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     """With `history.given`, which takes the factors of the axes off again. The network's log
     standard deviation is raised to a floor."""

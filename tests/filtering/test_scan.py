@@ -170,12 +170,13 @@ def laid(fixes):
 
 @pytest.mark.parametrize(
     "fail_scale, correlation, axes, every",
-    [(0.0, None, 0, None), (8.0, ERRORS, 2, None), (0.0, ERRORS, 3, 8)],
-    ids=["plain", "scaled, correlated, fixes", "correlated, whole fixes, in pieces"],
+    [(0.0, None, 0, None), (8.0, ERRORS, 2, 10), (0.0, ERRORS, 3, 8)],
+    ids=["plain", "scaled, correlated, fixes, in rounds", "correlated, whole fixes, in pieces"],
 )
 def test_random_walk(fail_scale, correlation, axes, every):
     """With missing and rejected rows. A run goes on from the state that another returned: ring,
-    gate and clock included; pieces of 8 intervals end at every slot of a ring of 5."""
+    gate and clock included. Pieces of 8 intervals end within a round of the ring of 5, and pieces
+    of 10 with a whole round."""
     config = GATED(DT, N, CLONES, mahalanobis_fail_scale=fail_scale)
     noise, fixes = noise_of(config, correlation), drawn_fixes(axes) if axes else {}
     measurements = (laid(fixes),) if axes else ()
