@@ -1,106 +1,159 @@
-"""Detection of units and signs from a header or from the data; ambiguous ones are refused."""
+"""Units and signs of the sensors: from an option or a header, or detected from the data. What is
+ambiguous is refused."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter1d
 
+from gnio_jax.data.physics import DEGREE, agreement, check_turning, is_supported
+from gnio_jax.data.physics import ImuSamples as Motion
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import interpolate
 from gnio_jax.types import GRAVITY, STANDARD_G
 
-TO_RAD_PER_SECOND = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
+TO_RAD_PER_SECOND = {"rad/s": 1.0, "deg/s": DEGREE}
 TO_METRES_PER_SECOND_SQUARED = {"m/s2": 1.0, "g": STANDARD_G, "mg": STANDARD_G * 1e-3}
+"""Units that `gnio live` takes too."""
+GYRO_UNITS = TO_RAD_PER_SECOND | {"mdps": DEGREE * 1e-3, "mrad/s": 1e-3}
+ACCEL_UNITS = TO_METRES_PER_SECOND_SQUARED | {"cm/s2": 1e-2, "mm/s2": 1e-3}
 SIGNS = ("android", "ios", "detect")
 
 _SPELLINGS = {
-    "rad/s": ("rad/s", "rads^-1", "rads-1", "radian/s", "radians/s"),
-    "deg/s": ("deg/s", "degs^-1", "degree/s", "degrees/s", "°/s", "dps"),
-    "m/s2": ("m/s2", "m/s^2", "m/s²", "m/s/s", "ms^-2", "ms-2"),
-    "g": ("g",),
-    "mg": ("mg",),
-    "s": ("s", "sec", "seconds"),
-    "ms": ("ms",),
-    "us": ("us", "µs", "μs"),
-    "ns": ("ns",),
+    "rad/s": ("rad/s", "rads^-1", "rads-1", "radian/s", "radians/s", "rad/sec", "rps"),
+    "deg/s": ("deg/s", "degs^-1", "degree/s", "degrees/s", "°/s", "º/s", "dps", "deg/sec"),
+    "mdps": ("mdps", "mdeg/s", "millidps"),
+    "mrad/s": ("mrad/s",),
+    "m/s2": ("m/s2", "m/s^2", "m/s²", "m/s/s", "ms^-2", "ms-2", "m/sec^2", "m/(s^2)", "m/(sec^2)"),
+    "cm/s2": ("cm/s2", "cm/s^2", "cm/s²"),
+    "mm/s2": ("mm/s2", "mm/s^2", "mm/s²"),
+    "g": ("g", "gs", "g's"),
+    "mg": ("mg", "milli-g", "millig"),
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "ms": ("ms", "msec", "msecs", "millis", "millisec", "milliseconds", "msecond"),
+    "us": ("us", "µs", "μs", "usec", "usecs", "micros", "microsec", "microseconds"),
+    "ns": ("ns", "nsec", "nsecs", "nanosecs", "nanos", "nanosec", "nanoseconds"),
 }
 """Our names of units, and their names in headers, without blanks and in small letters."""
 _NAMED = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
+_BRACKETS = re.compile(r"[(\[]([^\[\]]*)[)\]]\s*$")
 
 GRAVITY_RANGES = {"m/s2": (7.0, 13.0), "g": (0.7, 1.3), "mg": (700.0, 1300.0)}
 """Ranges of the accelerometer's median magnitude, by which its unit is recognised."""
+COUNTS_OF_G = {16384: 2, 8192: 4, 4096: 8, 2048: 16, 256: 16}
+"""Counts of usual 16-bit accelerometers in 1 g, and their range, g."""
 GYRO_RANGE = 35.0
 """Largest rate of a phone's gyro, rad/s: none measures more than 2000 deg/s."""
+WIDEST_RANGE = 4000.0
+"""Largest rate of any gyro, deg/s."""
 CARRIED_TURN = 10.0
 """A phone that somebody carries sometimes turns faster than this, deg/s."""
 STEPS = 1.0
 """Standard deviation of the magnitude of the specific force, m/s², which steps exceed."""
 
 
-class Motion(NamedTuple):
-    """What both sensors of an IMU measured at the same stamps."""
+def unit_text(label: str) -> str | None:
+    """The text in round or square brackets at the end of a column's header; None if there is
+    none."""
+    inside = _BRACKETS.search(label)
+    return inside[1].strip() if inside else None
 
-    time: Float[np.ndarray, " n"]
-    """s, increasing."""
-    gyro: Float[np.ndarray, "n 3"]
-    accel: Float[np.ndarray, "n 3"]
+
+def unit_of(text: str | None) -> str | None:
+    """Our name of a unit, such as "rad/s" for "rad s^-1"; None if it is no known unit."""
+    return None if text is None else _NAMED.get(re.sub(r"[\s*·]", "", text).lower())
 
 
 def named_unit(label: str) -> str | None:
     """The unit at the end of a column's header, in round or square brackets, such as "rad/s" in
     "Gyroscope x (rad/s)"; None if it names no known unit."""
-    inside = re.search(r"[(\[]([^()\[\]]*)[)\]]\s*$", label)
-    return _NAMED.get(re.sub(r"[\s*·]", "", inside[1]).lower()) if inside else None
+    return unit_of(unit_text(label))
 
 
-def common_unit(labels: Iterable[str], known: Iterable[str]) -> str | None:
-    """The unit, one of `known`, that all `labels` name."""
-    found = {named_unit(label) for label in labels}
-    return found.pop() if len(found) == 1 and found <= set(known) else None
+def common_unit(
+    texts: Mapping[str, str | None], known: Mapping[str, float], path: Path
+) -> str | None:
+    """The unit, one of `known`, that the columns name; `texts`: column → the unit it names or None.
+    None if none names one. Raises `InputError` for a unit that is not known, or several."""
+    names = {c: t for c, t in texts.items() if t and not re.fullmatch(r"[xyz]|\d+", t.lower())}
+    units = {unit_of(text) for text in names.values()}
+    for column, text in names.items():
+        if unit_of(text) not in known or len(units) > 1:
+            problem = f"column '{column}' is in '{text}', unlike others or no known unit"
+            remedy = f"state one of {', '.join(known)}, or raw counts as in 131/deg/s or 16384/g"
+            raise InputError(path, problem, remedy)
+    return units.pop() if units else None
+
+
+def scale_of(stated: str, known: Mapping[str, float], option: str) -> float:
+    """Value of 1 in SI units of a unit: a name of `known`, "131/deg/s" (counts in one deg/s) or
+    "0.061*mg" (the unit of one count). Raises `InputError`."""
+    match = re.fullmatch(r"(?:(\d[0-9.e+-]*|\.\d+)([/*]))?(.+)", stated.strip())
+    number, mark, name = match.groups() if match else ("0", "", "")
+    unit = name if name in known else unit_of(name)
+    try:
+        size = known[unit or ""] * float(number or 1) ** (-1 if mark == "/" else 1)
+    except (KeyError, ValueError, ZeroDivisionError):
+        size = 0.0
+    if not 0.0 < size < np.inf:
+        remedy = f"known: {', '.join(known)}, counts in one as 16384/g, or their size as 0.061*mg"
+        raise InputError(option, f"unknown value '{stated}'", remedy)
+    return size
 
 
 def accel_scale(
-    accel: Float[np.ndarray, "n 3"], unit: str | None, path: Path, notes: list[str]
+    accel: Float[np.ndarray, "n 3"],
+    unit: str | None,
+    path: Path,
+    notes: list[str],
+    warnings: list[str],
 ) -> float:
     """Value of one unit in m/s²; the unit None is detected. Raises `InputError` if it is
     ambiguous."""
     if unit is not None:
-        return TO_METRES_PER_SECOND_SQUARED[unit]
+        return scale_of(unit, ACCEL_UNITS, "accel_unit")
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     fitting = [name for name, (low, high) in GRAVITY_RANGES.items() if low <= size <= high]
     if not fitting:
         problem = f"the unit of field 'accel' is ambiguous (median magnitude {size:.3g})"
         remedy = "state it, and give the specific force, gravity included"
+        for count, reach in COUNTS_OF_G.items():
+            if 0.8 < size / count < 1.25:
+                remedy = f"raw counts? {count} per g is the scale of ±{reach} g: --accel-unit "
+                remedy += f"{count}/g"
         raise InputError(path, problem, remedy)
     notes.append(f"{path.name}: accel taken as {fitting[0]} (median magnitude {size:.3g})")
-    return TO_METRES_PER_SECOND_SQUARED[fitting[0]]
+    if fitting == ["mg"]:
+        problem = f"unit: {size:.0f} is gravity in mg (1000) as well as in cm/s² (981), which is"
+        warnings.append(f"{problem} ambiguous: state --accel-unit mg or cm/s2")
+    return ACCEL_UNITS[fitting[0]]
 
 
 def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> float:
     """Value of one unit in rad/s; the unit None is detected. `imu.accel` is in m/s².
 
-    Beyond `GYRO_RANGE` it is deg/s. Otherwise the rotation of gravity in the accelerometer decides,
-    if it is large enough. Otherwise, if the recording has steps and never exceeds `CARRIED_TURN`,
-    it is rad/s. Raises `InputError` if it is ambiguous.
+    Beyond `GYRO_RANGE` it is deg/s. Otherwise the turning of gravity decides, if it supports a
+    unit. Otherwise, if the recording has steps and never exceeds `CARRIED_TURN`, it is rad/s.
+    Raises `InputError` if it is ambiguous.
     """
     if unit is not None:
-        return TO_RAD_PER_SECOND[unit]
+        return scale_of(unit, GYRO_UNITS, "gyro_unit")
     peak = float(np.percentile(np.linalg.norm(imu.gyro, axis=1), 99.9))
-    slope, told = _turning_of_gravity(imu)
-    found = {"rad/s": slope, "deg/s": slope / TO_RAD_PER_SECOND["deg/s"]}
-    fitting = [name for name, share in found.items() if told and 0.5 < share < 2.0]
-    shaken = float(np.linalg.norm(imu.accel, axis=1).std()) > STEPS
+    agreements = {name: agreement(imu, scale) for name, scale in TO_RAD_PER_SECOND.items()}
+    contrasts = {name: one[1] for name, one in agreements.items() if is_supported(*one)}
+    is_shaken = float(np.linalg.norm(imu.accel, axis=1).std()) > STEPS
+    if peak > WIDEST_RANGE:
+        problem = f"field 'gyro' reaches {peak:.3g}, beyond any gyro's range in rad/s and deg/s"
+        raise InputError(path, problem, "state its unit: mdps, or raw counts as 131/deg/s")
     if peak > GYRO_RANGE:
         unit, reason = "deg/s", f"it reaches {peak:.3g}, beyond any phone's range in rad/s"
-    elif fitting:
-        unit, reason = fitting[0], f"gravity turns by {slope:.2g} of it"
-    elif peak <= CARRIED_TURN and shaken:
+    elif contrasts:
+        unit = max(contrasts, key=lambda name: contrasts[name])
+        reason = f"gravity turns by it, and {contrasts[unit]:.2g} times less against it"
+    elif peak <= CARRIED_TURN and is_shaken:
         reason = f"a carried phone turns faster than {CARRIED_TURN:g} deg/s"
         unit, reason = "rad/s", f"it reaches {peak:.3g}, and {reason}"
     else:
@@ -111,40 +164,9 @@ def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> f
 
 
 def check_rad_per_second(imu: Motion, path: Path) -> None:
-    """Raise `InputError` if a gyro whose unit a format or header states differs from the rotation
-    of gravity by the factor between rad and deg. `imu` is in SI units according to that
-    statement."""
-    (slope, told), factor = _turning_of_gravity(imu), TO_RAD_PER_SECOND["deg/s"]
-    for share, looks in ((slope / factor, "deg/s"), (slope * factor, "rad/s")):
-        if told and 0.5 < share < 2.0:
-            turns = f"gravity turns by {slope:.3g} of it"
-            problem = f"its gyro looks like {looks}, which it does not say ({turns})"
-            raise InputError(path, problem, "state the unit of the gyro: rad/s or deg/s")
-
-
-def _turning_of_gravity(imu: Motion) -> tuple[float, bool]:
-    """Slope of the change of the smoothed specific force over a second against −∫ω × f, which is 1
-    if ω is in rad/s, and whether it shows the unit: if both correlate by more than 0.5."""
-    step = float(np.median(np.diff(imu.time)))
-    clock = np.arange(imu.time[0], imu.time[-1], step)
-    if len(clock) < 3.0 / step:
-        return 0.0, False
-    force, rate = (
-        gaussian_filter1d(interpolate(clock, imu.time, values), 0.5 / step, axis=0)
-        for values in (imu.accel, imu.gyro)
-    )
-    # A bias is a constant rate; deviations from the median are motion.
-    rate = rate - np.median(rate, axis=0)
-    turned = np.cumsum(-np.cross(rate, force), axis=0) * step
-    turned = np.concatenate([np.zeros((1, 3)), turned])[:-1]
-    second = max(round(1.0 / step), 1)
-    change, expected = force[second:] - force[:-second], turned[second:] - turned[:-second]
-    power, strength = float((expected**2).sum()), float((change**2).sum())
-    # If gravity has not moved, there is only noise and vibration.
-    if power == 0.0 or strength / len(change) < 0.1**2:
-        return 0.0, False
-    both = float((change * expected).sum())
-    return both / power, bool(both > 0.5 * np.sqrt(power * strength))
+    """Raise `InputError` if gravity certainly turns otherwise than the gyro says: its unit, sign,
+    axes or clock is wrong. `imu` is in SI units."""
+    check_turning(imu, path)
 
 
 def signed(

@@ -1,0 +1,316 @@
+"""Tables of text as people have them: preamble, header, row of units, rows, columns.
+
+`layout_of` finds the shape in the first lines. `strict_frame` reads a published layout and refuses
+what is not in it; `tolerant_frame` leaves out damaged rows and names them. Limits are ours.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Int
+
+from gnio_jax.data.parsing.stamps import few, parsed_times
+from gnio_jax.errors import InputError
+
+HEAD, FIRST_LINES = 1 << 17, 400
+"""Numbers of bytes and lines in which the shape of a table is searched."""
+MOST_COLUMNS = 2000
+NUMERIC_SHARE = 0.9
+"""Share of numbers among the cells of a column from which others are damaged."""
+SEPARATORS = (",", ";", "\t", "|", " ")
+"""Separators of cells; " " means any run of blanks."""
+_MARK = re.compile(r"^\s*(#|//|%|@|!)+\s*")
+_DIGITS = r"[+-]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
+_NUMBER = re.compile(_DIGITS, re.IGNORECASE)
+
+
+class Layout(NamedTuple):
+    """The shape of a table of text."""
+
+    separator: str
+    decimal: str
+    """Decimal mark: a point or a comma."""
+    labels: tuple[str, ...]
+    """Names of the columns; none if there is no header."""
+    below: tuple[str, ...]
+    """Cells of a line between the header and the rows, such as units; none if there is none."""
+    before: int
+    """Number of lines before the first row."""
+    width: int
+    """Number of columns."""
+    preamble: tuple[str, ...]
+    """Other lines above the rows that are not blank."""
+
+
+def shortened(text: object, most: int = 80) -> str:
+    """A text from a file in a form that a message can quote: one line of at most `most` printable
+    characters."""
+    line = "".join(c if c.isprintable() else "\ufffd" for c in str(text).strip()[: 4 * most])
+    return line if len(line) <= most else line[: most - 3] + "..."
+
+
+# --- from bytes to lines
+
+
+def check_kind(path: object, head: bytes) -> None:
+    """Raise `InputError` for a file that begins as no recording does."""
+    start = head[:512].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    if start.startswith(b"version https://git-lfs"):
+        raise InputError(path, "is a pointer of Git LFS, not the data", "get it by git lfs pull")
+    if start.startswith(b"<"):
+        raise InputError(path, "is a web page or XML, not the data", "download the file itself")
+    if re.match(rb'[\[{]\s*["\[{\]}]', start):
+        raise InputError(path, "is JSON", "export the recording as CSV")
+
+
+def encoding_of(path: object, head: bytes) -> str:
+    """The encoding of a text by its first bytes: UTF-8 or UTF-16, else the code page of Windows.
+    Raises `InputError` if it is no text."""
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    if head[1:2] == b"\0" and head[1::2].count(0) > 0.4 * len(head) / 2:
+        return "utf-16-le"
+    body = head.rstrip(b"\0")
+    if len(re.findall(rb"[\0-\x08\x0e-\x1f]", body)) > 0.01 * len(body):
+        raise InputError(path, "is no text", "export the recording as CSV")
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(body)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig" if head.startswith(codecs.BOM_UTF8) else "utf-8"  # the parser's fast path
+
+
+def head_of(path: Path, content: bytes | None = None) -> bytes:
+    """The first bytes of a file, or of `content` instead. Raises `InputError`."""
+    if content is not None:
+        return content[:HEAD]
+    try:
+        with path.open("rb") as file:
+            return file.read(HEAD)
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from None
+
+
+def open_text(path: Path, content: bytes | None = None) -> io.TextIOWrapper:
+    """The text of a file, or `content` instead; a byte order mark is dropped."""
+    encoding = encoding_of(path, head_of(path, content))
+    source = path.open("rb") if content is None else io.BytesIO(content)
+    return io.TextIOWrapper(source, encoding=encoding, errors="replace")
+
+
+def is_row(line: str) -> bool:
+    """Whether a line is neither blank nor a comment."""
+    return not line.startswith("#") and bool(line.strip())
+
+
+def cells_of(line: str, separator: str) -> list[str]:
+    """The cells of a line, without blanks and quotes."""
+    if '"' in line and separator != " ":
+        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    else:
+        cells = line.strip("\r\n").split(None if separator == " " else separator)
+    return [cell.strip(" \t\"'\r\n\0\ufeff") for cell in cells]
+
+
+def without_mark(line: str) -> str:
+    """A line without the mark of a comment."""
+    return _MARK.sub("", line)
+
+
+def rows_of(path: Path, layout: Layout, content: bytes | None) -> Iterator[tuple[int, list[str]]]:
+    """(line from 1, cells) of each row below the header."""
+    with open_text(path, content) as file:
+        for number, line in enumerate(file, 1):
+            if number > layout.before and is_row(line):
+                yield number, cells_of(line, layout.separator)
+
+
+# --- from lines to the shape
+
+
+def layout_of(path: Path, content: bytes | None = None, separator: str | None = None) -> Layout:
+    """The shape of a table, from its first lines. The separator is the one that gives the most
+    numbers in rows of the same length; the header is the line above the rows with as many cells, no
+    number and the most names. Raises `InputError` if it is no text or too wide."""
+    head = head_of(path, content)
+    check_kind(path, head)
+    lines = head.decode(encoding_of(path, head), errors="replace").splitlines()[:FIRST_LINES]
+    lines = lines[:-1] if len(head) == HEAD and len(lines) > 1 else lines  # it may be cut
+    stated = re.match(r'\W*sep=(.)"?\s*$', lines[0], re.IGNORECASE) if lines else None
+    marks = [separator] if separator else [stated[1]] if stated else SEPARATORS
+    tables = {mark: [cells_of(line, mark) for line in lines] for mark in marks}
+    scores = {mark: _score(rows) for mark, rows in tables.items()}
+    mark = max(marks, key=lambda one: scores[one][0])
+    (score, width), rows = scores[mark], tables[mark]
+    if score == 0:  # a header without rows, or a table of words
+        first = next((n for n, line in enumerate(lines) if is_row(line)), len(lines) - 1)
+        line = lines[first] if lines else ""
+        mark = separator or max(SEPARATORS[:-1], key=line.count)
+        labels = tuple(cells_of(line, mark if mark in line else " "))
+        return Layout(mark, ".", labels, (), first + 1, len(labels), ())
+    if width > MOST_COLUMNS:
+        raise InputError(path, f"has {width} columns", f"{MOST_COLUMNS} are the most")
+    data = [n for n, cells in enumerate(rows) if len(cells) == width and _is_data(cells)]
+    ends = all(rows[n][-1] == "" for n in data)
+    headers: list[tuple[int, list[str]]] = []
+    for number in range(data[0] - 1, -1, -1):
+        cells = cells_of(without_mark(lines[number]), mark)
+        is_whole = len(cells) == width or (len(cells) == width + 1 and not cells[-1])
+        is_whole |= ends and len(cells) == width - 1
+        if is_whole and any(cells) and not any(_NUMBER.fullmatch(cell) for cell in cells):
+            headers.insert(0, (number, [*cells, ""][:width]))
+        elif headers and lines[number].strip():
+            break
+    header = max(headers, key=lambda one: len(set(one[1]) - {""}), default=(-1, []))
+    below = [cells for number, cells in headers if number > header[0]]
+    names = {number for number, _ in headers}
+    preamble = [lines[n] for n in range(data[0]) if n not in names and lines[n].strip()]
+    is_comma = any(re.search(r"\d,\d", cell) for n in data for cell in rows[n])
+    return Layout(
+        mark,
+        "," if is_comma else ".",
+        tuple(header[1]),
+        tuple(below[-1]) if below else (),
+        data[0],
+        width,
+        tuple(preamble),
+    )
+
+
+def _is_data(cells: list[str]) -> bool:
+    """Whether most of the cells of a line are numbers."""
+    numbers = sum(bool(_NUMBER.fullmatch(cell)) for cell in cells)
+    return len(cells) > 1 and 2 * numbers > sum(map(bool, cells))
+
+
+def _score(rows: list[list[str]]) -> tuple[int, int]:
+    """Number of numbers in rows of the usual width, and this width."""
+    rows = [cells for cells in rows if _is_data(cells)]
+    width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
+    cells = (cell for row in rows if len(row) == width for cell in row)
+    return sum(bool(_NUMBER.fullmatch(cell)) for cell in cells), width
+
+
+# --- from the shape to columns
+
+
+def _parsed(path: Path, layout: Layout, content: bytes | None) -> pd.DataFrame:
+    try:
+        return pd.read_csv(
+            path if content is None else io.BytesIO(content),
+            header=None,
+            skiprows=layout.before,
+            comment="#",
+            sep=r"\s+" if layout.separator == " " else layout.separator,
+            skipinitialspace=True,
+            skip_blank_lines=True,
+            low_memory=False,
+            decimal=layout.decimal,
+            encoding=encoding_of(path, head_of(path, content)),
+            compression=None,
+        )
+    except pd.errors.EmptyDataError:
+        raise InputError(path, "holds no row", "take the file as the logger wrote it") from None
+
+
+def strict_frame(path: Path, layout: Layout, content: bytes | None = None) -> pd.DataFrame:
+    """The rows of a table. Raises `InputError` naming a row that is too long."""
+    try:
+        return _parsed(path, layout, content)
+    except InputError:
+        raise
+    except (UnicodeDecodeError, pd.errors.ParserError, ValueError) as error:
+        problem = f"is no table of text ({shortened(error, 200)})"
+        for number, cells in rows_of(path, layout, content):
+            if len(cells) > layout.width:
+                problem = f"row {number} has {len(cells)} cells, expected {layout.width}"
+                break
+        raise InputError(path, problem, "correct that, or take the file as published") from None
+
+
+def tolerant_frame(
+    path: Path, layout: Layout, content: bytes | None, notes: list[str]
+) -> tuple[pd.DataFrame, Int[np.ndarray, " n"]]:
+    """The rows of a table without a `few` damaged ones, which are named in `notes`, and their
+    numbers among the rows of the file, from 0. Columns of numbers are numbers, times of day are
+    datetime64 in ns, others remain as they are. Raises `InputError` if more are damaged."""
+    frame, is_mixed, width = None, False, layout.width
+    try:
+        frame = _parsed(path, layout, content)
+    except (UnicodeDecodeError, pd.errors.ParserError):
+        pass  # rows of other lengths, or bytes of another encoding
+    if frame is not None and frame.iloc[:, -1].isna().any():  # the parser fills short rows
+        is_open = layout.separator == " " or not _has_separators(path, layout, content, len(frame))
+        frame = None if is_open else frame
+    damaged = np.zeros(0 if frame is None else len(frame), dtype=bool)
+    if frame is None or frame.shape[1] != width:
+        rows = [cells for _, cells in rows_of(path, layout, content)]
+        rows = [cells if any(cells[width:]) else cells[:width] for cells in rows]
+        missing = width - np.array([len(cells) for cells in rows])
+        is_open = bool(layout.labels) and layout.labels[-1] == ""  # a separator ends some rows
+        damaged = (missing != 0) & ~(is_open & (missing == 1))
+        wider = [len(cells) for cells in rows if len(cells) > width and _is_data(cells)]
+        is_mixed = len(wider) > 1 and len(set(wider)) == 1  # rows of another kind are no damage
+        frame = pd.DataFrame([[*cells, *[""] * width][:width] for cells in rows])
+        frame = frame.replace("", np.nan)
+    forms = {}
+    for place in (place for place in frame if frame[place].dtype.kind == "O"):
+        forms[place], valid = _form(frame[place], damaged)
+        damaged = damaged | ~valid
+    if damaged.any():
+        number, cells = next(islice(rows_of(path, layout, content), int(np.argmax(damaged)), None))
+        problem = f"row {number} is no row of {width} numbers: it has {len(cells)} cells"
+        problem += f" ('{shortened(layout.separator.join(cells), 40)}')"
+        if is_mixed or damaged.sum() > few(len(damaged)):
+            problem += f", as {damaged.sum() - 1} others"
+            raise InputError(path, problem, "give a table whose rows have the same columns")
+        notes.append(f"{path.name}: {problem}; {damaged.sum()} such rows are left out")
+    frame = frame[~damaged].reset_index(drop=True)
+    columns = {place: frame[place] for place in frame}
+    for place, form in forms.items():
+        text = pd.Series(frame[place]).astype(str).str.strip(" \"'\0")
+        if form == "number":
+            columns[place] = _as_numbers(text)
+        elif form == "time":
+            columns[place] = pd.Series(parsed_times(text)[0].astype("datetime64[ns]"))
+    return pd.DataFrame(columns), np.flatnonzero(~damaged)
+
+
+def _as_numbers(text: pd.Series) -> pd.Series:
+    return pd.Series(pd.to_numeric(text.str.replace(",", "."), errors="coerce"))
+
+
+def _has_separators(path: Path, layout: Layout, content: bytes | None, rows: int) -> bool:
+    """Whether a text has as many separators as whole rows have."""
+    count = 0
+    with path.open("rb") if content is None else io.BytesIO(content) as file:
+        for _ in range(layout.before):
+            file.readline()
+        while block := file.read(1 << 20):
+            count += block.count(layout.separator.encode())
+    return count == rows * (layout.width - 1)
+
+
+def _form(column: pd.Series, damaged: Bool[np.ndarray, " n"]) -> tuple[str, Bool[np.ndarray, " n"]]:
+    """Whether most cells of a column are numbers, times or words, and which of them are."""
+    text = column.astype(str).str.strip(" \"'\0")
+    blank = column.isna().to_numpy() | text.str.lower().isin(["", "nan"]).to_numpy()
+    rest = ~blank & ~damaged
+    numbers = _as_numbers(text).notna().to_numpy()
+    if numbers[rest].sum() >= NUMERIC_SHARE * max(rest.sum(), 1):
+        return "number", numbers | blank
+    times = parsed_times(text)[1]
+    if times[rest].sum() >= NUMERIC_SHARE * max(rest.sum(), 1):
+        return "time", times
+    return "word", np.ones(len(column), dtype=bool)
