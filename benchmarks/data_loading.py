@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks import baseline
 from gnio_jax import data
-from gnio_jax.data.dataset import Recording
+from gnio_jax.data.dataset import RecordingSource
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.data.loading import read_recording
 from gnio_jax.data.parsing.tables import read_text
@@ -46,19 +46,19 @@ REAL = {
 
 
 def best(
-    function: Callable[[], object], repeats: int, before: Callable[[], object] = lambda: None
+    function: Callable[[], object], repeats: int, prepare: Callable[[], object] = lambda: None
 ) -> float:
     """Seconds of the quickest call. `before` runs ahead of each and is not counted."""
     seconds = []
     for _ in range(repeats):
-        before()
-        began = time.perf_counter()
+        prepare()
+        start = time.perf_counter()
         function()
-        seconds.append(time.perf_counter() - began)
+        seconds.append(time.perf_counter() - start)
     return min(seconds)
 
 
-def find(layout: str, folder: Path, minutes: float, most: int) -> tuple[list[Recording], str]:
+def find(layout: str, folder: Path, minutes: float, most: int) -> tuple[list[RecordingSource], str]:
     """(recordings, "real" or "written") of a layout. Written files go to `folder`."""
     dataset = data.get(LAYOUTS[layout].dataset)
     base, (name, split) = os.environ.get("GNIO_DATA"), REAL.get(layout, ("", ""))
@@ -83,19 +83,19 @@ def measure(
             sequence for recording in recordings for sequence in read_recording(recording).sequences
         ]
 
-    cold = best(read, repeats, before=lambda: shutil.rmtree(cache, ignore_errors=True))
+    cold = best(read, repeats, prepare=lambda: shutil.rmtree(cache, ignore_errors=True))
     cached = best(read, repeats) if cache.is_dir() else None
     paths = [folder / f"{number}.h5" for number in range(len(sequences))]
     for path, sequence in zip(paths, sequences, strict=True):
         write_hdf5(path, sequence)
-    own = best(lambda: [read_hdf5(path) for path in paths], repeats)
+    hdf5_seconds = best(lambda: [read_hdf5(path) for path in paths], repeats)
     hours = sum(float(sequence.time[-1] - sequence.time[0]) for sequence in sequences) / 3600.0
     return {
         "source": source,
         "recordings": len(recordings),
         "hours": hours,
         "cold": hours / cold,
-        "HDF5": hours / own,
+        "HDF5": hours / hdf5_seconds,
         **({"cached": hours / cached} if cached else {}),
     }
 
@@ -114,19 +114,19 @@ def parser_ratio(folder: Path, minutes: float, repeats: int) -> tuple[float, flo
         LAYOUTS["euroc"].write(folder, 60.0 * minutes)
         path, source = next(folder.glob("*/mav0/imu0/data.csv")), "written"
 
-    def ours() -> np.ndarray:
+    def parse_ours() -> np.ndarray:
         table = read_text(path)
         return table.take(*table.columns, gaps=True)
 
-    def theirs() -> np.ndarray:
+    def parse_numpy() -> np.ndarray:
         return np.loadtxt(path, delimiter=",", comments="#")
 
-    np.testing.assert_allclose(ours(), theirs(), rtol=1e-15)
+    np.testing.assert_allclose(parse_ours(), parse_numpy(), rtol=1e-15)
     # In turn, so that a busy machine slows both.
-    times = [(best(ours, 1), best(theirs, 1)) for _ in range(repeats)]
+    times = [(best(parse_ours, 1), best(parse_numpy, 1)) for _ in range(repeats)]
     size = path.stat().st_size / 2**20
-    about = f"{path.relative_to(path.parents[3])}, {source}, {size:.1f} MiB"
-    return min(first for first, _ in times), min(second for _, second in times), about
+    description = f"{path.relative_to(path.parents[3])}, {source}, {size:.1f} MiB"
+    return min(first for first, _ in times), min(second for _, second in times), description
 
 
 def report_layout(layout: str, minutes: float, most: int, repeats: int) -> dict[str, float]:
@@ -134,8 +134,8 @@ def report_layout(layout: str, minutes: float, most: int, repeats: int) -> dict[
     with tempfile.TemporaryDirectory() as folder:
         row = measure(layout, Path(folder), minutes, most, repeats)
     cached = f"{row['cached']:8.3f}" if "cached" in row else f"{'':8}"
-    about = f"{layout:>14} {row['source']:>8} {row['recordings']:3} {row['hours']:6.2f}"
-    print(f"{about} {row['cold']:8.3f} {cached} {row['HDF5']:8.3f}", flush=True)
+    description = f"{layout:>14} {row['source']:>8} {row['recordings']:3} {row['hours']:6.2f}"
+    print(f"{description} {row['cold']:8.3f} {cached} {row['HDF5']:8.3f}", flush=True)
     ways = [way for way in ("cold", "cached", "HDF5") if way in row]
     return {f"h/s, {layout}, {way}": float(row[way]) for way in ways}
 
@@ -143,10 +143,12 @@ def report_layout(layout: str, minutes: float, most: int, repeats: int) -> dict[
 def report_parser(minutes: float, repeats: int) -> float:
     """Measure and print our text parser beside np.loadtxt; the ratio of their times."""
     with tempfile.TemporaryDirectory() as folder:
-        ours, theirs, about = parser_ratio(Path(folder) / "files", minutes, repeats)
-    ratio = theirs / ours
-    times = f"{1e3 * ours:.0f} ms, np.loadtxt {1e3 * theirs:.0f} ms"
-    print(f"\ntext ({about}): {times}: {ratio:.1f} times as long")
+        parser_seconds, numpy_seconds, description = parser_ratio(
+            Path(folder) / "files", minutes, repeats
+        )
+    ratio = numpy_seconds / parser_seconds
+    times = f"{1e3 * parser_seconds:.0f} ms, np.loadtxt {1e3 * numpy_seconds:.0f} ms"
+    print(f"\ntext ({description}): {times}: {ratio:.1f} times as long")
     return ratio
 
 

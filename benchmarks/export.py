@@ -27,8 +27,8 @@ from gnio_jax.apps import packages  # noqa: E402
 from gnio_jax.apps.onnx import driver, export_run  # noqa: E402
 from gnio_jax.apps.onnx.programs import start_arrays  # noqa: E402
 from gnio_jax.apps.onnx.run import draw_walk  # noqa: E402
-from gnio_jax.apps.track import tracking_filter  # noqa: E402
 from gnio_jax.evaluation import Recording  # noqa: E402
+from gnio_jax.filtering.settings import filter_setup  # noqa: E402
 from gnio_jax.models import Network  # noqa: E402
 
 
@@ -44,9 +44,9 @@ def main() -> None:
         out = Path(folder) / "models"
         export_run(arguments.run, out)
         models = driver.open_models(out, arguments.threads)
-        setup = tracking_filter(run)
-        drawn = draw_walk(run.config.data, setup, arguments.seconds)
-        times = measure(run, models, drawn)
+        setup = filter_setup(run.config.data, run.config.filter)
+        recording = draw_walk(run.config.data, setup, arguments.seconds)
+        times = measure(run, models, recording)
     period = 1e3 * setup.config.clone_seconds
     print(f"\n{'part':>34} {'p50 ms':>8} {'p99 ms':>8} {'of the period':>14}")
     for part, values in times.items():
@@ -58,19 +58,19 @@ def main() -> None:
     print(f"ONNX / gnio-jax, network:        {theirs / ours:.2f}")
 
 
-def measure(run: Any, models: driver.Models, drawn: Recording) -> dict[str, list[float]]:
+def measure(run: Any, models: driver.Models, recording: Recording) -> dict[str, list[float]]:
     """Seconds of each part of each clone interval that has a window."""
-    setup = tracking_filter(run)
+    setup = filter_setup(run.config.data, run.config.filter)
     network = Network.of(run.model, run.variables)
     apply = jax.jit(
         lambda window: network.apply(network.variables, window)._replace(diagnostics={})
     )
-    state = drawn.start.state(setup.config)
+    state = recording.start.state(setup.config)
     tracker = filtering.Tracker(apply, setup.config, setup.noise, state)
     arrays, dt = start_arrays(state, setup), setup.config.dt
     times: dict[str, list[float]] = defaultdict(list)
-    for k, rows in enumerate(clone_intervals(len(drawn.gyro), setup.config.samples_per_clone)):
-        stride = {"gyro": drawn.gyro[rows], "accel": drawn.accel[rows]}
+    for k, rows in enumerate(clone_intervals(len(recording.gyro), setup.config.samples_per_clone)):
+        stride = {"gyro": recording.gyro[rows], "accel": recording.accel[rows]}
         stamps = dt * np.arange(rows.start, rows.stop)
         samples = list(zip(stamps, *stride.values(), strict=True))
         for sample in samples[:-1]:
@@ -80,32 +80,34 @@ def measure(run: Any, models: driver.Models, drawn: Recording) -> dict[str, list
         parts = {}
         if k >= models.first_measured:
             inputs = {**arrays, **stride}
-            parts["window"], cut = timed(lambda given=inputs: driver.run(models.window, given))
+            parts["window"], cut = timed(lambda inputs=inputs: driver.run(models.window, inputs))
             window = cut["window"]
             parts["network"], measured = timed(lambda w=window: driver.measure(models, w))
             times["gnio-jax, whole"].append(ours)
             jitted, _ = timed(lambda w=window: jax.block_until_ready(apply(w)))
             times["gnio-jax, network"].append(jitted)
         inputs = {**arrays, **stride, **measured}
-        parts["filter step"], after = timed(lambda given=inputs: driver.run(models.step, given))
-        arrays = {"state." + key.removeprefix("next."): value for key, value in after.items()}
+        parts["filter step"], next_state = timed(
+            lambda inputs=inputs: driver.run(models.step, inputs)
+        )
+        arrays = {"state." + key.removeprefix("next."): value for key, value in next_state.items()}
         if "network" in parts:
             times["ONNX, whole"].append(sum(parts.values()))
-            for part, spent in parts.items():
-                times[f"ONNX, {part}"].append(spent)
+            for part, seconds in parts.items():
+                times[f"ONNX, {part}"].append(seconds)
     return times
 
 
 def clone_intervals(samples: int, n: int) -> list[slice]:
-    """Their rows."""
+    """The rows of each clone interval."""
     return [slice(first, first + n) for first in range(0, samples - n + 1, n)]
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds, and what it returned: on the host, or waited for."""
+    """Seconds of a call, and its result, which is on the host or waited for."""
     begin = time.perf_counter()
-    found = call()
-    return time.perf_counter() - begin, found
+    result = call()
+    return time.perf_counter() - begin, result
 
 
 if __name__ == "__main__":

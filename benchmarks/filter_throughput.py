@@ -103,8 +103,8 @@ def measure(
 def mebibytes(program) -> float:
     """Memory of a compiled program on one device: temporaries, arguments and results."""
     memory = program.memory_analysis()
-    held = memory.argument_size_in_bytes + memory.output_size_in_bytes
-    return (memory.temp_size_in_bytes + held) / 2**20
+    interface = memory.argument_size_in_bytes + memory.output_size_in_bytes
+    return (memory.temp_size_in_bytes + interface) / 2**20
 
 
 def measure_numpy(config: filtering.FilterConfig, seconds: float) -> float:
@@ -131,7 +131,7 @@ def measure_numpy(config: filtering.FilterConfig, seconds: float) -> float:
 
 
 class GradientCost(NamedTuple):
-    """What value and gradient of a number of pieces cost."""
+    """The cost of value and gradient of a number of pieces."""
 
     ratio: float
     """Their time over that of the value alone."""
@@ -170,15 +170,17 @@ def measure_gradient(
     else:
         logarithms, *of_piece = arguments
         arguments = logarithms, *(jnp.stack([part] * pieces) for part in of_piece)
-    both = jax.value_and_grad(value, argnums=(0, 1, 2))
-    programs = [jax.jit(function).lower(*arguments).compile() for function in (value, both)]
+    with_gradient = jax.value_and_grad(value, argnums=(0, 1, 2))
+    programs = [
+        jax.jit(function).lower(*arguments).compile() for function in (value, with_gradient)
+    ]
     for program in programs:
         result = jax.block_until_ready(program(*arguments))
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(result))
     times = [[timed(program, arguments) for program in programs] for _ in range(repeats)]
-    alone, with_gradient = np.min(times, axis=0)
+    value_seconds, gradient_seconds = np.min(times, axis=0)
     memory = programs[1].memory_analysis().temp_size_in_bytes / 2**20
-    return GradientCost(with_gradient / alone, pieces / with_gradient, memory)
+    return GradientCost(gradient_seconds / value_seconds, pieces / gradient_seconds, memory)
 
 
 def timed(program, arguments: tuple) -> float:

@@ -51,12 +51,12 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
     apply, frozen = models.Inference(model), models.inference_variables(model, variables)
 
     def with_network(frozen, gyro, accel):
-        def lean(windows):
+        def predict(windows):
             return apply(frozen, windows)._replace(diagnostics={})
 
-        return filtering.run_odometry(lean, state, gyro, accel, config, noise)[1].position
+        return filtering.run_odometry(predict, state, gyro, accel, config, noise)[1].position
 
-    def given(gyro, accel, displacement, covariance):
+    def filter_alone(gyro, accel, displacement, covariance):
         signals = (gyro, accel, displacement, covariance)
         _, history = filtering.run_filter(state, *signals, config, noise)
         return history.position
@@ -73,14 +73,16 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
     compiled = time.perf_counter() - begin
     assert bool(jnp.isfinite(program(frozen, *signals)).all())
     whole = best(program, (frozen, *signals), repeats)
-    alone = best(jax.jit(for_all(given, 0)), (*signals, displacement, covariance), repeats)
+    filter_seconds = best(
+        jax.jit(for_all(filter_alone, 0)), (*signals, displacement, covariance), repeats
+    )
     samples = gyro.shape[1]
     duration = batch * samples * DT
     windows = batch * (samples // config.samples_per_clone - config.clones_per_window)
     return {
         "whole": duration / whole,
-        "filter": duration / alone,
-        "ms a window": (whole - alone) / windows * 1e3,
+        "filter": duration / filter_seconds,
+        "ms a window": (whole - filter_seconds) / windows * 1e3,
         "compile": compiled,
         "seconds": whole,
         "windows": windows,

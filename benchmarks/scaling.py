@@ -39,11 +39,11 @@ STEPS = 8
 """Steps per dispatch."""
 
 
-class Network(NamedTuple):
-    """What the GPUs are assumed to be."""
+class Cluster(NamedTuple):
+    """Assumptions about the GPUs and the network between them."""
 
     flops: float = 0.35 * 989e12
-    """Of one GPU, bfloat16: the wished share of an H100's peak."""
+    """Operations per second of one GPU, bfloat16: the wished share of an H100's peak."""
     inside: float = 300e9
     """Bytes per second between GPUs of a machine of eight (NVLink)."""
     between: float = 40e9
@@ -59,15 +59,19 @@ def configuration(width: int, batch: int) -> TrainConfig:
     return TrainConfig(model=ModelConfig(width=width), optim=OptimConfig(batch_size=batch))
 
 
-def prepared(config: TrainConfig, model: nn.Module):
+def prepare(config: TrainConfig, model: nn.Module):
     """A function that takes a state through STEPS steps, the state, and its program."""
     samples = config.data.seen
     source = parallel.everywhere(jax.device_get(recordings(samples, config.optim.batch_size)))
     task = WindowTask(model, config, 1000)
     state = task.initial_state(jax.random.key(0), None)
     order = parallel.everywhere(np.arange(source.start.shape[0], dtype=np.int32))
-    given = (source, order, jnp.int32(0), jnp.int32(STEPS), jnp.float32(1), jax.random.key(1))
-    return lambda state: train_steps(state, *given, task=task), state, (given, {"task": task})
+    arguments = (source, order, jnp.int32(0), jnp.int32(STEPS), jnp.float32(1), jax.random.key(1))
+    return (
+        lambda state: train_steps(state, *arguments, task=task),
+        state,
+        (arguments, {"task": task}),
+    )
 
 
 def work(arguments: argparse.Namespace) -> None:
@@ -75,7 +79,7 @@ def work(arguments: argparse.Namespace) -> None:
     parallel.initialise(arguments.worker, arguments.devices)
     with parallel.sharing(arguments.devices):
         config = configuration(arguments.width, arguments.batch)
-        run, state, _ = prepared(config, models.from_config(config.model))
+        run, state, _ = prepare(config, models.from_config(config.model))
         best = math.inf
         for _ in range(arguments.repeats + 1):  # the first compiles
             began = time.perf_counter()
@@ -87,15 +91,15 @@ def work(arguments: argparse.Namespace) -> None:
         print(f"{STEPS * arguments.batch / best:.0f} {memory:.0f}")
 
 
-def measured(layout: str, width: int, batch: int, repeats: int) -> tuple[float, float]:
+def measure_layout(layout: str, width: int, batch: int, repeats: int) -> tuple[float, float]:
     """Windows/s of a layout, and MiB of its first process."""
-    processes, each = (int(word) for word in layout.split("x"))
+    processes, devices = (int(word) for word in layout.split("x"))
     with socket.socket() as free:
         free.bind(("localhost", 0))
         coordinator = f"localhost:{free.getsockname()[1]}"
-    command = [sys.executable, "-m", "benchmarks.scaling", "--devices", str(each)]
+    command = [sys.executable, "-m", "benchmarks.scaling", "--devices", str(devices)]
     command += ["--width", str(width), "--batch", str(batch), "--repeats", str(repeats)]
-    started = [
+    workers = [
         subprocess.Popen(
             [*command, "--worker", f"{coordinator},{processes},{k}"],
             stdout=subprocess.PIPE,
@@ -103,10 +107,10 @@ def measured(layout: str, width: int, batch: int, repeats: int) -> tuple[float, 
         )
         for k in range(processes)
     ]
-    said = [process.communicate()[0] for process in started]
-    if any(process.returncode for process in started):
+    outputs = [process.communicate()[0] for process in workers]
+    if any(process.returncode for process in workers):
         raise SystemExit(f"layout {layout} failed")
-    rate, memory = said[0].split()[-2:]
+    rate, memory = outputs[0].split()[-2:]
     return float(rate), float(memory)
 
 
@@ -118,7 +122,7 @@ def measure(arguments: argparse.Namespace) -> None:
         for layout in arguments.layouts:
             number = math.prod(int(word) for word in layout.split("x"))
             batch = arguments.batch * (number if name == "weak" else 1)
-            rate, memory = measured(layout, arguments.width, batch, arguments.repeats)
+            rate, memory = measure_layout(layout, arguments.width, batch, arguments.repeats)
             first = first or rate
             print(
                 f"  {layout:>5s}  batch {batch:5d}  {rate:8,.0f} windows/s  {rate / first:5.2f} of "
@@ -135,8 +139,8 @@ def model(batch: int) -> None:
     network = models.from_config(config.model).clone(winograd=False)  # as on a GPU
     flops = flops_per_window(config, network)
     with parallel.sharing(2):
-        _, state, (given, static) = prepared(config, network)
-        text = train_steps.lower(state, *given, **static).compile().as_text()
+        _, state, (arguments, static) = prepare(config, network)
+        text = train_steps.lower(state, *arguments, **static).compile().as_text()
     sums = [
         numbers(line) for line in text.splitlines() if re.search(r" all-reduce(-start)?\(", line)
     ]
@@ -144,23 +148,23 @@ def model(batch: int) -> None:
         f"{flops / 1e9:.2f} GFLOP a window (forward and backward); a step sums "
         f"{4 * sum(sums) / 1e6:.1f} MB over the devices, in {len(sums)} sums"
     )
-    gpu = Network()
+    gpu = Cluster()
     print(f"assumed: {assumptions(gpu)}")
     print("GPUs  batch each  computing ms  sums ms  share of the time that computes")
     for gpus in (8, 64, 512):
-        for each in (batch // gpus, batch, 8 * batch):
-            row(gpus, each, flops, sums, gpu)
+        for windows in (batch // gpus, batch, 8 * batch):
+            row(gpus, windows, flops, sums, gpu)
 
 
-def row(gpus: int, each: int, flops: float, sums: list[int], network: Network) -> None:
-    """One line of the model: `each` windows on every GPU."""
+def row(gpus: int, windows: int, flops: float, sums: list[int], cluster: Cluster) -> None:
+    """One line of the model: `windows` windows on every GPU."""
     machines = max(1, gpus // 8)
-    speed = network.inside if machines == 1 else network.between
+    speed = cluster.inside if machines == 1 else cluster.between
     ring = 2 * (gpus - 1) / gpus * 4 * sum(sums) / speed
-    waits = network.latency_inside + network.latency_between * math.log2(machines)
-    computing, summing = each * flops / network.flops, ring + len(sums) * waits
-    share = computing / (computing + summing) if each else 0.0
-    print(f"{gpus:4d}  {each:10d}  {1e3 * computing:12.2f}  {1e3 * summing:7.2f}  {share:6.0%}")
+    waits = cluster.latency_inside + cluster.latency_between * math.log2(machines)
+    computing, summing = windows * flops / cluster.flops, ring + len(sums) * waits
+    share = computing / (computing + summing) if windows else 0.0
+    print(f"{gpus:4d}  {windows:10d}  {1e3 * computing:12.2f}  {1e3 * summing:7.2f}  {share:6.0%}")
 
 
 def flops_per_window(config: TrainConfig, network: nn.Module) -> float:
@@ -168,12 +172,12 @@ def flops_per_window(config: TrainConfig, network: nn.Module) -> float:
     imu = jnp.zeros((config.optim.batch_size, config.data.seen, 6), jnp.float32)
     variables = jax.eval_shape(network.init, jax.random.key(0), imu[:1])
 
-    def loss(params, rest):
-        rest = {name: tree for name, tree in rest.items() if name != "params"}
-        said, _ = network.apply(
-            {"params": params, **rest}, imu, train=True, mutable=["batch_stats"]
+    def loss(params, state):
+        state = {name: tree for name, tree in state.items() if name != "params"}
+        prediction, _ = network.apply(
+            {"params": params, **state}, imu, train=True, mutable=["batch_stats"]
         )
-        return jnp.sum(said.displacement**2) + jnp.sum(said.log_std)
+        return jnp.sum(prediction.displacement**2) + jnp.sum(prediction.log_std)
 
     counted = jax.jit(jax.grad(loss)).lower(variables["params"], variables).cost_analysis()
     return counted["flops"] / config.optim.batch_size
@@ -186,12 +190,12 @@ def numbers(line: str) -> int:
     return sum(math.prod(int(size) for size in shape.split(",") if size) for shape in shapes)
 
 
-def assumptions(network: Network) -> str:
+def assumptions(cluster: Cluster) -> str:
     """The assumptions in one line."""
-    inside, between = network.inside / 1e9, network.between / 1e9
-    wait, more = 1e6 * network.latency_inside, 1e6 * network.latency_between
+    inside, between = cluster.inside / 1e9, cluster.between / 1e9
+    wait, more = 1e6 * cluster.latency_inside, 1e6 * cluster.latency_between
     return (
-        f"{network.flops / 1e12:.0f} TFLOP/s a GPU, {inside:.0f} GB/s within a machine of 8, "
+        f"{cluster.flops / 1e12:.0f} TFLOP/s a GPU, {inside:.0f} GB/s within a machine of 8, "
         f"{between:.0f} GB/s between machines, {wait:.0f} us for a small sum, {more:.0f} us more "
         "for each doubling of the machines, no sum while computing"
     )

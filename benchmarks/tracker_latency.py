@@ -37,14 +37,14 @@ def network(width: int):
     )
     random = np.random.default_rng(0)
 
-    def drawn(leaf: jax.ShapeDtypeStruct) -> jax.Array:
+    def draw(leaf: jax.ShapeDtypeStruct) -> jax.Array:
         fan_in = max(1, int(np.prod(leaf.shape[:-1])))
         return jnp.asarray(
             random.normal(0, fan_in**-0.5, leaf.shape) if leaf.ndim > 1 else np.ones(leaf.shape),
             jnp.float32,
         )
 
-    variables = jax.tree.map(drawn, shapes)
+    variables = jax.tree.map(draw, shapes)
     print(f"{sum(leaf.size for leaf in jax.tree.leaves(variables['params'])):,} parameters")
     frozen = models.inference_variables(model, variables)
     return lambda windows: models.Inference(model)(frozen, windows)
@@ -57,21 +57,21 @@ def measure(
     random = np.random.default_rng(first)
     gyro = 0.02 * random.standard_normal((samples, 3))
     accel = 0.3 * random.standard_normal((samples, 3)) + [0.0, 0.0, 9.81]
-    found: dict[str, list[float]] = {"step": [], "step, cpu": [], "sample": [], "sample, cpu": []}
+    times: dict[str, list[float]] = {"step": [], "step, cpu": [], "sample": [], "sample, cpu": []}
     gc.collect()
     if not collect:
         gc.disable()
     try:
         for k in range(samples):
-            spent, begin = time.process_time(), time.perf_counter()
+            cpu_start, begin = time.process_time(), time.perf_counter()
             pose = tracker.push((first + k) / imu_rate, gyro[k], accel[k])
-            wall, cpu = time.perf_counter() - begin, time.process_time() - spent
+            wall, cpu = time.perf_counter() - begin, time.process_time() - cpu_start
             kind = "sample" if pose is None else "step"
-            found[kind].append(1e3 * wall)
-            found[f"{kind}, cpu"].append(1e3 * cpu)
+            times[kind].append(1e3 * wall)
+            times[f"{kind}, cpu"].append(1e3 * cpu)
     finally:
         gc.enable()
-    return {kind: np.array(values) for kind, values in found.items()}
+    return {kind: np.array(values) for kind, values in times.items()}
 
 
 def main() -> None:
@@ -96,17 +96,17 @@ def main() -> None:
     begin = time.perf_counter()
     tracker = filtering.Tracker(predict, config, filtering.NoiseModel(), state, imu_rate=imu_rate)
     print(f"compiled in {time.perf_counter() - begin:.1f} s\n")
-    pushed = WARM_UP * per_step
-    measure(tracker, 0, pushed, imu_rate, True)
+    sample_count = WARM_UP * per_step
+    measure(tracker, 0, sample_count, imu_rate, True)
     figures, period = {}, 1e3 * PER_CLONE / RATE
     print(f"{'':>22} {'collector':>9} {'p50 ms':>8} {'p99 ms':>8} {'max ms':>8} {'p99/period':>10}")
     for collect in (True, False):
         collector = "on" if collect else "off"
-        found = measure(tracker, pushed, arguments.steps * per_step, imu_rate, collect)
-        pushed += arguments.steps * per_step
-        for kind, values in found.items():
-            p50, p99, most = np.percentile(values, [50, 99, 100])
-            row = f"{kind:>22} {collector:>9} {p50:8.3f} {p99:8.3f} {most:8.3f}"
+        times = measure(tracker, sample_count, arguments.steps * per_step, imu_rate, collect)
+        sample_count += arguments.steps * per_step
+        for kind, values in times.items():
+            p50, p99, longest = np.percentile(values, [50, 99, 100])
+            row = f"{kind:>22} {collector:>9} {p50:8.3f} {p99:8.3f} {longest:8.3f}"
             print(f"{row} {p99 / period:10.4f}", flush=True)
             figures[f"{kind}, p50 ms, collector {collector}"] = float(p50)
             figures[f"{kind}, p99 ms, collector {collector}"] = float(p99)

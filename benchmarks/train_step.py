@@ -64,8 +64,8 @@ def ours(config: TrainConfig):
 
     def whole():
         first, count, factor = jnp.int32(0), jnp.int32(STEPS), jnp.float32(1)
-        given = source, order, first, count, factor, key
-        holder[0], progress = train_steps(holder[0], *given, task=task)
+        arguments = source, order, first, count, factor, key
+        holder[0], progress = train_steps(holder[0], *arguments, task=task)
         jax.block_until_ready(progress)
         return STEPS
 

@@ -148,13 +148,14 @@ def speed_of_a_large_product(size: int = 2048) -> float:
 def in_turn(other: Path, rounds: int, program: str, *arguments: int) -> tuple[list, list]:
     """The best seconds (clock, processor) of the other version and of this one."""
     versions = [Version(root, program, *arguments) for root in (other, HERE)]
-    found = [[version.work() for version in versions] for _ in range(rounds)]
+    times_by_round = [[version.work() for version in versions] for _ in range(rounds)]
     for version in versions:
         version.end()
-    before, now = (
-        [min(each) for each in zip(*times, strict=True)] for times in zip(*found, strict=True)
+    other_seconds, seconds_here = (
+        [min(seconds) for seconds in zip(*times, strict=True)]
+        for times in zip(*times_by_round, strict=True)
     )
-    return before, now
+    return other_seconds, seconds_here
 
 
 def row(name: str, before: list, now: list) -> str:

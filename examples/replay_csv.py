@@ -35,7 +35,7 @@ class Replay:
     """How long the device is still at the start, s."""
 
 
-class Recorded(NamedTuple):
+class ImuSamples(NamedTuple):
     """Samples as they were recorded, not resampled. A missing sample is NaN."""
 
     time: np.ndarray
@@ -52,7 +52,7 @@ class Recorded(NamedTuple):
 
 
 @dataclass
-class Replayed:
+class ReplayResult:
     """Poses of a replay, and how long each push took in s."""
 
     poses: list = field(default_factory=list)
@@ -60,7 +60,7 @@ class Replayed:
     other_samples: list[float] = field(default_factory=list)
 
 
-def read(path: Path) -> Recorded:
+def read(path: Path) -> ImuSamples:
     """Read a CSV or HDF5. Raises `InputError` if a stamp is missing or does not increase."""
     from gnio_jax.data.hdf5 import read_hdf5
     from gnio_jax.data.parsing.tables import read_text
@@ -68,16 +68,16 @@ def read(path: Path) -> Recorded:
 
     if path.suffix.lower() in (".h5", ".hdf5"):
         sequence = read_hdf5(path)
-        return Recorded(sequence.time, sequence.gyro, sequence.accel)
+        return ImuSamples(sequence.time, sequence.gyro, sequence.accel)
     table = read_text(path)
     stamps = table.take("time")  # every sample needs one
     check_increasing(stamps, path)
     # A sensor that missed a sample leaves its columns empty.
     gyro, accel = table.axes("gyro_", gaps=True), table.axes("accel_", gaps=True)
-    return Recorded(stamps, gyro, accel)
+    return ImuSamples(stamps, gyro, accel)
 
 
-def create_tracker(run, recorded: Recorded, rest_seconds: float):
+def create_tracker(run, recorded: ImuSamples, rest_seconds: float):
     """The compiled tracker of a trained run, which starts from rest."""
     from gnio_jax.apps import live
 
@@ -87,29 +87,29 @@ def create_tracker(run, recorded: Recorded, rest_seconds: float):
         raise InputError("--rest-seconds", str(error)) from None
 
 
-def replay(tracker, recorded: Recorded, path: Path, realtime: bool, progress) -> Replayed:
+def replay(tracker, recorded: ImuSamples, path: Path, realtime: bool, progress) -> ReplayResult:
     """Push every sample and time each push."""
-    replayed, start = Replayed(), recorded.time[0]
+    result, start = ReplayResult(), recorded.time[0]
     gc.collect()
     gc.freeze()  # existing objects need no further look by the collector
     begin = time.perf_counter()
     for k, stamp in enumerate(recorded.time):
         if realtime:
             time.sleep(max(0.0, stamp - start - (time.perf_counter() - begin)))
-        before = time.perf_counter()
+        push_start = time.perf_counter()
         try:
             pose = tracker.push(stamp, recorded.gyro[k], recorded.accel[k])
         except ValueError as error:
             raise InputError(f"{path} row {k + 1}", str(error)) from None
-        seconds = time.perf_counter() - before
+        seconds = time.perf_counter() - push_start
         if pose is None:
-            replayed.other_samples.append(seconds)
+            result.other_samples.append(seconds)
         else:
-            replayed.clone_steps.append(seconds)
-            replayed.poses.append(pose)
+            result.clone_steps.append(seconds)
+            result.poses.append(pose)
         if k % 100 == 0:
             progress(f"replaying {stamp - start:.0f} s", (k + 1) / len(recorded.time))
-    return replayed
+    return result
 
 
 def write_trajectory(out: Path, name: str, poses: list) -> np.ndarray:
@@ -120,14 +120,14 @@ def write_trajectory(out: Path, name: str, poses: list) -> np.ndarray:
 
     position = np.array([pose.position for pose in poses])
     orientation = np.array([quaternion(pose.rotation) for pose in poses])
-    estimated = Trajectory(np.array([pose.time for pose in poses]), position, orientation)
+    trajectory = Trajectory(np.array([pose.time for pose in poses]), position, orientation)
     no_reference = Trajectory(
-        estimated.time, np.full_like(position, np.nan), np.full_like(orientation, np.nan)
+        trajectory.time, np.full_like(position, np.nan), np.full_like(orientation, np.nan)
     )
     with replacing(out) as temporary:
-        write_tum(temporary, estimated)
-    seen = plots.view(Estimate(name, estimated, no_reference), alignment="none")
-    plots.save(out.with_suffix(".png"), plots.sequence(seen))
+        write_tum(temporary, trajectory)
+    view = plots.view(Estimate(name, trajectory, no_reference), alignment="none")
+    plots.save(out.with_suffix(".png"), plots.sequence(view))
     return position
 
 
@@ -141,30 +141,30 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def summarise(
-    replayed: Replayed, recorded: Recorded, position: np.ndarray, compiled: float
+    replayed: ReplayResult, recorded: ImuSamples, position: np.ndarray, compiled: float
 ) -> None:
     """Print the length of the walk, the speed and the latencies."""
     poses = replayed.poses
     length = float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum())
     rejected = sum(pose.accepted == 0 for pose in poses)
-    worked = sum(replayed.clone_steps) + sum(replayed.other_samples)
-    lasted = recorded.time[-1] - recorded.time[0]
+    computing = sum(replayed.clone_steps) + sum(replayed.other_samples)
+    duration = recorded.time[-1] - recorded.time[0]
     verdict = "" if poses[-1].healthy else "; the filter DIVERGED"
     print(
-        f"{lasted:.1f} s, {len(poses)} poses, {length:.1f} m walked, "
+        f"{duration:.1f} s, {len(poses)} poses, {length:.1f} m walked, "
         f"{rejected} measurements rejected{verdict}"
     )
     print(
-        f"real-time factor {lasted / worked:.1f} (computing took {worked:.2f} s), "
+        f"real-time factor {duration / computing:.1f} (computing took {computing:.2f} s), "
         f"compiled in {compiled:.1f} s"
     )
     kinds = {"clone step": replayed.clone_steps, "other sample": replayed.other_samples}
     for kind, seconds in kinds.items():
         if seconds:
-            p50, p99, most = 1e3 * np.percentile(seconds, [50, 99, 100])
+            p50, p99, longest = 1e3 * np.percentile(seconds, [50, 99, 100])
             print(
                 f"latency of a push with a {kind}: "
-                f"p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {most:.3f} ms"
+                f"p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {longest:.3f} ms"
             )
 
 
@@ -172,7 +172,7 @@ def main() -> None:
     console.run(lambda: options.run(follow, options.Call("python replay_csv.py", sys.argv[1:])))
 
 
-def follow(asked: Replay, _call: options.Call) -> None:
+def follow(request: Replay, _call: options.Call) -> None:
     """Feed a recording to gnio_jax.filtering.Tracker sample by sample, like an app on a phone.
 
     The CSV has a header with time (s), gyro_x..z (rad/s) and accel_x..z (m/s2, +9.81 upwards at
@@ -190,30 +190,30 @@ def follow(asked: Replay, _call: options.Call) -> None:
     """
     # The filter needs float64. The network states its float32 everywhere.
     jax.config.update("jax_enable_x64", True)
-    path = Path(asked.csv)
+    path = Path(request.csv)
     recorded = read(path)
 
     from gnio_jax.apps import packages
 
-    run = packages.load_pretrained(asked.weights)
+    run = packages.load_pretrained(request.weights)
     if len(recorded.time) < 2:
         raise InputError(path, "holds a single sample", "record a walk of some seconds")
     with console.terminal() as terminal:
         progress = terminal.progress
         progress("compiling", 0.0)
         begin = time.perf_counter()
-        tracker = create_tracker(run, recorded, asked.rest_seconds)
+        tracker = create_tracker(run, recorded, request.rest_seconds)
         compiled = time.perf_counter() - begin
-        replayed = replay(tracker, recorded, path, asked.realtime, progress)
+        replayed = replay(tracker, recorded, path, request.realtime, progress)
     if not replayed.poses:
         raise InputError(
             path,
-            f"ends before the device was still for {asked.rest_seconds:g} s "
+            f"ends before the device was still for {request.rest_seconds:g} s "
             "without a missing sample",
             "record longer, or give a smaller --rest-seconds",
         )
 
-    out = Path(asked.out or f"{path.stem}_trajectory.txt")
+    out = Path(request.out or f"{path.stem}_trajectory.txt")
     position = write_trajectory(out, path.stem, replayed.poses)
     summarise(replayed, recorded, position, compiled)
     if tracker.delay:

@@ -23,11 +23,11 @@ class InputError(ValueError):
 
 
 def did_you_mean(
-    word: str, known: Iterable[str], shown: Callable[[str], object] = str, cutoff: float = 0.6
+    word: str, words: Iterable[str], shown: Callable[[str], object] = str, cutoff: float = 0.6
 ) -> str:
     """The beginning of a remedy that names the closest of the known words, as `shown` writes it;
     empty if none is close."""
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=cutoff)
+    close = difflib.get_close_matches(word, list(words), n=1, cutoff=cutoff)
     return f"did you mean '{shown(close[0])}'? " if close else ""
 
 

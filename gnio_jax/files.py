@@ -59,11 +59,11 @@ def check_writable_folder(folder: Path) -> None:
 def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
     """Write and remove a file. A missing folder is not created: its nearest parent is tried."""
     parents = (folder.absolute(), *folder.absolute().parents)
-    there = next(parent for parent in parents if parent.exists())
+    existing = next(parent for parent in parents if parent.exists())
     try:
-        handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=there)
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=existing)
     except OSError as error:
-        error.filename = str(there)  # the user does not know the temporary file
+        error.filename = str(existing)  # the user does not know the temporary file
         raise
     os.close(handle)
     Path(name).unlink()

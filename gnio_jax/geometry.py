@@ -154,8 +154,9 @@ def _contract(a: jax.Array, b: jax.Array, longest: int) -> jax.Array:
 
 
 def orthonormalize(rotation: Matrix) -> Matrix:
-    """The rotation nearest to a matrix that is a rotation except for rounding: one Newton step R (3
-    I − RᵀR)/2 of the polar decomposition."""
+    """The rotation nearest to a matrix that is a rotation except for rounding.
+
+    It is one Newton step of the polar decomposition: R (3 I − RᵀR) / 2."""
     return matmul(
         rotation, 1.5 * np.eye(3, dtype=rotation.dtype) - 0.5 * matmul(rotation.T, rotation)
     )
@@ -228,11 +229,22 @@ def matrix_from_quaternion(wxyz: Quaternion) -> Matrix:
 
 @jax.jit
 def right_jacobian(phi: Vector) -> Matrix:
-    """J_r(φ): exp(φ + δ) ≈ exp(φ) exp(J_r(φ) δ).  J_r = I − (1 − cos θ)/θ² hat(φ) + (θ − sin θ)/θ³
-    hat(φ)²."""
+    """J_r(φ): exp(φ + δ) ≈ exp(φ) exp(J_r(φ) δ).
+
+    J_r = I − (1 − cos θ)/θ² hat(φ) + (θ − sin θ)/θ³ hat(φ)²."""
     squared = jnp.sum(phi * phi)
     _, versine, excess = _series(squared)
     return _polynomial(phi, squared, -versine, excess)
+
+
+@jax.jit
+def left_jacobian_product(phi: Vector, x: Vector) -> Vector:
+    """J_l(φ) x, where exp(φ + δ) ≈ exp(J_l(φ) δ) exp(φ): x + (1 − cos θ)/θ² φ × x + (θ − sin θ)/θ³
+    φ × (φ × x)."""
+    _, versine, excess = _series(jnp.sum(phi * phi))
+    turn = hat(phi)
+    once = matmul(turn, x[:, None])
+    return x + (versine * once + excess * matmul(turn, once))[:, 0]
 
 
 def direction(

@@ -24,7 +24,7 @@ def filled_up(values: np.ndarray, rows: int, filling: float | None = None) -> np
     return np.concatenate([values, np.repeat(last, rows - len(values), axis=0)])
 
 
-def convolved(
+def convolve(
     values: Float[np.ndarray, "n *w"], kernel: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "m *w"]:
     """Convolve columns of n rows with a kernel of k ≤ n at complete overlap: m = n − k + 1.
@@ -61,13 +61,13 @@ def quaternions(rotation: Rotation) -> Float[np.ndarray, "*k 4"]:
     return rotation.as_quat(scalar_first=True)
 
 
-def quaternion_product(left: np.ndarray, right: np.ndarray, axis: int = -1) -> np.ndarray:
+def quaternion_product(p: np.ndarray, q: np.ndarray, axis: int = -1) -> np.ndarray:
     """left ⊗ right of quaternions along `axis`, all other axes broadcast.
 
     With the components along the first axis, `axis=0`, long stacks are multiplied several times
     faster.
     """
-    (a, b, c, d), (w, x, y, z) = np.moveaxis(left, axis, 0), np.moveaxis(right, axis, 0)
+    (a, b, c, d), (w, x, y, z) = np.moveaxis(p, axis, 0), np.moveaxis(q, axis, 0)
     product = (
         a * w - b * x - c * y - d * z,
         a * x + b * w + c * z - d * y,

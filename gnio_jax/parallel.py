@@ -40,27 +40,27 @@ def initialise(distributed: str | None = None, devices: int | None = None) -> No
     if devices is not None:
         _check_devices(devices)
         cpu_devices(devices)
-    given: tuple[str, int, int] | None = None
+    rendezvous: tuple[str, int, int] | None = None
     if distributed is not None:
         host_port, *numbers = distributed.split(",")
         host, _, port = host_port.rpartition(":")
-        whole = all(re.fullmatch("[0-9]{1,5}", each) for each in (port, *numbers))
-        if not (host and len(numbers) == 2 and whole and 0 < int(port) < 2**16):
+        numeric = all(re.fullmatch("[0-9]{1,5}", number) for number in (port, *numbers))
+        if not (host and len(numbers) == 2 and numeric and 0 < int(port) < 2**16):
             problem = f"must be HOST:PORT,PROCESSES,ID, found '{distributed}'"
             raise InputError("--distributed", problem, "such as 10.0.0.1:4321,2,0")
-        given = host_port, int(numbers[0]), int(numbers[1])
-        if not given[2] < given[1]:
-            problem = f"gives this process the number {given[2]} of {given[1]}"
+        rendezvous = host_port, int(numbers[0]), int(numbers[1])
+        if not rendezvous[2] < rendezvous[1]:
+            problem = f"gives this process the number {rendezvous[2]} of {rendezvous[1]}"
             raise InputError("--distributed", problem, "count the processes from 0")
     tasks = {os.environ.get(name) for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")}
     launched = "JOB_COMPLETION_INDEX" in os.environ or bool(tasks - {None, "", "1"})
-    alone = given[1] == 1 if given else not launched
+    alone = rendezvous[1] == 1 if rendezvous else not launched
     if alone or jax.distributed.is_initialized():
         return
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
         # A process that has failed must not wait five minutes for the others.
-        jax.distributed.initialize(*given or (), shutdown_timeout_seconds=15)
+        jax.distributed.initialize(*rendezvous or (), shutdown_timeout_seconds=15)
     except (RuntimeError, ValueError) as error:
         problem = f"the processes did not meet ({' '.join(str(error).split())[:150]})"
         remedy = "give all of them the same HOST:PORT,PROCESSES and each an ID of its own"
@@ -73,8 +73,8 @@ def cpu_devices(count: int) -> None:
     Raises RuntimeError after JAX's first computation, when the number can no longer change.
     """
     # JAX makes its settings when it is imported, so its types do not know this one.
-    given = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
-    if given >= 0 or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
+    current = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
+    if current >= 0 or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     jax.config.update("jax_num_cpu_devices", count)
 
@@ -95,8 +95,8 @@ def largest(*numbers: int) -> tuple[int, ...]:
     """
     if jax.process_count() == 1:
         return numbers
-    given: Any = multihost_utils.process_allgather(np.array(numbers, np.int32))
-    return tuple(int(each) for each in given.max(axis=0))
+    gathered: Any = multihost_utils.process_allgather(np.array(numbers, np.int32))
+    return tuple(int(value) for value in gathered.max(axis=0))
 
 
 def on_host(tree: Tree) -> Tree:
@@ -126,17 +126,17 @@ def sharing(limit: int | None = None) -> Iterator[None]:
         limit = 1
     if limit is not None:
         _check_devices(limit)
-    chosen = []
+    shared = []
     for process in range(jax.process_count()):
-        own = jax.local_devices(process)
-        if limit is not None and limit > len(own):
-            problem = f"is {limit}, but process {process} has {len(own)}"
+        local = jax.local_devices(process)
+        if limit is not None and limit > len(local):
+            problem = f"is {limit}, but process {process} has {len(local)}"
             raise InputError("--devices", problem, "lower it")
-        chosen += own[:limit]
-    if len(chosen) == 1:
+        shared += local[:limit]
+    if len(shared) == 1:
         yield
         return
-    mesh = jax.make_mesh((len(chosen),), (BATCH,), (AxisType.Auto,), devices=chosen)
+    mesh = jax.make_mesh((len(shared),), (BATCH,), (AxisType.Auto,), devices=shared)
     with jax.set_mesh(mesh):
         yield
 
@@ -146,7 +146,7 @@ def count() -> int:
     return jax.sharding.get_abstract_mesh().shape.get(BATCH, 1)
 
 
-def described() -> str:
+def describe() -> str:
     """The devices in words: "cpu", "8 × gpu", "16 × gpu in 2 processes"."""
     platform, processes = jax.devices()[0].platform, jax.process_count()
     number = f"{count()} × " if count() > 1 else ""
@@ -161,14 +161,14 @@ def everywhere(tree: Tree) -> Tree:
     """
     mesh = jax.sharding.get_mesh()
 
-    def placed(leaf: Any) -> jax.Array:
+    def place(leaf: Any) -> jax.Array:
         if mesh.empty:
             return fresh_copy(leaf)
         host = np.asarray(leaf)
         sharding = NamedSharding(mesh, PartitionSpec())
         return jax.make_array_from_process_local_data(sharding, host, host.shape)
 
-    return jax.tree.map(placed, tree)
+    return jax.tree.map(place, tree)
 
 
 def fresh_copy(leaf: Any) -> jax.Array:
@@ -183,15 +183,15 @@ def fresh_copy(leaf: Any) -> jax.Array:
 
 def split(tree: Tree) -> Tree:
     """In a compiled program: share the rows of these arrays among the devices."""
-    return _constrained(tree, PartitionSpec(BATCH))
+    return _constrain(tree, PartitionSpec(BATCH))
 
 
-def replicated(tree: Tree) -> Tree:
+def replicate(tree: Tree) -> Tree:
     """In a compiled program: give each device the whole of these arrays."""
-    return _constrained(tree, PartitionSpec())
+    return _constrain(tree, PartitionSpec())
 
 
-def _constrained(tree: Tree, spec: PartitionSpec) -> Tree:
+def _constrain(tree: Tree, spec: PartitionSpec) -> Tree:
     if count() == 1:
         return tree
     return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, spec), tree)

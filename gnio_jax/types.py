@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from gnio_jax.errors import InputError as InputError
 
@@ -68,7 +68,13 @@ class Sequence(NamedTuple):
     """The origin: dataset, session, group, subject, device, placement, truth, licence, ...
     (str, float or bool)."""
 
-    def known_where(self, valid: Bool[np.ndarray, "n"]) -> Sequence:
+    @property
+    def measured_rows(self) -> Int[np.ndarray, "m"]:
+        """Rows of the IMU that were measured, and not interpolated across a gap."""
+        mask = self.imu_valid
+        return np.arange(len(self.time)) if mask is None else np.flatnonzero(mask)
+
+    def with_reference_where(self, valid: Bool[np.ndarray, "n"]) -> Sequence:
         """The sequence with its reference where `valid` is True, and none elsewhere."""
         poses = (self.orientation, self.position, self.velocity)
         orientation, position, velocity = (np.where(valid[:, None], x, np.nan) for x in poses)

@@ -45,7 +45,7 @@ class AlignedRecording(NamedTuple):
     imu: Float[Array, "t 6"]
     """[accel m/s², gyro rad/s]: in the world for `per_sample`, in the body for `single`."""
     rotation: Float[Array, "m 3 3"]
-    """From the frame of `imu` to the gravity-aligned frame of each window."""
+    """Rotation from the frame of `imu` to the gravity-aligned frame of each window."""
 
 
 def window_starts(samples: int, length: int, stride: int) -> Starts:
@@ -59,8 +59,8 @@ def window_starts(samples: int, length: int, stride: int) -> Starts:
 
 def without_any(bad: Bool[np.ndarray, "t"], start: Starts, length: int) -> Bool[np.ndarray, "m"]:
     """Which of the windows of `length` samples from `start` on touch no sample that is `bad`."""
-    before = np.concatenate([[0], np.cumsum(bad)])
-    return before[start + length] == before[start]
+    invalid_before = np.concatenate([[0], np.cumsum(bad)])
+    return invalid_before[start + length] == invalid_before[start]
 
 
 def align_recording(
@@ -132,7 +132,7 @@ def rotate_vectors(
 
 
 class WindowCut(NamedTuple):
-    """The filter's cut of its window between clone i and clone j from the stream.
+    """How the filter cuts the network's window, between clone i and clone j, out of the IMU stream.
 
     The window's first sample gets the attitude of clone i.
     """
@@ -179,8 +179,10 @@ def cut_window(
     turns = jax.vmap(geometry.exp, out_axes=2)(rates[cut.propagating] * dt)
     first = geometry.yaw_rotation(rotation).T @ rotation
     if context:
-        before = geometry.cumulative_rotation(jnp.eye(3, dtype=first.dtype), turns[:, :, :context])
-        first = first @ before[:, :, -1].T
+        context_turns = geometry.cumulative_rotation(
+            jnp.eye(3, dtype=first.dtype), turns[:, :, :context]
+        )
+        first = first @ context_turns[:, :, -1].T
     attitudes = geometry.cumulative_rotation(first, turns)
     # Samples are along the last axis, so that XLA fuses sums over three, as everywhere in the
     # filter.
@@ -203,11 +205,11 @@ def true_displacement(
 
     orientation quaternions wxyz, body → world; position m, in the world. NaN where either is NaN.
     """
-    moved = position[start + length] - position[start]
-    known = finite_rows(orientation[start])
-    attitude = rotations(np.where(known[:, None], orientation[start], [1.0, 0.0, 0.0, 0.0]))
-    local = np.einsum("mij,mj->mi", remove_yaw(attitude.as_matrix()), moved)
-    return np.where(known[:, None], local, np.nan)
+    displacement = position[start + length] - position[start]
+    finite = finite_rows(orientation[start])
+    attitude = rotations(np.where(finite[:, None], orientation[start], [1.0, 0.0, 0.0, 0.0]))
+    local = np.einsum("mij,mj->mi", remove_yaw(attitude.as_matrix()), displacement)
+    return np.where(finite[:, None], local, np.nan)
 
 
 def remove_yaw(rotation: Rotations) -> Rotations:

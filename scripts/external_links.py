@@ -25,13 +25,13 @@ def pages():
 
 def links():
     """URL -> the pages that have it."""
-    found = {}
+    pages_of = {}
     for page in pages():
         for url in URL.findall(page.read_text(encoding="utf-8")):
             url = url.rstrip(".,;:")
             if not url.startswith(EXAMPLES):
-                found.setdefault(url, []).append(page.relative_to(ROOT).as_posix())
-    return found
+                pages_of.setdefault(url, []).append(page.relative_to(ROOT).as_posix())
+    return pages_of
 
 
 def problem(url):
@@ -48,16 +48,16 @@ def problem(url):
 
 
 def main():
-    found = links()
+    pages_of = links()
     if "--list" in sys.argv:
-        print("\n".join(sorted(found)))
+        print("\n".join(sorted(pages_of)))
         return
     with ThreadPoolExecutor(8) as pool:
-        problems = dict(zip(found, pool.map(problem, found), strict=True))
+        problems = dict(zip(pages_of, pool.map(problem, pages_of), strict=True))
     failed = {url: why for url, why in problems.items() if why}
     for url, why in failed.items():
-        print(f"{url}: {why} ({', '.join(found[url])})")
-    print(f"{len(found)} links, {len(failed)} without an answer")
+        print(f"{url}: {why} ({', '.join(pages_of[url])})")
+    print(f"{len(pages_of)} links, {len(failed)} without an answer")
     sys.exit(bool(failed))
 
 

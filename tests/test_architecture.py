@@ -48,6 +48,15 @@ LIBRARIES = {
 }
 """Libraries that only these rooms or modules import."""
 
+REFUSED = set("found own each given there known place seen about asked kept told here both".split())
+REFUSED |= set("these those wanted taken laid made left rest apart since late".split())
+"""Words that do not say what a variable holds."""
+OLD_NAMES = ("apps/importing", "apps/live", "apps/track", "calibration", "commands/calibrate")
+OLD_NAMES += ("config", "data/parsing", "evaluation", "filtering", "training")
+"""Rooms and modules whose variables still have such names."""
+TWO_MEANINGS = {"Estimate", "Inputs", "Outcome", "Recording", "Run", "Source", "Summary"}
+"""Names that two classes of these rooms still share."""
+
 
 @functools.cache
 def imports():
@@ -87,6 +96,27 @@ def test_a_library_stays_in_its_rooms(library):
 def test_every_module_has_a_room():
     rooms = {module.split(".")[0] for module, _ in imports()}
     assert rooms - {"__init__", "__main__"} <= ROOMS.keys()
+
+
+def test_a_variable_is_a_noun():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        module = path.relative_to(PACKAGE).as_posix()
+        if module.startswith(OLD_NAMES):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            name = node.arg if isinstance(node, ast.arg) else ""
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                name = node.id
+            assert name not in REFUSED, f"gnio_jax/{module}: a variable is called '{name}'"
+
+
+def test_the_name_of_a_class_has_one_meaning():
+    homes = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and node.name not in TWO_MEANINGS:
+                home = homes.setdefault(node.name, path)
+                assert home == path, f"{home} and {path} have a class '{node.name}'"
 
 
 def test_no_test_module_imports_another():

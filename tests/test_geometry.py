@@ -77,6 +77,23 @@ def test_right_jacobian_and_its_derivative(angle):
     np.testing.assert_allclose(slope_of_right_jacobian(phi), expected, atol=1e-8)
 
 
+@pytest.mark.parametrize("angle", ANGLES)
+def test_left_jacobian_product_and_its_derivative(angle):
+    """J_l x is the last column of exp([hat φ, x; 0, 0])."""
+    x = np.array([0.3, -1.2, 0.5])
+
+    def oracle(phi):
+        block = np.zeros((4, 4))
+        block[:3, :3], block[:3, 3] = -np.cross(np.eye(3), -phi), x
+        return expm(block)[:3, 3]
+
+    phi = jnp.asarray(angle * AXIS)
+    product = geometry.left_jacobian_product
+    np.testing.assert_allclose(product(phi, x), oracle(angle * AXIS), atol=3e-15)
+    slope = jax.jacrev(product)(phi, jnp.asarray(x))
+    np.testing.assert_allclose(slope, differences(oracle, angle * AXIS), atol=1e-8)
+
+
 def test_cumulative_rotation():
     for n in (1, 2, 3, 10):
         rng = np.random.default_rng(n)

@@ -199,6 +199,6 @@ def test_columns_are_convolved_where_they_overlap_the_kernel_wholly(rows, taps):
     random = np.random.default_rng(taps)
     values, kernel = random.standard_normal((rows, 3)), random.standard_normal(taps)
     wanted = [np.convolve(column, kernel, mode="valid") for column in values.T]
-    np.testing.assert_allclose(numerics.convolved(values, kernel), np.transpose(wanted), atol=1e-12)
-    found = numerics.convolved(values[:, 0], kernel)
+    np.testing.assert_allclose(numerics.convolve(values, kernel), np.transpose(wanted), atol=1e-12)
+    found = numerics.convolve(values[:, 0], kernel)
     np.testing.assert_allclose(found, wanted[0], atol=1e-12)

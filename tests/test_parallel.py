@@ -284,9 +284,9 @@ def test_with_one_device_nothing_is_placed_nor_constrained():
     rows = jnp.arange(6)
     for limit in (1, None):  # a CPU is one device unless asked for more
         with parallel.sharing(limit):
-            assert parallel.count() == 1 and parallel.described() == "cpu"
-            assert parallel.split(rows) is rows and parallel.replicated(rows) is rows
+            assert parallel.count() == 1 and parallel.describe() == "cpu"
+            assert parallel.split(rows) is rows and parallel.replicate(rows) is rows
             assert parallel.everywhere(np.arange(6)).sharding == rows.sharding
     with parallel.sharing(2):
-        assert parallel.count() == 2 and parallel.described() == "2 × cpu"
+        assert parallel.count() == 2 and parallel.describe() == "2 × cpu"
         assert parallel.everywhere(np.arange(6)).sharding.spec == PartitionSpec()

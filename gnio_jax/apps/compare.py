@@ -32,7 +32,7 @@ SEED = re.compile(r"_s(\d+)(?=(_calibrated)?$)")
 """Pattern of the seed in the name of a run."""
 
 
-class Source(NamedTuple):
+class EvaluationSource(NamedTuple):
     """An evaluation of a row: an existing one, or that of a run."""
 
     path: Path
@@ -41,11 +41,11 @@ class Source(NamedTuple):
     folder: Path
     identity: dict[str, Any]
     """Values of the settings `kept.IDENTITY`."""
-    found: Report | kept.Kept
+    figures: Report | kept.Kept
     """The figures of a named evaluation, or for a run its requested evaluation."""
 
 
-class Row(NamedTuple):
+class ComparedRow(NamedTuple):
     """One configuration, with its seeds."""
 
     label: str
@@ -56,11 +56,11 @@ class Row(NamedTuple):
     @property
     def way(self) -> str:
         """The way its trajectories are estimated."""
-        return " and ".join(dict.fromkeys(tabulate.way(each.settings) for each in self.reports))
+        return " and ".join(dict.fromkeys(tabulate.way(report.settings) for report in self.reports))
 
     def recordings(self, metric: str | None = None) -> set[str]:
         """Recordings that all seeds have, and for which the metric, if given, has a value."""
-        seeds = [each.scores for each in self.reports]
+        seeds = [report.scores for report in self.reports]
         if metric is not None:
             return set(statistics.values(seeds, metric))
         return set.intersection(*map(set, seeds))
@@ -69,7 +69,7 @@ class Row(NamedTuple):
 class Comparison(NamedTuple):
     """The result of a comparison."""
 
-    rows: list[Row]
+    rows: list[ComparedRow]
     cells: dict[str, list[Cell]]
     """Metric → a cell for each row."""
 
@@ -94,16 +94,24 @@ def compare(
     if len(config.rows) < 2:
         remedy = "name the run to compare with first, and all of them before --metrics"
         raise InputError("RUNS", "needs two or more", remedy)
-    found = [[_source(path, config) for path in find(word)] for word in config.rows]
-    sources = [source for row in found for source in row]
+    sources_by_row = [[_source(path, config) for path in find(word)] for word in config.rows]
+    sources = [source for row in sources_by_row for source in row]
     _check_sources(sources)
 
-    def report_of(each: Report | kept.Kept) -> Report:
-        return each if isinstance(each, Report) else kept.made(each, reporter, workers)
+    def report_of(evaluation: Report | kept.Kept) -> Report:
+        return (
+            evaluation
+            if isinstance(evaluation, Report)
+            else kept.made(evaluation, reporter, workers)
+        )
 
     rows = [
-        Row(label, [each.run.name for each in row], [report_of(each.found) for each in row])
-        for label, row in zip(_labels(config.rows), found, strict=True)
+        ComparedRow(
+            label,
+            [source.run.name for source in row],
+            [report_of(source.figures) for source in row],
+        )
+        for label, row in zip(_labels(config.rows), sources_by_row, strict=True)
     ]
     reports = [report for row in rows for report in row.reports]
     _check_recordings([source.folder for source in sources], reports)
@@ -111,13 +119,15 @@ def compare(
         if not row.recordings() & rows[0].recordings():
             problem = f"shares no recording with {rows[0].label} that all seeds have"
             raise InputError(row.label, problem, "compare evaluations of the same recordings")
-    there = {x for report in reports for own in report.scores.values() for x in own.values}
+    available = {
+        name for report in reports for scores in report.scores.values() for name in scores.values
+    }
     for metric in config.metrics or ():
-        if metric not in there:
-            has = ", ".join(name for name in NAMES if name in there)
+        if metric not in available:
+            has = ", ".join(name for name in NAMES if name in available)
             raise InputError("--metrics", f"no row has '{metric}'", f"there are: {has}")
-    wanted = config.metrics or [metric for metric in USUAL if metric in there]
-    return Comparison(rows, tabulate.cells([row.reports for row in rows], wanted))
+    metrics = config.metrics or [metric for metric in USUAL if metric in available]
+    return Comparison(rows, tabulate.cells([row.reports for row in rows], metrics))
 
 
 # --- the evaluations
@@ -136,15 +146,15 @@ def find(word: str) -> list[Path]:
         return [path]
     seeds: dict[int, Path] = {}
     parent = next((folder for folder in path.parents if folder.exists()), path.parent)
-    name, *rest = path.relative_to(parent).parts
+    name, *folders = path.relative_to(parent).parts
     for run in sorted(path.parent for path in parent.glob("*/config.yaml")):
         seed = SEED.search(run.name)
         if seed and run.name[: seed.start()] + run.name[seed.end() :] == name:
             if other := seeds.get(int(seed[1])):
                 raise InputError(word, f"has a seed twice: {other}, {run}", "rename one")
             seeds[int(seed[1])] = run
-    paths = [seeds[seed].joinpath(*rest) for seed in sorted(seeds)]
-    missing = [each for each in paths if not each.exists()]
+    paths = [seeds[seed].joinpath(*folders) for seed in sorted(seeds)]
+    missing = [seed_path for seed_path in paths if not seed_path.exists()]
     if missing and len(missing) < len(paths):
         problem = f"exists for {len(paths) - len(missing)} of {len(paths)} seeds only"
         raise InputError(word, problem, f"missing: {', '.join(map(str, missing))}")
@@ -156,55 +166,59 @@ def find(word: str) -> list[Path]:
     return paths
 
 
-def _source(path: Path, config: CompareConfig) -> Source:
+def _source(path: Path, config: CompareConfig) -> EvaluationSource:
     """The evaluation of a run with all options at their defaults, or the evaluation that is
     named."""
     if (path / "config.yaml").is_file():
-        how = {"split": config.split, "estimator": config.estimator, "plots": False}
-        asked = kept.look(EvaluateConfig(str(path), data_root=config.data_root, **how))
-        identity = {name: getattr(asked.config, name) for name in IDENTITY}
-        return Source(path, path, asked.folder, identity, asked)
+        settings = {"split": config.split, "estimator": config.estimator, "plots": False}
+        evaluation = kept.look(EvaluateConfig(str(path), data_root=config.data_root, **settings))
+        identity = {name: getattr(evaluation.config, name) for name in IDENTITY}
+        return EvaluationSource(path, path, evaluation.folder, identity, evaluation)
     report = read(path)
     run = Path(os.path.abspath(path)).parent.parent
     if path.resolve().parent.name == "eval" and (problem := kept.out_of_date(report, run)):
         raise InputError(path, problem, REMEDY)
     identity = {name: report.settings.get(name) for name in IDENTITY}
-    return Source(path, run, path, identity, report)
+    return EvaluationSource(path, run, path, identity, report)
 
 
-def _check_sources(sources: list[Source]) -> None:
+def _check_sources(sources: list[EvaluationSource]) -> None:
     """Raise `InputError` if an evaluation is named twice, or if rows are of different recordings or
     measured in different ways."""
-    taken: dict[Path, Path] = {}
+    named: dict[Path, Path] = {}
     first = sources[0]
     for source in sources:
-        if other := taken.get(source.folder.resolve()):
+        if other := named.get(source.folder.resolve()):
             same = source.path == other
             problem = "is named twice" if same else f"is the same evaluation as {other}"
             raise InputError(source.path, problem, "name each once")
-        taken[source.folder.resolve()] = source.path
+        named[source.folder.resolve()] = source.path
     for source in sources:
-        for name, own in source.identity.items():
-            if own == first.identity[name]:
+        for name, value in source.identity.items():
+            if value == first.identity[name]:
                 continue
             words = name.replace("_", " ")
             remedy = f"compare evaluations of one {words}"
-            made = [each.identity[name] for each in sources if isinstance(each.found, Report)]
-            if name in ("split", "data_root") and len(made) < len(sources):
-                given = made[0] if made else own
-                remedy = f"give --{name.replace('_', '-')} {given} for the runs, or {remedy}"
-            problem = f"is of {words} {own}, the first row of {first.identity[name]}"
+            existing = [
+                evaluation.identity[name]
+                for evaluation in sources
+                if isinstance(evaluation.figures, Report)
+            ]
+            if name in ("split", "data_root") and len(existing) < len(sources):
+                choice = existing[0] if existing else value
+                remedy = f"give --{name.replace('_', '-')} {choice} for the runs, or {remedy}"
+            problem = f"is of {words} {value}, the first row of {first.identity[name]}"
             raise InputError(source.path, problem, remedy)
 
 
 def _check_recordings(folders: list[Path], reports: list[Report]) -> None:
     """Raise `InputError` if recordings of one name have different lengths, or belong to different
     people or sessions. The seeds of a row are checked too."""
-    known: dict[str, tuple[Path, str, float]] = {}
+    references: dict[str, tuple[Path, str, float]] = {}
     for folder, report in zip(folders, reports, strict=True):
         for name, group in report.groups.items():
             seconds = report.settings["recordings"][name]
-            first, *other = known.setdefault(name, (folder, group, seconds))
+            first, *other = references.setdefault(name, (folder, group, seconds))
             remedy = f"evaluate it again, or {first}"
             if group != other[0]:
                 problem = f"sequence {name} is of {group} here, of {other[0]} in {first}"
@@ -220,45 +234,49 @@ def _labels(words: tuple[str, ...]) -> list[str]:
     paths = [Path(os.path.abspath(word)) for word in words]
     common = os.path.commonpath([path.parent for path in paths])
     parts = [path.relative_to(common).parts for path in paths]
-    while len({each[-1] for each in parts}) == 1 and all(len(each) > 1 for each in parts):
-        parts = [each[:-1] for each in parts]
-    return [str(Path(*each)) for each in parts]
+    while len({names[-1] for names in parts}) == 1 and all(len(names) > 1 for names in parts):
+        parts = [names[:-1] for names in parts]
+    return [str(Path(*names)) for names in parts]
 
 
 # --- text
 
 
-def title(found: Comparison) -> str:
+def title(comparison: Comparison) -> str:
     """Recordings, the way the trajectories are estimated, and the first row."""
-    ways, settings = {row.way for row in found.rows}, found.rows[0].reports[0].settings
-    how = f", {ways.pop()}" if len(ways) == 1 else ""
-    head = f"{settings['dataset']} {settings['split']}{how}"
-    return f"{head}; differences to {found.rows[0].label}, paired by sequence"
+    ways, settings = {row.way for row in comparison.rows}, comparison.rows[0].reports[0].settings
+    way = f", {ways.pop()}" if len(ways) == 1 else ""
+    head = f"{settings['dataset']} {settings['split']}{way}"
+    return f"{head}; differences to {comparison.rows[0].label}, paired by sequence"
 
 
-def lines(found: Comparison) -> list[list[str]]:
+def lines(comparison: Comparison) -> list[list[str]]:
     """The cells of `HEADER`: each metric's rows one below the other. Means over different
     recordings state their number."""
     table = []
-    for metric, cells in found.cells.items():
+    for metric, cells in comparison.cells.items():
         column = tabulate.column(metric)
         alike = all(
-            row.recordings(metric) == found.rows[0].recordings(metric) for row in found.rows
+            row.recordings(metric) == comparison.rows[0].recordings(metric)
+            for row in comparison.rows
         )
-        for place, (row, (mean, difference)) in enumerate(zip(found.rows, cells, strict=True)):
+        for index, (row, (mean, difference)) in enumerate(zip(comparison.rows, cells, strict=True)):
             better = ""
             if difference and difference.compared and not difference.withheld:
                 better = f"{difference.better} of {difference.compared}"
             text = tabulate.mean(mean, column.digits)
             text += "" if alike else f" over {mean.sequences}"
-            head = ["" if place else column.title, row.label, text]
+            head = ["" if index else column.title, row.label, text]
             table.append([*head, tabulate.difference(difference, column.digits), better])
     return table
 
 
-def explanations(found: Comparison) -> list[str]:
+def explanations(comparison: Comparison) -> list[str]:
     """Sentences that explain the figures."""
-    rows, cells = found.rows, [cell for of in found.cells.values() for cell in of]
+    rows, cells = (
+        comparison.rows,
+        [cell for metric_cells in comparison.cells.values() for cell in metric_cells],
+    )
     remarks = ["There is one seed of each run, so the variation between seeds is not known."]
     if any(len(row.runs) > 1 for row in rows):
         seeds = "; ".join(
@@ -279,36 +297,51 @@ def explanations(found: Comparison) -> list[str]:
             "The rows are not of the same recordings, so their means cannot be compared, only "
             f"their differences. {rows[0].label} has {len(first)}; {others}."
         )
-    if options := filter_options(found):
+    if options := filter_options(comparison):
         remarks.append(f"The rows differ in options of the filter: {', '.join(options)}.")
     return remarks + tabulate.marks(cells)
 
 
-def filter_options(found: Comparison) -> list[str]:
+def filter_options(comparison: Comparison) -> list[str]:
     """Names of the filter's options in which a row differs from the first, if both have a
     filter."""
     first, *others = (
-        [each.settings["filter"] for each in row.reports if each.settings["estimator"] != SUMMED]
-        for row in found.rows
+        [
+            report.settings["filter"]
+            for report in row.reports
+            if report.settings["estimator"] != SUMMED
+        ]
+        for row in comparison.rows
     )
-    pairs = [(own, other) for row in others for own in first for other in row]
-    return sorted({x for own, other in pairs for x in own | other if own.get(x) != other.get(x)})
+    pairs = [(reference, other) for row in others for reference in first for other in row]
+    return sorted(
+        {
+            option
+            for reference, other in pairs
+            for option in reference | other
+            if reference.get(option) != other.get(option)
+        }
+    )
 
 
-def write(path: Path, found: Comparison) -> None:
+def write(path: Path, comparison: Comparison) -> None:
     """Write `path`.md, `path`.csv and `path`.png."""
     from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
 
-    text = f"{title(found)}\n\n{tabulate.markdown(HEADER, lines(found))}\n"
-    text += "\n\n".join(explanations(found))
-    settings = found.rows[0].reports[0].settings
+    text = f"{title(comparison)}\n\n{tabulate.markdown(HEADER, lines(comparison))}\n"
+    text += "\n\n".join(explanations(comparison))
+    settings = comparison.rows[0].reports[0].settings
     recordings = {name: settings[name] for name in ("dataset", "split")}
     heads = [
         {**recordings, "estimated": row.way, "row": row.label, "seeds": len(row.runs)}
-        for row in found.rows
+        for row in comparison.rows
     ]
-    tabulate.write(path, text, tabulate.records(heads, found.cells))
-    drawn = [metric for metric, cells in found.cells.items() if any(c.mean.seeds for c in cells)]
-    rows = {row.label: row.reports for row in found.rows}
-    picture = plots.paired(rows, next(iter(drawn or found.cells)))
+    tabulate.write(path, text, tabulate.records(heads, comparison.cells))
+    drawable = [
+        metric
+        for metric, cells in comparison.cells.items()
+        if any(cell.mean.seeds for cell in cells)
+    ]
+    rows = {row.label: row.reports for row in comparison.rows}
+    picture = plots.paired(rows, next(iter(drawable or comparison.cells)))
     plots.save(with_ending(path, ".png"), picture)

@@ -51,10 +51,10 @@ def export(
         raise InputError(
             path, "the ending of its name is not a known format", f"known: {', '.join(SUFFIXES)}"
         )
-    known = trajectory.known & np.isfinite(trajectory.time)
-    if not known.any():
+    finite = trajectory.known & np.isfinite(trajectory.time)
+    if not finite.any():
         raise InputError(path, "the trajectory has no pose", "it may have diverged at its start")
-    poses = Trajectory(*(field[known] for field in trajectory))
+    poses = Trajectory(*(field[finite] for field in trajectory))
     check(path, kind, poses.time)
     with replacing(path) as temporary:
         match kind:
@@ -66,7 +66,7 @@ def export(
                 options = {"fmt": "%.9f", "delimiter": ",", "header": names, "comments": ""}
                 np.savetxt(temporary, rows, **options)
             case _:
-                _write_mcap(temporary, poses, None if covariance is None else covariance[known])
+                _write_mcap(temporary, poses, None if covariance is None else covariance[finite])
     return len(poses.time)
 
 
@@ -127,23 +127,37 @@ def _messages(
         return make("geometry_msgs/Vector3", *values.tolist())
 
     stamps = np.round(poses.time * 1e9).astype(np.int64).tolist()
-    places = [pose(row) for row in range(len(stamps))]
+    pose_messages = [pose(row) for row in range(len(stamps))]
     path = [
-        make("geometry_msgs/PoseStamped", header(stamp), place)
-        for stamp, place in zip(stamps, places, strict=True)
+        make("geometry_msgs/PoseStamped", header(stamp), pose_message)
+        for stamp, pose_message in zip(stamps, pose_messages, strict=True)
     ]
     yield "/path", stamps[0], make("nav_msgs/Path", header(stamps[0]), path)
     velocity, rate = _body_motion(poses)
-    for row, (stamp, place) in enumerate(zip(stamps, places, strict=True)):
-        spread = np.zeros((6, 6))
+    for row, (stamp, pose_message) in enumerate(zip(stamps, pose_messages, strict=True)):
+        pose_covariance = np.zeros((6, 6))
         if covariance is not None and np.isfinite(covariance[row]).all():
-            spread[:3, :3] = covariance[row]
-        placed = make("geometry_msgs/PoseWithCovariance", place, spread.ravel())
+            pose_covariance[:3, :3] = covariance[row]
+        pose_with_covariance = make(
+            "geometry_msgs/PoseWithCovariance", pose_message, pose_covariance.ravel()
+        )
         twist = make("geometry_msgs/Twist", vector(velocity[row]), vector(rate[row]))
-        moving = make("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
-        yield "/odometry", stamp, make("nav_msgs/Odometry", header(stamp), BODY, placed, moving)
-        moved = make("geometry_msgs/Transform", vector(poses.position[row]), place.orientation)
-        transform = make("geometry_msgs/TransformStamped", header(stamp), BODY, moved)
+        twist_with_covariance = make("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
+        yield (
+            "/odometry",
+            stamp,
+            make(
+                "nav_msgs/Odometry",
+                header(stamp),
+                BODY,
+                pose_with_covariance,
+                twist_with_covariance,
+            ),
+        )
+        transform_of_pose = make(
+            "geometry_msgs/Transform", vector(poses.position[row]), pose_message.orientation
+        )
+        transform = make("geometry_msgs/TransformStamped", header(stamp), BODY, transform_of_pose)
         yield "/tf", stamp, make("tf2_msgs/TFMessage", [transform])
 
 

@@ -27,13 +27,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.apps.importing import units
-from gnio_jax.apps.track import tracking_filter
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory
 from gnio_jax.evaluation.metrics import path_length
 from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.filtering import Pose, Tracker
+from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.filtering.start import level_state
 from gnio_jax.models import Network
 from gnio_jax.numerics import quaternion_from_matrix
@@ -335,7 +335,8 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
     `Tracker.expect` changes it. If samples are further apart than 1.5 of its intervals, some are
     missing between them. Raises `ValueError` for a rest that is shorter than two samples.
     """
-    setup, network = tracking_filter(run), Network.of(run.model, run.variables)
+    setup = filter_setup(run.config.data, run.config.filter)
+    network = Network.of(run.model, run.variables)
     return Tracker(
         lambda windows: network.apply(network.variables, windows),
         setup.config,
@@ -363,7 +364,7 @@ def expect(tracker: Tracker, found: Followed, run: Run, imu_rate: float) -> None
 def begins_at_rest(run: Run) -> Callable[[list[Sample]], bool]:
     """A function that tells whether the first second of some samples is quiet enough for the start
     of the filter."""
-    setup = tracking_filter(run)
+    setup = filter_setup(run.config.data, run.config.filter)
 
     def at_rest(samples: list[Sample]) -> bool:
         first = [each for each in samples if each.time - samples[0].time < FIRST_SECONDS]

@@ -50,7 +50,7 @@ AT_WAYPOINTS = ("leg_ratio", "waypoint_rms")
 _DAMAGED = "the package is damaged: fetch or publish it again"
 
 
-class About(NamedTuple):
+class PackageManifest(NamedTuple):
     """The content of a package's manifest."""
 
     name: str
@@ -78,73 +78,75 @@ class Weights(NamedTuple):
 
     name: str
     run: Run
-    about: str
+    trained_on: str
     """Its training data, and its measured error if there is one."""
 
 
 # --- where packages are found
 
 
-def is_package(place: Path) -> bool:
+def is_package(path: Path) -> bool:
     """Whether a folder or file is meant to be a package; its content is not checked."""
-    return (place.is_file() and place.suffix == ".zip") or (place / MANIFEST).is_file()
+    return (path.is_file() and path.suffix == ".zip") or (path / MANIFEST).is_file()
 
 
 def packages() -> dict[str, Path]:
     """Packages by name (that of the folder, or of the zip without its suffix), those of gnio-jax
     first. Raises `InputError` for a folder of $GNIO_WEIGHTS that is missing."""
-    folders = [Path(each) for each in os.environ.get(VARIABLE, "").split(os.pathsep) if each]
-    found: dict[str, Path] = {}
+    folders = [Path(folder) for folder in os.environ.get(VARIABLE, "").split(os.pathsep) if folder]
+    paths: dict[str, Path] = {}
     for folder in (SHIPPED, *folders):
         if not folder.is_dir():
             raise InputError(
                 f"${VARIABLE}", f"'{folder}' is not a folder", "name folders that contain packages"
             )
-        for place in filter(is_package, sorted(folder.iterdir())):
-            found.setdefault(place.name.removesuffix(".zip"), place)
-    return found
+        for path in filter(is_package, sorted(folder.iterdir())):
+            paths.setdefault(path.name.removesuffix(".zip"), path)
+    return paths
 
 
 def find(which: str | Path | None = None) -> Path:
     """The package or run of a path or a name; None: the first of gnio-jax, else the newest run
     below runs/. Raises `InputError` for neither."""
-    known = packages()
+    paths = packages()
     if which is None:
-        shipped = [place for place in known.values() if place.parent == SHIPPED]
+        shipped = [
+            shipped_path for shipped_path in paths.values() if shipped_path.parent == SHIPPED
+        ]
         return shipped[0] if shipped else configuration.newest_run()
     path = Path(which)
     if is_package(path) or (path / "config.yaml").is_file():
         return path
-    if str(which) in known:
-        return known[str(which)]
+    if str(which) in paths:
+        return paths[str(which)]
     if path.exists():
         problem = f"holds neither a package ({MANIFEST}) nor a run (config.yaml)"
         raise InputError(path, problem, "gnio publish makes a package of a run")
-    names = f"known names: {', '.join(known) or 'none'}; give a folder, a zip or a name"
-    hint = did_you_mean(str(which), known).strip()
+    names = f"known names: {', '.join(paths) or 'none'}; give a folder, a zip or a name"
+    hint = did_you_mean(str(which), paths).strip()
     raise InputError(which, "no such weights", hint or names)
 
 
 def choose(which: str | Path | None = None) -> Weights:
     """The weights of a name, package or run that `find` finds. Raises `InputError`."""
-    place = find(which)
-    if is_package(place):
-        about, content = read(place)
-        name, trained_on, measured = about.name, about.data, about.measured
-        source = str(place / MANIFEST)
-        config = configuration.parse(json.dumps(about.config), source)
+    path = find(which)
+    if is_package(path):
+        manifest, content = read(path)
+        name, trained_on, measured = manifest.name, manifest.data, manifest.measured
+        source = str(path / MANIFEST)
+        config = configuration.parse(json.dumps(manifest.config), source)
         config = configuration.validate(config, source)
         model = models.from_config(config.model)
         shapes = models.variable_shapes(model, config.data.seen)
         template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
-        variables = from_bytes(content, template, place / WEIGHTS)
-        run = Run(config, model, variables, about.epoch, about.step)
+        variables = from_bytes(content, template, path / WEIGHTS)
+        run = Run(config, model, variables, manifest.epoch, manifest.step)
     else:
-        run = checkpoint.load_run(place)
+        run = checkpoint.load_run(path)
         names, split = ", ".join(run.config.datasets), run.config.data.train_split
-        name, trained_on = place.name, f"dataset {names}, split {split}"
+        name, trained_on = path.name, f"dataset {names}, split {split}"
         try:
-            measured = _measured(_figures(place), run.config.datasets)
+            measured = _measured(_figures(path), run.config.datasets)
         except InputError:
             measured = ""  # a damaged evaluation must not prevent tracking
     return Weights(name, run, f"{trained_on}, whose {measured}" if measured else trained_on)
@@ -164,10 +166,10 @@ def load_pretrained(which: str | Path | None = None) -> Run:
 
 def card_of(which: str | Path) -> str:
     """The model card of a package, Markdown. Raises `InputError`, also for a run."""
-    place = find(which)
-    if not is_package(place):
-        raise InputError(place, "is a run and has no model card", "gnio publish makes a package")
-    return "\n".join(map(str, read_about(place).card))
+    path = find(which)
+    if not is_package(path):
+        raise InputError(path, "is a run and has no model card", "gnio publish makes a package")
+    return "\n".join(map(str, read_manifest(path).card))
 
 
 def write_run(which: str | Path, workdir: Path) -> None:
@@ -186,85 +188,85 @@ def write_run(which: str | Path, workdir: Path) -> None:
 # --- reading
 
 
-def read(place: Path) -> tuple[About, bytes]:
+def read(path: Path) -> tuple[PackageManifest, bytes]:
     """The manifest and the weights of a package. Raises `InputError` if it is damaged."""
-    about = read_about(place)
-    content = _content(place, WEIGHTS, LARGEST_WEIGHTS)
-    if fingerprint(content) != about.weights:
+    manifest = read_manifest(path)
+    content = _content(path, WEIGHTS, LARGEST_WEIGHTS)
+    if fingerprint(content) != manifest.weights:
         problem = f"'{WEIGHTS}' is not the file that the manifest describes (SHA-256 differs)"
-        raise InputError(place, problem, _DAMAGED)
-    return about, content
+        raise InputError(path, problem, _DAMAGED)
+    return manifest, content
 
 
-def read_about(place: Path) -> About:
+def read_manifest(path: Path) -> PackageManifest:
     """The manifest of a package; the weights are not read. Raises `InputError`."""
     try:
-        found = json.loads(_content(place, MANIFEST, LARGEST_MANIFEST))
+        manifest = json.loads(_content(path, MANIFEST, LARGEST_MANIFEST))
     except (ValueError, RecursionError) as error:  # InputError, too, is a ValueError
         if isinstance(error, InputError):
             raise
-        raise InputError(place, f"'{MANIFEST}' is no JSON ({error})", _DAMAGED) from None
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise InputError(place, f"'{MANIFEST}' is not that of a package", _DAMAGED)
-    if found.get("version") == 1:
-        found = _of_version_1(place, found)
-    elif found.get("version") != VERSION:
-        problem = f"has format version {found.get('version')!r}; this program reads {VERSION}"
+        raise InputError(path, f"'{MANIFEST}' is no JSON ({error})", _DAMAGED) from None
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise InputError(path, f"'{MANIFEST}' is not that of a package", _DAMAGED)
+    if manifest.get("version") == 1:
+        manifest = _of_version_1(path, manifest)
+    elif manifest.get("version") != VERSION:
+        problem = f"has format version {manifest.get('version')!r}; this program reads {VERSION}"
         raise InputError(
-            place, problem, "publish its run again, or install the gnio-jax that made it"
+            path, problem, "publish its run again, or install the gnio-jax that made it"
         )
-    elif _digest(found) != found.get("sha256"):
-        raise InputError(place, f"'{MANIFEST}' was changed (SHA-256 differs)", _DAMAGED)
-    for name, kind in get_type_hints(About).items():
-        value = found.get(name)
+    elif _digest(manifest) != manifest.get("sha256"):
+        raise InputError(path, f"'{MANIFEST}' was changed (SHA-256 differs)", _DAMAGED)
+    for name, kind in get_type_hints(PackageManifest).items():
+        value = manifest.get(name)
         if type(value) is not kind or (isinstance(value, int) and not 0 <= value < 2**31):
-            raise InputError(place, f"'{MANIFEST}' has no '{name}', or a wrong one", _DAMAGED)
-    if found["weights"].keys() != {"bytes", "sha256"}:
-        raise InputError(place, f"'{MANIFEST}' does not describe '{WEIGHTS}'", _DAMAGED)
-    return About(*(found[name] for name in About._fields))
+            raise InputError(path, f"'{MANIFEST}' has no '{name}', or a wrong one", _DAMAGED)
+    if manifest["weights"].keys() != {"bytes", "sha256"}:
+        raise InputError(path, f"'{MANIFEST}' does not describe '{WEIGHTS}'", _DAMAGED)
+    return PackageManifest(*(manifest[name] for name in PackageManifest._fields))
 
 
-def _of_version_1(place: Path, found: dict[str, Any]) -> dict[str, Any]:
+def _of_version_1(path: Path, manifest: dict[str, Any]) -> dict[str, Any]:
     """The manifest of an earlier version, whose settings and card were separate files."""
-    files = found.get("files")
-    described = files if isinstance(files, dict) else {}
+    files = manifest.get("files")
+    fingerprints = files if isinstance(files, dict) else {}
     texts = {}
     for name in ("config.yaml", "README.md"):
-        content = _content(place, name, LARGEST_MANIFEST)
-        if fingerprint(content) != described.get(name):
+        content = _content(path, name, LARGEST_MANIFEST)
+        if fingerprint(content) != fingerprints.get(name):
             problem = f"'{name}' is not the file that the manifest describes (SHA-256 differs)"
-            raise InputError(place, problem, _DAMAGED)
+            raise InputError(path, problem, _DAMAGED)
         texts[name] = content.decode("utf-8", "replace")
-    config = configuration.parse(texts["config.yaml"], str(place / "config.yaml"))
-    return found | {
+    config = configuration.parse(texts["config.yaml"], str(path / "config.yaml"))
+    return manifest | {
         "measured": "",
         "card": texts["README.md"].splitlines(),
         "config": configuration.plain(config),
-        "weights": described.get(WEIGHTS),
+        "weights": fingerprints.get(WEIGHTS),
     }
 
 
 def _digest(manifest: dict[str, Any]) -> str:
     """The SHA-256 of all fields of a manifest except this digest."""
-    rest = {name: value for name, value in manifest.items() if name != "sha256"}
-    return str(fingerprint(json.dumps(rest, sort_keys=True).encode())["sha256"])
+    fields = {name: value for name, value in manifest.items() if name != "sha256"}
+    return str(fingerprint(json.dumps(fields, sort_keys=True).encode())["sha256"])
 
 
-def _content(place: Path, name: str, most: int) -> bytes:
+def _content(path: Path, name: str, most: int) -> bytes:
     """The content of a file of at most `most` bytes."""
     try:
-        if place.is_dir():
-            with (place / name).open("rb") as file:
+        if path.is_dir():
+            with (path / name).open("rb") as file:
                 content = file.read(most + 1)
         else:
-            with zipfile.ZipFile(place) as archive, archive.open(name) as file:
+            with zipfile.ZipFile(path) as archive, archive.open(name) as file:
                 content = file.read(most + 1)
     except (FileNotFoundError, KeyError):
-        raise InputError(place, f"'{name}' is missing", _DAMAGED) from None
+        raise InputError(path, f"'{name}' is missing", _DAMAGED) from None
     except (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
-        raise InputError(place, f"'{name}' cannot be read ({error})", _DAMAGED) from None
+        raise InputError(path, f"'{name}' cannot be read ({error})", _DAMAGED) from None
     if len(content) > most:
-        raise InputError(place, f"'{name}' is larger than {most} bytes", _DAMAGED)
+        raise InputError(path, f"'{name}' is larger than {most} bytes", _DAMAGED)
     return content
 
 
@@ -281,15 +283,17 @@ def from_bytes(content: bytes, template: Any, where: object) -> Any:
     except (SafetensorError, ValueError, KeyError) as error:
         problem = f"cannot be read ({str(error)[:120]})"
         raise InputError(where, problem, "it must be a safetensors file") from None
-    wanted = _named(template)
-    for name in sorted(wanted.keys() | tensors.keys()):
-        found, own = (tree[name].shape if name in tree else None for tree in (tensors, wanted))
-        if found != own:
-            problem = f"'{name}' has shape {found}; the configured network has {own}"
+    expected = _named(template)
+    for name in sorted(expected.keys() | tensors.keys()):
+        shape, expected_shape = (
+            tree[name].shape if name in tree else None for tree in (tensors, expected)
+        )
+        if shape != expected_shape:
+            problem = f"'{name}' has shape {shape}; the configured network has {expected_shape}"
             raise InputError(where, problem, "weights and settings must be of one run")
         if not np.isfinite(tensors[name]).all():
             raise InputError(where, f"'{name}' holds values that are not finite")
-    leaves = [jnp.asarray(tensors[name], jnp.float32) for name in wanted]
+    leaves = [jnp.asarray(tensors[name], jnp.float32) for name in expected]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
@@ -309,7 +313,7 @@ def publish(
     license: str,
     fails: tuple[str, ...] = (),
     which: Which = "best",
-) -> About:
+) -> PackageManifest:
     """Make a package from a run at `out`: a zip if its name ends with .zip, else a folder. It
     replaces an older package. It is written whole or not at all, and its settings do not contain
     folders of this machine.
@@ -332,8 +336,8 @@ def publish(
         raise InputError(out, "is there already and is no package", "name another --out")
     run = checkpoint.load_run(workdir, which)
     figures = _figures(workdir)
-    content = to_bytes(run.variables)
-    about = About(
+    weights = to_bytes(run.variables)
+    manifest = PackageManifest(
         name,
         run.config.model.name,
         data,
@@ -344,37 +348,37 @@ def publish(
         f"gnio-jax {version('gnio-jax')}",
         [],
         configuration.plain(configuration.without_places(run.config)),
-        fingerprint(content),
+        fingerprint(weights),
     )
-    about = about._replace(card=_card(about, fails, run, figures, workdir).split("\n"))
-    manifest = {"format": FORMAT, "version": VERSION, **about._asdict()}
-    manifest["sha256"] = _digest(manifest)
-    text = json.dumps(manifest, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    files = {MANIFEST: text.encode(), WEIGHTS: content}
+    manifest = manifest._replace(card=_card(manifest, fails, run, figures, workdir).split("\n"))
+    fields = {"format": FORMAT, "version": VERSION, **manifest._asdict()}
+    fields["sha256"] = _digest(fields)
+    text = json.dumps(fields, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    files = {MANIFEST: text.encode(), WEIGHTS: weights}
     if out.suffix == ".zip":
         with replacing(out) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-            for name, each in files.items():
+            for name, content in files.items():
                 # With a date the bytes of the same package would differ.
-                archive.writestr(zipfile.ZipInfo(name), each, zipfile.ZIP_DEFLATED)
+                archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
     else:
         with replacing_folder(out) as folder:
-            for name, each in files.items():
-                (folder / name).write_bytes(each)
-    return about
+            for name, content in files.items():
+                (folder / name).write_bytes(content)
+    return manifest
 
 
-def _has_manifest(place: Path) -> bool:
+def _has_manifest(path: Path) -> bool:
     """Whether it holds the manifest of a package, of any version."""
     try:
-        return f'"{FORMAT}"'.encode() in _content(place, MANIFEST, LARGEST_MANIFEST)
+        return f'"{FORMAT}"'.encode() in _content(path, MANIFEST, LARGEST_MANIFEST)
     except InputError:
         return False
 
 
 def _figures(workdir: Path) -> dict[str, Report]:
-    """Every evaluation of a run, by its folder's name. Raises `InputError`."""
-    places = sorted(path.parent for path in workdir.glob("eval/*/metrics.json"))
-    return {place.name: report.read(place) for place in places}
+    """Read every evaluation of a run, by its folder's name. Raises `InputError`."""
+    folders = sorted(path.parent for path in workdir.glob("eval/*/metrics.json"))
+    return {folder.name: report.read(folder) for folder in folders}
 
 
 def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
@@ -383,15 +387,15 @@ def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
     the run's own datasets, then those on a test split. It is empty if no evaluation has it."""
 
     def rank(name: str) -> tuple[bool, bool, bool, int, str]:
-        how = figures[name].settings
-        own, tested = how["dataset"] in datasets, "test" in how["split"]
-        return how["estimator"] != "ekf", not own, not tested, len(name), name
+        settings = figures[name].settings
+        of_run, tested = settings["dataset"] in datasets, "test" in settings["split"]
+        return settings["estimator"] != "ekf", not of_run, not tested, len(name), name
 
     for name in sorted(figures, key=rank):
         if (error := _cell(figures[name], SHOWN[0])) != tabulate.number(None, 0):
-            found = f"{tabulate.column(SHOWN[0]).heading} is {error} m on {name}"
-            carried = _by_placement(figures[name])
-            return f"{found} ({'; '.join(carried)})" if carried else found
+            text = f"{tabulate.column(SHOWN[0]).heading} is {error} m on {name}"
+            by_placement = _by_placement(figures[name])
+            return f"{text} ({'; '.join(by_placement)})" if by_placement else text
     return ""
 
 
@@ -399,68 +403,76 @@ def _by_placement(figures: Report) -> list[str]:
     """The mean of this error for each way of carrying, the smallest first, in words."""
     errors: dict[str, list[float]] = {}
     for name, placement in figures.placements.items():
-        own = figures.scores[name]
-        error = own.values.get(SHOWN[0])
-        if error is not None and math.isfinite(error) and not own.diverged:
+        scores = figures.scores[name]
+        error = scores.values.get(SHOWN[0])
+        if error is not None and math.isfinite(error) and not scores.diverged:
             errors.setdefault(placement, []).append(error)
-    means = {placement: sum(own) / len(own) for placement, own in errors.items()}
-    return [f"{each} {means[each]:.1f}" for each in sorted(means, key=means.__getitem__)]
+    means = {placement: sum(values) / len(values) for placement, values in errors.items()}
+    return [
+        f"{placement} {means[placement]:.1f}" for placement in sorted(means, key=means.__getitem__)
+    ]
 
 
 def _cell(figures: Report, metric: str) -> str:
     """The mean over the sequences with its 95 % interval."""
-    found = summarise([figures.scores], metric, figures.groups)
+    summary = summarise([figures.scores], metric, figures.groups)
     digits = tabulate.column(metric).digits
-    text = tabulate.number(found.mean, digits)
-    if found.interval is None:
+    text = tabulate.number(summary.mean, digits)
+    if summary.interval is None:
         return text
-    low, high = (tabulate.number(each, digits) for each in found.interval)
+    low, high = (tabulate.number(bound, digits) for bound in summary.interval)
     return f"{text} ({low} to {high})"
 
 
 def _named_run(which: str) -> str:
     """The name of a package, or a run without the folders of this machine."""
-    known = which in packages() and not Path(which).exists()
-    return shlex.quote(which if known else f"runs/{Path(which).name}")
+    is_package_name = which in packages() and not Path(which).exists()
+    return shlex.quote(which if is_package_name else f"runs/{Path(which).name}")
 
 
 def _card(
-    about: About, fails: tuple[str, ...], run: Run, figures: dict[str, Report], workdir: Path
+    manifest: PackageManifest,
+    fails: tuple[str, ...],
+    run: Run,
+    figures: dict[str, Report],
+    workdir: Path,
 ) -> str:
     """The model card, Markdown."""
-    config, windows, name = run.config, run.config.data, about.name
-    begun = f" --init-from {_named_run(config.init_from)}" if config.init_from else ""
+    config, windows, name = run.config, run.config.data, manifest.name
+    start = f" --init-from {_named_run(config.init_from)}" if config.init_from else ""
     if windows.poses_by:
-        begun += f" --set data.poses_by={_named_run(windows.poses_by)}"
-    steps, fitted = [f"gnio train --config config.yaml --workdir runs/{name}{begun}"], ""
+        start += f" --set data.poses_by={_named_run(windows.poses_by)}"
+    steps, filter_note = [f"gnio train --config config.yaml --workdir runs/{name}{start}"], ""
     if (workdir / "calibration.json").is_file():
-        found = json.loads((workdir / "calibration.json").read_text(encoding="utf-8"))
-        fitted_run = Path(found["run"]).name
+        calibration = json.loads((workdir / "calibration.json").read_text(encoding="utf-8"))
+        fitted_run = Path(calibration["run"]).name
         if fitted_run == workdir.name.removesuffix("_calibrated"):
             fitted_run = name
-        averaged = " --average-headings" if found.get("average_headings") else ""
-        steps.append(f"gnio calibrate --workdir runs/{fitted_run}{averaged}")
-        fitted = f" The filter is fitted to split `{found['split']}` of run `{fitted_run}`."
+        headings = " --average-headings" if calibration.get("average_headings") else ""
+        steps.append(f"gnio calibrate --workdir runs/{fitted_run}{headings}")
+        filter_note = (
+            f" The filter is fitted to split `{calibration['split']}` of run `{fitted_run}`."
+        )
     recipe = "\n".join(("```", *steps, "```"))
-    considered = [each for each, std in config.filter.considered._asdict().items() if std > 0]
-    tapped = any(AT_WAYPOINTS[0] in found.summary() for found in figures.values())
-    shown = (*SHOWN, *AT_WAYPOINTS) if tapped else SHOWN
-    header = ["evaluation", "sequences", "groups", *(tabulate.column(x).title for x in shown)]
+    considered = [name for name, std in config.filter.considered._asdict().items() if std > 0]
+    has_waypoints = any(AT_WAYPOINTS[0] in evaluation.summary() for evaluation in figures.values())
+    metrics = (*SHOWN, *AT_WAYPOINTS) if has_waypoints else SHOWN
+    header = ["evaluation", "sequences", "groups", *(tabulate.column(x).title for x in metrics)]
     rows = [
         [
-            place,
-            str(len(found.scores)),
-            str(len(set(found.groups.values()))),
-            *(_cell(found, metric) for metric in shown),
+            folder,
+            str(len(evaluation.scores)),
+            str(len(set(evaluation.groups.values()))),
+            *(_cell(evaluation, metric) for metric in metrics),
         ]
-        for place, found in figures.items()
+        for folder, evaluation in figures.items()
     ]
     means = "Means over sequences, with 95 % intervals over groups (people, sessions)."
     table = f"{tabulate.markdown(header, rows)}\n{means}"
     fails = fails or ("Its publisher has not said. Try it on recordings like yours.",)
     return f"""# {name}
 
-Network `{config.model.name}` for neural inertial odometry by {about.made_by}: windows of \
+Network `{config.model.name}` for neural inertial odometry by {manifest.made_by}: windows of \
 {windows.window_seconds:g} s at {windows.rate:g} Hz, a displacement every \
 {windows.stride_seconds:g} s. Epoch {run.epoch}, step {run.step}.
 
@@ -470,9 +482,9 @@ gnio track RECORDING --weights {name}
 
 ## Data and licence
 
-Trained on: {about.data}
+Trained on: {manifest.data}
 
-Licence: {about.license}
+Licence: {manifest.license}
 
 ## Recipe
 
@@ -480,7 +492,7 @@ Licence: {about.license}
 
 Dataset `{", ".join(config.datasets)}`, seed {config.seed}; `gnio weights {name} --out \
 runs/{name}` writes config.yaml with all settings, those of the filter as they are used. Consider \
-covariance of the filter: {", ".join(considered) or "none"}.{fitted}
+covariance of the filter: {", ".join(considered) or "none"}.{filter_note}
 
 ## Figures
 
@@ -488,4 +500,4 @@ covariance of the filter: {", ".join(considered) or "none"}.{fitted}
 
 ## Where it fails
 
-{chr(10).join(f"- {each}" for each in fails)}"""
+{chr(10).join(f"- {sentence}" for sentence in fails)}"""

@@ -58,20 +58,20 @@ def write(
     """
     import rerun
 
-    stems = file_names([each.name for each in estimates])
+    stems = file_names([original.name for original in estimates])
     with replacing(path) as temporary:
         log = rerun.RecordingStream("gnio-jax", recording_id="gnio")
         log.save(temporary)
         log.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for stem, each, recording in zip(stems, estimates, recordings, strict=True):
-            estimate = in_one_frame(each, alignment)
+        for stem, original, recording in zip(stems, estimates, recordings, strict=True):
+            estimate = in_one_frame(original, alignment)
             _log_paths(log, stem, estimate)
             time = estimate.trajectory.time - estimate.trajectory.time[0]
-            found, filtered = estimate.displacements, estimate.filtered
+            displacements, history = estimate.displacements, estimate.filtered
             curves = {
-                **({} if found is None else found.diagnostics),
-                "network_std": found and found.std,
-                "nis": filtered and filtered.nis[:, None],
+                **({} if displacements is None else displacements.diagnostics),
+                "network_std": displacements and displacements.std,
+                "nis": history and history.nis[:, None],
             }
             for name, values in curves.items():
                 _log_curves(log, f"{stem}/{name}", time, values)
@@ -98,7 +98,7 @@ def _log_paths(log: Any, stem: str, estimate: Estimate) -> None:
 
 
 def _log_poses(
-    log: Any, place: str, poses: Trajectory, covariance: Float[np.ndarray, "k 3 3"] | None
+    log: Any, entity: str, poses: Trajectory, covariance: Float[np.ndarray, "k 3 3"] | None
 ) -> None:
     """Log poses over time, and the contours of the covariances of their positions (m²) at
     `SIGMAS`."""
@@ -107,7 +107,7 @@ def _log_poses(
     time = rerun.TimeColumn("time", duration=poses.time)
     quaternion = xyzw_from_wxyz(poses.orientation)
     pose = rerun.Transform3D.columns(translation=poses.position, quaternion=quaternion)
-    log.send_columns(f"{place}/pose", [time], pose)
+    log.send_columns(f"{entity}/pose", [time], pose)
     if covariance is None:
         return
     variance, axes = np.linalg.eigh(covariance)
@@ -117,20 +117,20 @@ def _log_poses(
         half_sizes=SIGMAS * np.sqrt(np.maximum(variance, 0.0)),
         quaternions=xyzw_from_wxyz(quaternion_from_matrix(axes)),
     )
-    log.send_columns(f"{place}/ellipsoid", [time], contour)
+    log.send_columns(f"{entity}/ellipsoid", [time], contour)
 
 
-def _log_curves(log: Any, place: str, time: Float[np.ndarray, "n"], values: Any) -> None:
+def _log_curves(log: Any, entity: str, time: Float[np.ndarray, "n"], values: Any) -> None:
     """Log curves (n, w) over time, where they are known; nothing for None."""
     import rerun
 
-    if values is None or not (known := finite_rows(values)).any():
+    if values is None or not (finite := finite_rows(values)).any():
         return
-    colours = AXES if values.shape[1] == 3 else {place.rpartition("/")[2]: BLUE}
+    colours = AXES if values.shape[1] == 3 else {entity.rpartition("/")[2]: BLUE}
     lines = rerun.SeriesLines(names=list(colours), colors=[*map(_rgb, colours.values())])
-    log.log(place, lines, static=True)
-    column = rerun.TimeColumn("time", duration=time[known])
-    log.send_columns(place, [column], rerun.Scalars.columns(scalars=values[known]))
+    log.log(entity, lines, static=True)
+    column = rerun.TimeColumn("time", duration=time[finite])
+    log.send_columns(entity, [column], rerun.Scalars.columns(scalars=values[finite]))
 
 
 def _rgb(colour: str) -> tuple[int, ...]:
@@ -181,8 +181,8 @@ class RerunStream:
             return
         self._start = pose.time if self._start is None else self._start
         time, attitude = np.array([pose.time - self._start]), pose.rotation[None]
-        one = Trajectory(time, pose.position[None], quaternion_from_matrix(attitude))
-        _log_poses(self._log, "live", one, pose.covariance[None, 6:9, 6:9])
+        poses = Trajectory(time, pose.position[None], quaternion_from_matrix(attitude))
+        _log_poses(self._log, "live", poses, pose.covariance[None, 6:9, 6:9])
         if np.isfinite(pose.nis):
             column = rerun.TimeColumn("time", duration=time)
             nis = rerun.Scalars.columns(scalars=[pose.nis])

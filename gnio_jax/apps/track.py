@@ -24,23 +24,15 @@ from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Recording, estimate, metrics, prepare, report
-from gnio_jax.evaluation.prepare import ROUGH_START, measured_rows
+from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
 from gnio_jax.filtering.settings import FilterSetup, filter_setup
 from gnio_jax.filtering.zero_velocity import quiet_samples
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import GRAVITY, Sequence
 
-ZERO_VELOCITY_STD = 0.02
-"""Standard deviation of the zero velocity that the filter measures while the IMU is quiet, m/s
-(ours)."""
-GAP_GYRO_STD, GAP_ACCEL_STD = 0.8, 0.8
-"""Standard deviations of a carrier's motion while samples are missing, rad/s and m/s² (ours). On
-OxIOD and on simulated walks the root mean square over a second is 0.5 to 0.8 rad and 0.5 to 0.7 m/s
-for each axis; over two and three seconds it is less per second."""
 LYING = 0.95
 """Share of rest from which a warning says that a recording lies still (ours)."""
 RUNNING, RUNNING_SHARE = 5.0, 0.7
@@ -105,19 +97,6 @@ class Tracked(NamedTuple):
     folder: Path
 
 
-def tracking_filter(run: Run) -> FilterSetup:
-    """The run's own filter, which also measures rest, and whose covariance grows by a walker's
-    motion while samples are missing. `gnio live` and `gnio export` use the same."""
-    setup = filter_setup(run.config.data, run.config.filter)
-    config = dataclasses.replace(
-        setup.config,
-        zero_velocity_std=ZERO_VELOCITY_STD,
-        gap_gyro_std=GAP_GYRO_STD,
-        gap_accel_std=GAP_ACCEL_STD,
-    )
-    return setup._replace(config=config)
-
-
 def track(
     recording: Imported,
     weights: Weights,
@@ -141,7 +120,7 @@ def track(
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
     _check_bridged(sequence)
-    ekf = tracking_filter(weights.run)
+    ekf = filter_setup(config.data, config.filter)
     ready, left_out = prepare(
         [sequence],
         config.data,
@@ -188,7 +167,7 @@ def _check_bridged(sequence: Sequence) -> None:
     motion in it."""
     # An earlier resampling interpolated the holes, and each clock has widened a hole by up to a
     # sample at each end.
-    there = np.union1d(sequence.time[measured_rows(sequence)], sequence.time[[0, -1]])
+    there = np.union1d(sequence.time[sequence.measured_rows], sequence.time[[0, -1]])
     bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
     check_gaps(sequence.time, sequence.name)
     check_gaps(there, sequence.name, WINDOW_SECONDS + bridged)
@@ -220,7 +199,7 @@ def summarise(
     summary = Summary(
         recording=sequence.name,
         weights=weights.name,
-        trained_on=weights.about,
+        trained_on=weights.trained_on,
         start_time=float(sequence.attributes.get("start_time", 0.0)),
         seconds=seconds,
         path_length=length,

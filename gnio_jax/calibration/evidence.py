@@ -52,44 +52,46 @@ def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
     Raises `InputError` for a split that is neither the run's validation nor its training split, and
     for runs that are not the folds of one experiment.
     """
-    split, own = run.config.data.train_split, run.config.data.val_split
+    train, val = run.config.data.train_split, run.config.data.val_split
     if not config.out_of_fold:
-        if config.split not in (None, own, split):
+        if config.split not in (None, val, train):
             problem = "is neither the validation nor the training split of the run"
-            remedy = f"give {own} or {split}: the filter must not be fitted to test walks"
+            remedy = f"give {val} or {train}: the filter must not be fitted to test walks"
             raise InputError(f"--split {config.split}", problem, remedy)
-        return config.split or own, [Source(run, None)]
+        return config.split or val, [Source(run, None)]
     if config.split:
         problem = "is of no use with --out-of-fold, which takes the training split"
         raise InputError(f"--split {config.split}", problem)
     runs = [load_run(Path(folder), config) for folder in config.out_of_fold]
     for folder, fold_run in zip(config.out_of_fold, runs, strict=True):
         _check_alike(folder, fold_run.config, run.config)
-    found, count = [each.config.data.train_split for each in runs], len(runs)
-    unseen = {
-        f"{split}-{k}of{count}": data.Fold(split, k, count, left_out=False) for k in range(count)
+    splits, count = [fold_run.config.data.train_split for fold_run in runs], len(runs)
+    folds = {
+        f"{train}-{k}of{count}": data.Fold(train, k, count, left_out=False) for k in range(count)
     }
-    if count < 2 or sorted(found) != sorted(unseen):
-        remedy = f"train one run for each of --data.train-split {split}-0ofK, {split}-1ofK, ..."
-        raise InputError("--out-of-fold", f"were trained on the splits {', '.join(found)}", remedy)
-    return split, [Source(each, unseen[name]) for each, name in zip(runs, found, strict=True)]
+    if count < 2 or sorted(splits) != sorted(folds):
+        remedy = f"train one run for each of --data.train-split {train}-0ofK, {train}-1ofK, ..."
+        raise InputError("--out-of-fold", f"were trained on the splits {', '.join(splits)}", remedy)
+    return train, [
+        Source(fold_run, folds[name]) for fold_run, name in zip(runs, splits, strict=True)
+    ]
 
 
 def _check_alike(folder: str, fold_run: TrainConfig, run: TrainConfig) -> None:
     """Check that a fold has the experiment of the run, except for its share of the recordings."""
-    own = dataclasses.replace(fold_run.data, train_split=run.data.train_split)
-    for name, found, expected in (
+    windows = dataclasses.replace(fold_run.data, train_split=run.data.train_split)
+    for name, section, expected in (
         ("dataset", fold_run.dataset, run.dataset),
-        ("data", own, run.data),
+        ("data", windows, run.data),
         ("model", fold_run.model, run.model),
     ):
-        if found != expected:
+        if section != expected:
             raise InputError(folder, f"differs from the calibrated run in '{name}'")
 
 
 def gather(
     split: str,
-    asked: list[Source],
+    networks: list[Source],
     config: CalibrateConfig,
     settings: FilterSettings,
     progress: OnStage,
@@ -101,38 +103,40 @@ def gather(
     The network runs in the loop of the filter with `settings`, and the filter's attitude rotates
     the windows.
     """
-    own = asked[0].run.config
-    names = ", ".join(own.datasets)
-    roots = config.data_root or (own.data_root,) * len(own.datasets)
-    if len(roots) != len(own.datasets):
+    trained = networks[0].run.config
+    names = ", ".join(trained.datasets)
+    roots = config.data_root or (trained.data_root,) * len(trained.datasets)
+    if len(roots) != len(trained.datasets):
         problem = f"names {len(roots)} folders, and the run has learnt from {names}"
         raise InputError("--data-root", problem, "name one for each dataset")
-    loaded = [
+    datasets = [
         data.load(name, root, split, workers, lambda share: progress("reading", share))
-        for name, root in zip(own.datasets, roots, strict=True)
+        for name, root in zip(trained.datasets, roots, strict=True)
     ]
-    found = Evidence([], [])
-    for number, source in enumerate(asked):
-        trained, where = source.run.config.data, f"dataset {names}, split '{split}'"
-        recordings = [each for sequences in loaded for each in sequences]
+    evidence = Evidence([], [])
+    for number, source in enumerate(networks):
+        windows, subset = source.run.config.data, f"dataset {names}, split '{split}'"
+        sequences = [sequence for dataset in datasets for sequence in dataset]
         if source.fold is not None:
-            where = f"{where}, fold {source.fold.number}"
-            recordings = [each for some in loaded for each in source.fold.select(some)]
-        with_reference = [each for each in recordings if each.valid.any()]
+            subset = f"{subset}, fold {source.fold.number}"
+            sequences = [
+                sequence for dataset in datasets for sequence in source.fold.select(dataset)
+            ]
+        with_reference = [sequence for sequence in sequences if sequence.valid.any()]
         prepared, _ = prepare(
-            with_reference, trained, settings.start, raw_gyro_bias=settings.raw_gyro_bias
+            with_reference, windows, settings.start, raw_gyro_bias=settings.raw_gyro_bias
         )
         if not prepared:
             problem = "has no recording with a reference that is long enough to be fitted"
-            raise InputError(where, problem)
+            raise InputError(subset, problem)
         network = Network.of(source.run.model, source.run.variables)
         estimates = estimate(
             prepared,
             network,
-            own.data,
-            filter_setup(own.data, settings),
-            progress=lambda share, n=number: progress("estimating", (n + share) / len(asked)),
+            trained.data,
+            filter_setup(trained.data, settings),
+            progress=lambda share, n=number: progress("estimating", (n + share) / len(networks)),
         )
-        found.recordings.extend(prepared)
-        found.estimates.extend(estimates)
-    return found
+        evidence.recordings.extend(prepared)
+        evidence.estimates.extend(estimates)
+    return evidence

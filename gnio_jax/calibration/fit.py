@@ -99,13 +99,13 @@ def std_factors(
     starts. Those of the network are expressed in the filter's own yaw frame. Raises `ValueError` if
     too few windows have both.
     """
-    found = []
+    errors = []
     for estimate, truth in zip(estimates, truths, strict=True):
         displacements = estimate.displacements
         assert displacements is not None
         last = slice(len(displacements.value) - len(truth), None)
-        found.append((displacements.value[last] - truth) / displacements.std[last])
-    normalised = np.concatenate(found)
+        errors.append((displacements.value[last] - truth) / displacements.std[last])
+    normalised = np.concatenate(errors)
     normalised = normalised[np.isfinite(normalised).all(1)]
     if len(normalised) < LEAST_WINDOWS:
         raise ValueError(f"{len(normalised)} windows have a reference, {LEAST_WINDOWS} are needed")
@@ -158,13 +158,13 @@ def fit_innovations(
     """
     free = free_parameters(settings, paths)
     names, start = tuple(free), np.array(list(free.values()))
-    given = jax.device_put((walks, start, settings))
+    on_device = jax.device_put((walks, start, settings))
     config = innovation_config(windows, settings)
     evidences: list[float] = []
     """Values of every call, the first of which is at the start."""
 
     def evaluate(vector: np.ndarray) -> tuple[float, np.ndarray]:
-        call = _value_and_gradient(vector, *given, names=names, config=config)
+        call = _value_and_gradient(vector, *on_device, names=names, config=config)
         (value, evidence), gradient = jax.device_get(call)
         sound = np.isfinite(value) and np.isfinite(gradient).all()
         evidences.append(float(evidence) if sound else FAILED)
@@ -173,26 +173,26 @@ def fit_innovations(
             return FAILED, np.zeros_like(vector)
         return float(value), np.asarray(gradient, float)
 
-    at, reached, steps, converged = start, math.inf, 0, False
+    point, least, steps, converged = start, math.inf, 0, False
     # After a trial step to a point with an exploding gradient (4e126 occurred, for a value of 0.4)
     # the step of the line search becomes almost zero, which counts as convergence. A new search
     # from there continues, if the objective can still decrease.
     while True:
         limits = {"maxiter": most_steps - steps, "ftol": 1e-7}
-        found = minimize(evaluate, at, jac=True, method="L-BFGS-B", options=limits)
-        gained, at, reached = reached - found.fun, found.x, found.fun
-        steps += int(found.nit)
-        converged = found.success or (converged and gained < LEAST_GAIN)
+        search = minimize(evaluate, point, jac=True, method="L-BFGS-B", options=limits)
+        gain, point, least = least - search.fun, search.x, search.fun
+        steps += int(search.nit)
+        converged = search.success or (converged and gain < LEAST_GAIN)
         if evidences[0] == FAILED:
             problem = "fails on these recordings with the settings of the run"
             raise InputError("the filter", problem)
-        if gained < LEAST_GAIN or steps >= most_steps:
+        if gain < LEAST_GAIN or steps >= most_steps:
             break
-    fitted = with_written_parameters(settings, dict(zip(names, at, strict=True)), DIGITS)
+    fitted = with_written_parameters(settings, dict(zip(names, point, strict=True)), DIGITS)
     before = evidences[0]
     evaluate(np.array(list(free_parameters(fitted, names).values())))
     warnings = []
-    if steps >= most_steps and gained >= LEAST_GAIN:
+    if steps >= most_steps and gain >= LEAST_GAIN:
         limit = f"the fit stopped after {most_steps} steps"
         warnings.append(
             f"{limit}, before it had found the best settings; give fewer groups to --fit"
@@ -208,15 +208,15 @@ def fit_innovations(
 
 def unphysical(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
     """A sentence for each of these numbers that is outside the plausible range."""
-    values, found = flat(settings), []
+    values, lines = flat(settings), []
     for name in (name for name in names if name in PHYSICAL):
         low, high = PHYSICAL[name]
         if not low <= values[name] <= high:
-            found.append(
+            lines.append(
                 f"filter.{name} came out as {values[name]:.4g}, outside {low:g} to {high:g}: "
                 "these recordings do not determine it"
             )
-    return found
+    return lines
 
 
 def innovation_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig:
@@ -263,18 +263,19 @@ _value_and_gradient = jax.jit(
 )
 
 
-def _start(walk: Inputs, settings: FilterSettings) -> Start:
-    """The start of a walk as in an evaluation."""
+def evaluated_start(start: Start, settings: FilterSettings) -> Start:
+    """The start as an evaluation with the settings has it, of a recording that starts from its
+    reference."""
     level = settings.start.gyro_bias
     if settings.raw_gyro_bias is not None:
-        level = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, level)
-    return walk.start._replace(std=settings.start, level_gyro_bias=level)
+        level = jnp.where(start.raw_gyro, settings.raw_gyro_bias, level)
+    return start._replace(std=settings.start, level_gyro_bias=level)
 
 
 def _wide_start(walk: Inputs, settings: FilterSettings) -> Start:
     """The start with all components of a raw gyro's bias uncertain (ours). Otherwise the fit would
     explain an unknown vertical component by noise."""
-    start = _start(walk, settings)
+    start = evaluated_start(walk.start, settings)
     return start._replace(std=start.std._replace(gyro_bias=start.level_gyro_bias))
 
 
@@ -336,24 +337,24 @@ def fit_considered(
         raise InputError("the filter", "is not healthy where these recordings have a reference")
     raw = positions.raw_axis.any(axis=1)
     mixed = raw.any() and not raw.all()
-    begins = CONSIDERED._replace(raw_gyro_bias=0.0)
+    initial = CONSIDERED._replace(raw_gyro_bias=0.0)
     fitted = _most_likely_considered(
         Positions(*(part[~raw] for part in positions)) if mixed else positions,
         stride_seconds,
-        dataclasses.replace(settings, considered=begins),
+        dataclasses.replace(settings, considered=initial),
         "considered",
     )
     if mixed:
-        begins = fitted.considered._replace(raw_gyro_bias=CONSIDERED.raw_gyro_bias)
+        initial = fitted.considered._replace(raw_gyro_bias=CONSIDERED.raw_gyro_bias)
         fitted = _most_likely_considered(
             positions,
             stride_seconds,
-            dataclasses.replace(settings, considered=begins),
+            dataclasses.replace(settings, considered=initial),
             "considered.raw_gyro_bias",
         )
     before, after = (
-        float(jnp.mean(normalised_squares(positions.error, each))) / 3
-        for each in (positions.covariance, _reported(positions, fitted.considered))
+        float(jnp.mean(normalised_squares(positions.error, covariance))) / 3
+        for covariance in (positions.covariance, _reported(positions, fitted.considered))
     )
     return Considered(fitted, before, after)
 
@@ -372,12 +373,12 @@ def _most_likely_considered(
         return likelihood + _prior(free, start) / independent
 
     compiled = jax.jit(jax.value_and_grad(objective))
-    found = minimize(
+    search = minimize(
         lambda free: jax.device_get(compiled(free)), start, jac=True, method="L-BFGS-B"
     )
-    if not np.isfinite(found.fun):
+    if not np.isfinite(search.fun):
         raise InputError("the filter", "has no positive definite covariance on these recordings")
-    return with_written_parameters(settings, dict(zip(names, found.x, strict=True)), DIGITS)
+    return with_written_parameters(settings, dict(zip(names, search.x, strict=True)), DIGITS)
 
 
 def _reported(positions: Positions, std: ConsideredStd) -> Array:
@@ -397,8 +398,8 @@ def filtered_positions(
         _filtered(walks, settings, config=filter_config(windows, settings))
     )
     error = truth - position
-    known = np.isfinite(error).all(axis=2) & (healthy > 0)
-    return Positions(*(part[known] for part in (error, *parts)))
+    compared = np.isfinite(error).all(axis=2) & (healthy > 0)
+    return Positions(*(part[compared] for part in (error, *parts)))
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -409,14 +410,14 @@ def _filtered(
     axis of a raw gyro."""
 
     def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
-        start = _start(walk, settings)
+        start = evaluated_start(walk.start, settings)
         state = start.state(config)
         run, displacement = _repeated(walk, settings, config)
         history = run(state, displacement)
-        found = sensitivity(run, state, displacement)
+        derivatives = sensitivity(run, state, displacement)
         assert history.covariance is not None
         covariance = history.covariance[:, POSITION, POSITION]
         axis = jnp.tile(start.raw_axis[None], (len(covariance), 1))
-        return history.healthy, history.position, covariance, found[:, POSITION], axis
+        return history.healthy, history.position, covariance, derivatives[:, POSITION], axis
 
     return over_sequences(of_walk, shared=1)(settings, walks)

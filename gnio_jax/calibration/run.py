@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gnio_jax import config as configuration
+from gnio_jax.calibration.comparison import Effect, compare_filters
 from gnio_jax.calibration.evidence import OnStage, gather, load_run, sources
 from gnio_jax.calibration.fit import (
     DIGITS,
@@ -34,8 +35,10 @@ from gnio_jax.training import checkpoint
 
 MOST_STEPS = 60
 """Largest number of steps of the search for the settings (L-BFGS)."""
-ABOUT = "calibration.json"
+RECORD = "calibration.json"
 """File that records the fit and its data, by which a calibrated run is recognised."""
+LEAST_RECORDINGS = 5
+"""Number of recordings below which a fit to them is doubtful (ours)."""
 
 
 class Calibration(NamedTuple):
@@ -45,8 +48,25 @@ class Calibration(NamedTuple):
     fit: Fit
     considered: Considered
     """The fit, with the settings of the calibrated run."""
+    effect: Effect
+    """What it does to the trajectories of its recordings."""
     recordings: int
+    raw_gyros: int
+    """Number of recordings with a raw gyro."""
     folder: Path
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons not to trust the calibration, each in one sentence."""
+        others = self.recordings - self.raw_gyros
+        groups = {"with a raw gyro": self.raw_gyros, "without a raw gyro": others}
+        few = (
+            f"only {count} recording{'s' * (count > 1)} {group}: fewer than {LEAST_RECORDINGS} "
+            "hardly determine the settings that are fitted to them"
+            for group, count in groups.items()
+            if 0 < count < LEAST_RECORDINGS
+        )
+        return (*self.fit.warnings, *self.effect.warnings, *few)
 
 
 def calibrate(
@@ -60,7 +80,8 @@ def calibrate(
     deviations those of its errors, which are compared with the reference window by window. Then the
     settings of `config.fit` are chosen so that the innovations of the filter are most likely; here
     the reference gives only the start. Last, the consider covariance is chosen so that the errors
-    of the filter's positions are most likely; it changes no trajectory.
+    of the filter's positions are most likely; it changes no trajectory. Likely innovations are not
+    always good trajectories, so the errors of these are compared with those of the run's filter.
 
     The recordings are those of the validation split, or those of the training split, each with the
     displacements of a network that was not trained on it. Raises `InputError` for another split,
@@ -72,26 +93,26 @@ def calibrate(
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
     run = load_run(workdir, config)
     folder = _folder(config, workdir)
-    split, asked = sources(run, config)
+    split, networks = sources(run, config)
     windows = run.config.data
     noise = run.config.filter.noise._replace(measurement_scale=1.0, std_factor=(1.0, 1.0, 1.0))
-    nothing = ConsideredStd()  # it changes no estimate, and is fitted last
-    uncalibrated = dataclasses.replace(run.config.filter, noise=noise, considered=nothing)
+    # Consider covariance changes no estimate, and is fitted last.
+    uncalibrated = dataclasses.replace(run.config.filter, noise=noise, considered=ConsideredStd())
     start_of_fit(uncalibrated, paths)  # finds mistakes before reading data
-    recordings, estimates = gather(split, asked, config, uncalibrated, progress, workers)
+    recordings, estimates = gather(split, networks, config, uncalibrated, progress, workers)
     try:
-        factors = std_factors(estimates, [each.displacement for each in recordings])
+        factors = std_factors(estimates, [recording.displacement for recording in recordings])
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
     x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as written to the settings
     noise = noise._replace(std_factor=(x, y, z))
     settings = start_of_fit(dataclasses.replace(uncalibrated, noise=noise), paths)
-    strides = max(each.strides for each in recordings)
+    strides = max(recording.strides for recording in recordings)
     # The first row of an estimate is its start. That of a network has displacements.
-    predicted = [each.displacements for each in estimates if each.displacements is not None]
-    given = [Displacements(*(x[1:] for x in each[:2])) for each in predicted]
-    walks = filter_inputs(recordings, given, strides, filter_config(windows, settings))
-    found = fit_innovations(
+    rows = [estimate.displacements for estimate in estimates if estimate.displacements is not None]
+    displacements = [Displacements(value[1:], covariance[1:]) for value, covariance, _ in rows]
+    walks = filter_inputs(recordings, displacements, strides, filter_config(windows, settings))
+    fit = fit_innovations(
         walks,
         windows,
         settings,
@@ -100,18 +121,22 @@ def calibrate(
         MOST_STEPS,
     )
     progress("considering", 0.0)
-    references = (each.reference.position[1:] for each in recordings)
-    truth = np.stack([filled_up(each, strides, np.nan) for each in references])
-    positions = filtered_positions(walks, truth, windows, found.settings)
-    considered = fit_considered(positions, windows.stride_seconds, found.settings)
-    progress("considering", 1.0)
-    calibration = Calibration(run.config.filter, found, considered, len(recordings), folder)
+    references = (recording.reference.position[1:] for recording in recordings)
+    truth = np.stack([filled_up(reference, strides, np.nan) for reference in references])
+    positions = filtered_positions(walks, truth, windows, fit.settings)
+    considered = fit_considered(positions, windows.stride_seconds, fit.settings)
+    progress("comparing", 0.0)
+    before = run.config.filter
+    effect = compare_filters(recordings, displacements, windows, before, considered.settings)
+    progress("comparing", 1.0)
+    raw = sum(bool(recording.start.raw_gyro) for recording in recordings)
+    calibration = Calibration(before, fit, considered, effect, len(recordings), raw, folder)
     _write(calibration, workdir, run, config, split)
     return calibration
 
 
 def _folder(config: CalibrateConfig, workdir: Path) -> Path:
-    if (workdir / ABOUT).exists():
+    if (workdir / RECORD).exists():
         remedy = "calibrate the run that it was made from"
         raise InputError(workdir, "is a calibrated run", remedy)
     absolute = workdir.resolve()
@@ -129,20 +154,26 @@ def _write(
     split: str,
 ) -> None:
     """The run with its new settings, its checkpoint, and what was fitted."""
-    found, settings = calibration.fit, calibration.considered.settings
-    about: dict[str, Any] = {
+    fit, effect = calibration.fit, calibration.effect
+    settings = calibration.considered.settings
+    record: dict[str, Any] = {
         "run": str(workdir),
         "split": split,
         "out_of_fold": list(config.out_of_fold),
         "average_headings": config.average_headings,
         "recordings": calibration.recordings,
+        "recordings_with_raw_gyro": calibration.raw_gyros,
         "fitted": list(config.fit),
-        "negative_log_likelihood_per_innovation": {"before": found.before, "after": found.after},
-        "steps": found.steps,
-        "warnings": list(found.warnings),
+        "negative_log_likelihood_per_innovation": {"before": fit.before, "after": fit.after},
+        "steps": fit.steps,
+        "warnings": list(calibration.warnings),
         "position_nees_per_axis": {
             "before": calibration.considered.before,
             "after": calibration.considered.after,
+        },
+        "trajectories": {
+            **{metric: change._asdict() for metric, change in effect.errors.items()},
+            "diverged": effect.diverged._asdict(),
         },
         "filter": configuration.plain(settings),
     }
@@ -152,7 +183,7 @@ def _write(
         )
         configuration.validate(experiment, "the calibrated run")
         configuration.save(new / "config.yaml", experiment)
-        write_text(new / ABOUT, json.dumps(about, indent=2) + "\n")
+        write_text(new / RECORD, json.dumps(record, indent=2) + "\n")
         checkpoint.write_best(new, trained._replace(config=experiment))
         for name in ("splits.yaml", "metrics.jsonl"):
             if (workdir / name).exists():

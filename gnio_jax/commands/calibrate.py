@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
@@ -10,6 +10,9 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
 from gnio_jax.config import CalibrateConfig
 from gnio_jax.cores import usable_cores
+
+if TYPE_CHECKING:
+    from gnio_jax.calibration.comparison import Effect
 
 
 def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
@@ -19,9 +22,10 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
     fitted to other walks. First, each axis gets a factor for the network's standard deviations,
     from the errors on the validation split. Then the filter's noises are chosen that make its
     innovations most likely. Last, the errors that the filter reports but does not estimate (its
-    consider covariance) are fitted to the errors of its positions. The result is a run, which gnio
-    evaluate takes like any other; test splits are refused. A run that has learnt from several
-    datasets is fitted to the walks of all of them.
+    consider covariance) are fitted to the errors of its positions. It prints the errors of the
+    trajectories of these walks before and after, and a warning if they are larger. The result is a
+    run, which gnio evaluate takes like any other; test splits are refused. A run that has learnt
+    from several datasets is fitted to the walks of all of them.
 
     examples:
       {prog}                                    the newest run below runs/
@@ -33,28 +37,46 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
 
     console.prepare_filter()
     with console.terminal() as terminal:
-        found = calibration.calibrate(asked, terminal.progress, usable_cores())
-    table, before = Table("filter", "before", "calibrated"), configuration.flat(found.before)
-    for name, value in configuration.flat(found.considered.settings).items():
+        result = calibration.calibrate(asked, terminal.progress, usable_cores())
+    table, before = Table("filter", "before", "calibrated"), configuration.flat(result.before)
+    for name, value in configuration.flat(result.considered.settings).items():
         if value != before.get(name):
             table.add_row(name, _spelled(before.get(name)), _spelled(value))
     console.say(table)
+    console.say(_trajectories(result.effect))
+    others = result.recordings - result.raw_gyros
+    console.say(f"recordings: {result.raw_gyros} with a raw gyro, {others} without")
     console.say(
-        f"negative log-likelihood of an innovation: {found.fit.before:.4f} after the factors of "
-        f"the axes, {found.fit.after:.4f} after the fit ({found.recordings} recordings, "
-        f"{found.fit.steps} steps)"
+        f"negative log-likelihood of an innovation: {result.fit.before:.4f} after the factors of "
+        f"the axes, {result.fit.after:.4f} after the fit ({result.recordings} recordings, "
+        f"{result.fit.steps} steps)"
     )
     console.say(
         "squared error of the position over the variance that the filter reports, per axis: "
-        f"{found.considered.before:.2f} -> {found.considered.after:.2f} with consider covariance"
+        f"{result.considered.before:.2f} -> {result.considered.after:.2f} with consider covariance"
     )
-    for warning in found.fit.warnings:
+    for warning in result.warnings:
         console.warn(warning)
-    console.say(f"look at it with: gnio evaluate --workdir {found.folder}")
+    console.say(f"look at it with: gnio evaluate --workdir {result.folder}")
+
+
+def _trajectories(effect: Effect) -> Table:
+    """The errors of the trajectories of the recordings before and after the calibration."""
+    from gnio_jax.evaluation.tabulate import column, number  # as late as the calibration
+
+    table = Table("trajectories", "before", "calibrated")
+    for metric, change in effect.errors.items():
+        shown = column(metric)
+        table.add_row(shown.title, *(number(mean, shown.digits) for mean in change))
+    if any(effect.diverged):
+        table.add_row("diverged", *(f"{count} of {effect.recordings}" for count in effect.diverged))
+    return table
 
 
 def _spelled(value: Any) -> str:
     """The text of a setting in a cell: one number, several, or none if it is switched off."""
     if value is None:
         return "none"
-    return ", ".join(f"{each:.4g}" for each in (value if isinstance(value, tuple) else (value,)))
+    return ", ".join(
+        f"{number:.4g}" for number in (value if isinstance(value, tuple) else (value,))
+    )

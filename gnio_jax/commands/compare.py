@@ -16,7 +16,7 @@ from gnio_jax.files import check_writable, with_ending
 ENDINGS = (".md", ".csv", ".png")
 
 
-def compare(asked: CompareConfig, _call: options.Call) -> None:
+def compare(request: CompareConfig, _call: options.Call) -> None:
     """Compare runs sequence by sequence: their differences, with intervals.
 
     The others are compared with the first run. Runs that have no evaluation yet are evaluated
@@ -34,28 +34,28 @@ def compare(asked: CompareConfig, _call: options.Call) -> None:
       {prog} runs/plain runs/context --metrics ate rpe_1s rte_60s --out runs/plain_or_context
       {prog} runs/gnio_s0 runs/gnio_s0/eval/oxiod_test_ekf_loose
     """
-    if asked.out is not None:
-        _check_out(asked.out)  # otherwise the evaluations for it would be lost
+    if request.out is not None:
+        _check_out(request.out)  # otherwise the evaluations for it would be lost
     from gnio_jax.apps import compare as comparison  # late: mistakes do not wait for JAX
 
     console.prepare_filter()
     with console.terminal() as terminal:
-        found = comparison.compare(asked, terminal, usable_cores())
-    console.say(f"{comparison.title(found)}\n")
+        result = comparison.compare(request, terminal, usable_cores())
+    console.say(f"{comparison.title(result)}\n")
     table = Table(box=box.SIMPLE_HEAD, header_style="bold")
     table.add_column(overflow="fold", min_width=16)  # names get the remaining width
     for name in comparison.HEADER[2:]:
         table.add_column(name, justify="right")
-    for metric, *cells in comparison.lines(found):
+    for metric, *cells in comparison.lines(result):
         if metric:
             table.add_row(metric, style="bold")
         table.add_row(f"  {cells[0]}", *cells[1:])
     console.say(table)
-    for line in comparison.explanations(found):
+    for line in comparison.explanations(result):
         console.say(line)
-    if asked.out is not None:
-        comparison.write(Path(asked.out), found)
-        console.say(f"\nresults: {asked.out}.md, .csv, .png")
+    if request.out is not None:
+        comparison.write(Path(request.out), result)
+        console.say(f"\nresults: {request.out}.md, .csv, .png")
 
 
 def _check_out(out: str) -> None:

@@ -70,8 +70,8 @@ def warn_of_other_sources() -> None:
     have no effect."""
     running = Path(gnio_jax.__file__)
     if os.path.isfile("gnio_jax/__init__.py") and not running.samefile("gnio_jax/__init__.py"):
-        there = f"runs the gnio_jax of {running.parent} and not that of this folder"
-        warn(f"gnio {there}; install this folder with pip install -e .")
+        problem = f"runs the gnio_jax of {running.parent} and not that of this folder"
+        warn(f"gnio {problem}; install this folder with pip install -e .")
 
 
 def keep_compiled_programs() -> None:
@@ -98,9 +98,9 @@ def compile_quickly() -> None:
     flags = {"--xla_backend_optimization_level": "1"}
     if version("jax").startswith("0.10."):
         flags["--xla_cpu_use_fusion_emitters"] = "false"
-    given = os.environ.get("XLA_FLAGS", "")
-    added = [f"{name}={value}" for name, value in flags.items() if name not in given]
-    os.environ["XLA_FLAGS"] = " ".join([*added, given]).strip()
+    user_flags = os.environ.get("XLA_FLAGS", "")
+    added = [f"{name}={value}" for name, value in flags.items() if name not in user_flags]
+    os.environ["XLA_FLAGS"] = " ".join([*added, user_flags]).strip()
 
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
@@ -112,7 +112,7 @@ newline.
 def without_controls(text: str) -> str:
     """`text` with Python's escapes in the place of control characters, which may be in names of
     files and recordings."""
-    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    return _CONTROL.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 
 class _Plain(Console):

@@ -49,7 +49,7 @@ class ConvertOptions(_Dataset):
     """Rate of the result, Hz; by default each recording's own."""
 
 
-def show_list(asked: ListOptions, _call: options.Call) -> None:
+def show_list(request: ListOptions, _call: options.Call) -> None:
     """List every known dataset: rate, splits, licence, source, and what is found here.
 
     A dataset is looked for in $GNIO_DATA/NAME, then in data/NAME. Its recordings are not read.
@@ -65,7 +65,7 @@ def show_list(asked: ListOptions, _call: options.Call) -> None:
         splits = ", ".join(dataset.splits)
         rows += [
             (dataset.name, f"{dataset.rate:g} Hz; splits {splits}; {dataset.licence}"),
-            ("  here", _found_here(dataset)),
+            ("  here", _describe_root(dataset)),
             ("  source", dataset.source),
             *([("  layout", dataset.layout)] if dataset.needs_root else []),
         ]
@@ -75,7 +75,7 @@ def show_list(asked: ListOptions, _call: options.Call) -> None:
     console.say(f"looked in {' and '.join([*bases, 'data'])}; {other}")
 
 
-def _found_here(dataset: Any) -> str:
+def _describe_root(dataset: Any) -> str:
     """The folder of a `Dataset`, and the recordings of each split."""
     from gnio_jax.data.loading import find_recordings
 
@@ -83,16 +83,16 @@ def _found_here(dataset: Any) -> str:
         _, root = _find(dataset.name, None)
     except InputError:
         return "not found"
-    place = f"{root}: " if dataset.needs_root else "computed: "
+    prefix = f"{root}: " if dataset.needs_root else "computed: "
     try:
-        found, splits, _ = find_recordings(dataset, root, "all")
+        recordings, splits, _ = find_recordings(dataset, root, "all")
     except InputError as error:
-        return f"{place}no recording ({error})"
+        return f"{prefix}no recording ({error})"
     counts = ", ".join(f"{split} {len(names)}" for split, names in splits.items())
-    return f"{place}{len(found)} recordings ({counts})"
+    return f"{prefix}{len(recordings)} recordings ({counts})"
 
 
-def check(asked: CheckOptions, _call: options.Call) -> None:
+def check(request: CheckOptions, _call: options.Call) -> None:
     """Check whether IMU and reference of each recording describe the same motion.
 
     The mean of R·accel must be gravity, and the gyro must turn as the reference does. A walker's
@@ -107,12 +107,12 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
     """
     from gnio_jax.data import loading  # late: mistakes do not wait for JAX
 
-    dataset, root = _find(asked.name, asked.data_root)
+    dataset, root = _find(request.name, request.data_root)
     with console.terminal() as terminal:
         progress = partial(terminal.progress, "checking")
-        rows, notes = loading.check(dataset, root, asked.split, asked.plots, None, progress)
-    place = f" at {root}" if dataset.needs_root else ""
-    title = f"{dataset.name}{place}, split {asked.split}"
+        rows, notes = loading.check(dataset, root, request.split, request.plots, None, progress)
+    location = f" at {root}" if dataset.needs_root else ""
+    title = f"{dataset.name}{location}, split {request.split}"
     table = console.columns("sequence", "split", title=title, title_justify="left")
     for column in (*_FIGURES, ""):
         table.add_column(column, justify="right", no_wrap=True)
@@ -125,17 +125,17 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
     used, count = [row for row in rows if not row.reason], len(rows)
     hours = sum(row.check.duration for row in used if row.check) / 3600
     console.say(f"{len(used)} of {count} sequences are used, {hours:.2f} h")
-    if asked.json:
-        found = {
+    if request.json:
+        content = {
             "dataset": dataset.name,
             "root": str(root) if dataset.needs_root else None,
-            "split": asked.split,
+            "split": request.split,
             "sequences": {row.name: _json(row) for row in rows},
             "notes": notes,
         }
-        write_text(asked.json, json.dumps(found, indent=2, ensure_ascii=False) + "\n")
-    if asked.plots:
-        console.say(f"pictures: {asked.plots}")
+        write_text(request.json, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+    if request.plots:
+        console.say(f"pictures: {request.plots}")
     if not used:
         raise InputError(root, f"none of {count} sequences can be used", "see the reasons above")
 
@@ -147,23 +147,25 @@ def _two_digits(*values: float) -> str:
 
 
 _FIGURES: dict[str, Callable[[Any], str]] = {
-    "s": lambda found: f"{found.duration:.1f}",
-    "Hz": lambda found: f"{found.rate:.1f}",
-    "mean of R·accel\nm/s²": lambda found: _two_digits(*found.gravity_mean),
-    "gyro\n°/10 s": lambda found: _two_digits(found.gyro_consistency_degrees),
-    "speed\nm/s": lambda found: _two_digits(found.median_speed),
-    "accel\ncorr.": lambda found: _two_digits(found.accel_correlation_horizontal),
-    "valid": lambda found: "–" if math.isnan(found.share_valid) else f"{found.share_valid:.1%}",
+    "s": lambda figures: f"{figures.duration:.1f}",
+    "Hz": lambda figures: f"{figures.rate:.1f}",
+    "mean of R·accel\nm/s²": lambda figures: _two_digits(*figures.gravity_mean),
+    "gyro\n°/10 s": lambda figures: _two_digits(figures.gyro_consistency_degrees),
+    "speed\nm/s": lambda figures: _two_digits(figures.median_speed),
+    "accel\ncorr.": lambda figures: _two_digits(figures.accel_correlation_horizontal),
+    "valid": lambda figures: (
+        "–" if math.isnan(figures.share_valid) else f"{figures.share_valid:.1%}"
+    ),
 }
 """Columns of a `SelfCheck`."""
 
 
 def _json(row: Any) -> dict[str, Any]:
-    """A `loading.Checked` for a JSON file, which has no arrays and no NaN."""
+    """A `loading.CheckResult` for a JSON file, which has no arrays and no NaN."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Iterable) and not isinstance(value, str):
-            return [plain(each) for each in value]
+            return [plain(entry) for entry in value]
         return None if isinstance(value, float) and math.isnan(value) else value
 
     figures = row.check._asdict() if row.check else {}
@@ -171,7 +173,7 @@ def _json(row: Any) -> dict[str, Any]:
     return state | {name: plain(value) for name, value in figures.items()}
 
 
-def convert(asked: ConvertOptions, _call: options.Call) -> None:
+def convert(request: ConvertOptions, _call: options.Call) -> None:
     """Convert a dataset to the package's HDF5: a file per recording, a list per split.
 
     Recordings that fail the self-check are left out. The folder is written whole or not at all: a
@@ -184,16 +186,18 @@ def convert(asked: ConvertOptions, _call: options.Call) -> None:
     """
     from gnio_jax.data import loading  # late: mistakes do not wait for JAX
 
-    dataset, root = _find(asked.name, asked.data_root)
+    dataset, root = _find(request.name, request.data_root)
     with console.terminal() as terminal:
         progress = partial(terminal.progress, "converting")
-        result = loading.convert(dataset, root, asked.out, asked.split, asked.rate, None, progress)
+        result = loading.convert(
+            dataset, root, request.out, request.split, request.rate, None, progress
+        )
     _print_reasons(result.left_out, result.notes)
     counts = ", ".join(f"{split} {len(stems)}" for split, stems in result.sequences.items())
-    console.say(f"{asked.out}: {result.files} sequences, {result.hours:.2f} h ({counts})")
+    console.say(f"{request.out}: {result.files} sequences, {result.hours:.2f} h ({counts})")
     learnable = {"train", "val"} <= result.sequences.keys()
     following = "gnio train --dataset csv" if learnable else "gnio data check csv"
-    console.say(f"next: {following} --data-root {asked.out}")
+    console.say(f"next: {following} --data-root {request.out}")
 
 
 def _find(name: str, data_root: str | None) -> tuple[Any, Path]:

@@ -21,7 +21,7 @@ class DoctorOptions:
     """Print it as JSON."""
 
 
-def doctor(asked: DoctorOptions, _call: options.Call) -> None:
+def doctor(request: DoctorOptions, _call: options.Call) -> None:
     """Show what is installed and found here: packages, devices, datasets, weights, caches.
 
     A missing part is not an error. Include the output when you ask for help. A dataset is looked
@@ -32,17 +32,17 @@ def doctor(asked: DoctorOptions, _call: options.Call) -> None:
       GNIO_DATA=~/recordings {prog}
       {prog} --json
     """
-    found = {
+    facts = {
         "gnio_jax": f"{_version('gnio-jax')} in {Path(__file__).parents[1]}",
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
         "packages": ", ".join(map(_version, PACKAGES)),
         **_devices(),
-        **_places(),
+        **_find_places(),
     }
-    if asked.json:
-        print(json_format.dumps(found, indent=2, ensure_ascii=False))
+    if request.json:
+        print(json_format.dumps(facts, indent=2, ensure_ascii=False))
         return
-    console.say(console.pairs(found.items()))
+    console.say(console.pairs(facts.items()))
 
 
 def _version(name: str) -> str:
@@ -62,14 +62,14 @@ def _devices() -> dict[str, str]:
         third = float(jnp.asarray(1.0, jnp.float64) / 3.0)
     except RuntimeError as error:  # a requested platform that does not exist
         return {"devices": f"none: {error}"}
-    counted = ", ".join(f"{kinds.count(kind)} × {kind}" for kind in dict.fromkeys(kinds))
-    found = {"devices": counted, "float64": "works" if third == 1 / 3 else "does not work"}
+    counts = ", ".join(f"{kinds.count(kind)} × {kind}" for kind in dict.fromkeys(kinds))
+    facts = {"devices": counts, "float64": "works" if third == 1 / 3 else "does not work"}
     if jax.default_backend() == "cpu" and Path("/proc/driver/nvidia").exists():
-        found["gpu"] = "there is a driver, but JAX sees no GPU: pip install 'jax[cuda13]'"
-    return found
+        facts["gpu"] = "there is a driver, but JAX sees no GPU: pip install 'jax[cuda13]'"
+    return facts
 
 
-def _places() -> dict[str, str]:
+def _find_places() -> dict[str, str]:
     """Datasets whose folder exists, weights, runs, caches."""
     import jax
 
@@ -78,19 +78,19 @@ def _places() -> dict[str, str]:
     from gnio_jax.apps import packages
     from gnio_jax.data.hdf5 import cache_folder
 
-    found = {}
+    facts = {}
     for name in data.names():
         with contextlib.suppress(InputError):
-            here = str(data.find_root(name)) if data.get(name).needs_root else "computed"
-            found[f"dataset {name}"] = here
+            location = str(data.find_root(name)) if data.get(name).needs_root else "computed"
+            facts[f"dataset {name}"] = location
     try:
-        found["weights"] = ", ".join(packages.packages())
+        facts["weights"] = ", ".join(packages.packages())
     except InputError as error:
-        found["weights"] = f"none: {error}"
+        facts["weights"] = f"none: {error}"
     try:
-        found["newest run"] = str(configuration.newest_run())
+        facts["newest run"] = str(configuration.newest_run())
     except InputError as error:
-        found["newest run"] = f"none: {error}"
+        facts["newest run"] = f"none: {error}"
     compiled = jax.config.values["jax_compilation_cache_dir"]
-    found["compiled programs"] = compiled or "not kept: the cache's folder cannot be written"
-    return found | {"recordings read": str(cache_folder())}
+    facts["compiled programs"] = compiled or "not kept: the cache's folder cannot be written"
+    return facts | {"recordings read": str(cache_folder())}

@@ -23,7 +23,7 @@ class ScoreOptions:
     """Alignment before the errors are computed (docs/tables.md)."""
 
 
-def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
+def evaluate(request: EvaluateConfig, call: options.Call) -> None:
     """Estimate the trajectories of a split with a trained network and report the errors.
 
     Results go to WORKDIR/eval/<dataset>_<split>_<estimator>/: metrics.json, metrics.csv,
@@ -45,23 +45,23 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
     from gnio_jax.apps import rerun
     from gnio_jax.evaluation import tabulate
 
-    if asked.rerun:
-        rerun.check(asked.rerun)
+    if request.rerun:
+        rerun.check(request.rerun)
     console.prepare_filter()
     with console.terminal() as terminal:
-        found = evaluation.evaluate(asked, terminal, usable_cores(), str(call))
-    console.say(tabulate.render(found.report))
-    console.say(f"results: {found.folder}")
-    if asked.rerun:
-        rerun.write(Path(asked.rerun), found.estimates, found.recordings, asked.alignment)
-        console.say(f"for Rerun: {asked.rerun}")
-    if asked.plots:
-        console.say(f"page: {found.folder / 'report.html'} (open it in a browser)")
-        pictures = found.folder / "plots" / "error_cdf.png"
+        result = evaluation.evaluate(request, terminal, usable_cores(), str(call))
+    console.say(tabulate.render(result.report))
+    console.say(f"results: {result.folder}")
+    if request.rerun:
+        rerun.write(Path(request.rerun), result.estimates, result.recordings, request.alignment)
+        console.say(f"for Rerun: {request.rerun}")
+    if request.plots:
+        console.say(f"page: {result.folder / 'report.html'} (open it in a browser)")
+        pictures = result.folder / "plots" / "error_cdf.png"
         console.say(f"pictures: {pictures}, and there <name>.png of each sequence")
 
 
-def score(asked: ScoreOptions, _call: options.Call) -> None:
+def score(request: ScoreOptions, _call: options.Call) -> None:
     """Print errors of any trajectory against a reference, as gnio evaluate does.
 
     Each pose of the reference is compared with the nearest one of the estimate, if their stamps
@@ -74,5 +74,5 @@ def score(asked: ScoreOptions, _call: options.Call) -> None:
     from gnio_jax import evaluation  # late: mistakes do not wait for JAX
     from gnio_jax.evaluation import tabulate
 
-    found = evaluation.score_files(asked.reference, asked.estimate, asked.alignment)
-    console.say(tabulate.render(found))
+    report = evaluation.score_files(request.reference, request.estimate, request.alignment)
+    console.say(tabulate.render(report))

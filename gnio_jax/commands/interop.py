@@ -28,7 +28,7 @@ class InteropOptions:
     """Dataset that gnio evaluate uses if none is named."""
 
 
-def interop(asked: InteropOptions, _call: options.Call) -> None:
+def interop(request: InteropOptions, _call: options.Call) -> None:
     """Make a run from weights that were trained with TLIO's code, for gnio evaluate.
 
     CHECKPOINT is a checkpoint of TLIO's training, its model_torchscript.pt, or an .npz of its state
@@ -43,9 +43,9 @@ def interop(asked: InteropOptions, _call: options.Call) -> None:
     from gnio_jax import interop as tlio  # late: mistakes do not wait for JAX
 
     data = DataConfig(
-        rate=asked.rate,
-        window_seconds=asked.window_seconds,
-        stride_seconds=asked.stride_seconds,
+        rate=request.rate,
+        window_seconds=request.window_seconds,
+        stride_seconds=request.stride_seconds,
     )
-    tlio.write_run(asked.checkpoint, asked.workdir, data, asked.dataset)
-    print(f"run: {asked.workdir}; next: gnio evaluate --workdir {asked.workdir}")
+    tlio.write_run(request.checkpoint, request.workdir, data, request.dataset)
+    print(f"run: {request.workdir}; next: gnio evaluate --workdir {request.workdir}")

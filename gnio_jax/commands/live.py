@@ -58,7 +58,7 @@ class LiveOptions:
     """For datagrams: end when, after the first one, none has come for this many seconds."""
 
 
-def live(asked: LiveOptions, _call: options.Call) -> None:
+def live(request: LiveOptions, _call: options.Call) -> None:
     """Follow an IMU live, and show where its carrier is now.
 
     A stream has a line for each sample, time,gyro x,y,z,accel x,y,z, or a JSON object with time,
@@ -73,7 +73,7 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
       {prog} udp:0.0.0.0:5555                        the same lines as datagrams, from a phone
       {prog} walk.zip --speed 4                      a recording or bag, four times as fast
     """
-    inbox = _listen(asked) if asked.source.startswith(UDP) else None  # before slow imports
+    inbox = _listen(request) if request.source.startswith(UDP) else None  # before slow imports
     console.compile_quickly()
     import jax  # late, so that mistakes do not wait for it
     import numpy as np
@@ -84,99 +84,99 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
     from gnio_jax.apps.importing import read_imported
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    datagrams = following.Datagrams(inbox, asked.source) if inbox else None
-    if asked.out:
-        check_writable(asked.out)  # otherwise the trajectory would be lost at the end
-    if asked.rerun:
-        rerun.check(asked.rerun)
-    weights = packages.choose(asked.weights)
+    datagrams = following.Datagrams(inbox, request.source) if inbox else None
+    if request.out:
+        check_writable(request.out)  # otherwise the trajectory would be lost at the end
+    if request.rerun:
+        rerun.check(request.rerun)
+    weights = packages.choose(request.weights)
     run, say = weights.run, console.say
-    say(f"following {asked.source} with {weights.name}; Ctrl-C ends it")
+    say(f"following {request.source} with {weights.name}; Ctrl-C ends it")
     stream, rate = None, 0.0
-    if datagrams is None and asked.source != "-":
-        stated = ImportOptions(gyro_unit=asked.gyro_unit, accel_unit=asked.accel_unit)
-        sequence, notes, warned = read_imported(Path(asked.source), stated)
-        for note in (*warned, *notes):
+    if datagrams is None and request.source != "-":
+        units = ImportOptions(gyro_unit=request.gyro_unit, accel_unit=request.accel_unit)
+        sequence, notes, warnings = read_imported(Path(request.source), units)
+        for note in (*warnings, *notes):
             say(f"  {note}")
-        stream = following.from_recording(sequence, asked.speed)
-        rate = asked.imu_rate or 1 / float(np.median(np.diff(sequence.time)))
+        stream = following.from_recording(sequence, request.speed)
+        rate = request.imu_rate or 1 / float(np.median(np.diff(sequence.time)))
     with console.terminal() as terminal:
         terminal.progress("compiling", 0.0)
         try:
-            tracker = following.create_tracker(run, rest_seconds=asked.rest_seconds)
+            tracker = following.create_tracker(run, rest_seconds=request.rest_seconds)
         except ValueError as error:
             problem = str(error).removeprefix("rest_seconds: ")
             raise InputError("--rest-seconds", problem) from None
-    found = following.Followed()
+    result = following.Followed()
 
     def begin(imu_rate: float) -> None:
-        following.expect(tracker, found, run, imu_rate)
-        own = run.config.data.rate
-        lower = f"; the network was trained at {own:g} Hz, so higher frequencies are missing"
-        say(f"  samples come at {imu_rate:.4g} Hz{lower if imu_rate < 0.99 * own else ''}")
+        following.expect(tracker, result, run, imu_rate)
+        native = run.config.data.rate
+        lower = f"; the network was trained at {native:g} Hz, so higher frequencies are missing"
+        say(f"  samples come at {imu_rate:.4g} Hz{lower if imu_rate < 0.99 * native else ''}")
 
     if stream is None:
-        stated = asked.gyro_unit or "rad/s", asked.accel_unit or "m/s2"
-        say(f"ready: hold still now, for {asked.rest_seconds:g} s")
+        units = request.gyro_unit or "rad/s", request.accel_unit or "m/s2"
+        say(f"ready: hold still now, for {request.rest_seconds:g} s")
         if datagrams is None:
             if isinstance(sys.stdin, io.TextIOWrapper):
                 sys.stdin.reconfigure(errors="replace")  # noise on a line is no text
-            stream = following.lines_of(sys.stdin, stated=stated)
+            stream = following.lines_of(sys.stdin, stated=units)
         else:
             at_rest = following.begins_at_rest(run)
-            stream = datagrams.source(stated, asked.silence, say, at_rest)
-        stream = following.measured(stream, begin, asked.imu_rate)
+            stream = datagrams.source(units, request.silence, say, at_rest)
+        stream = following.measured(stream, begin, request.imu_rate)
     else:
-        following.expect(tracker, found, run, rate)
-    stopped: BaseException | None = None
+        following.expect(tracker, result, run, rate)
+    interruption: BaseException | None = None
     with contextlib.ExitStack() as running:
-        sent = running.enter_context(rerun.streaming(asked.rerun)) if asked.rerun else None
+        viewer = running.enter_context(rerun.streaming(request.rerun)) if request.rerun else None
         show = running.enter_context(_shown())
 
-        def on_pose(found: Any) -> None:
-            if sent is not None:
-                sent.add(found.pose)
-            show(found)
+        def on_pose(result: Any) -> None:
+            if viewer is not None:
+                viewer.add(result.pose)
+            show(result)
 
-        try:
-            following.follow(tracker.push, stream, found, on_pose)
-        except (KeyboardInterrupt, SystemExit) as leaving:  # Ctrl-C, SIGTERM: of the stream alone
-            stopped = leaving
-    for warning in found.warnings():
+        try:  # Ctrl-C and SIGTERM end the stream alone
+            following.follow(tracker.push, stream, result, on_pose)
+        except (KeyboardInterrupt, SystemExit) as signal_exit:
+            interruption = signal_exit
+    for warning in result.warnings():
         say(f"warning: {warning}")
-    if found.pose is not None:
-        say(following.line(found))
-        if asked.out:
-            export(asked.out, found.trajectory, "tum")
-            say(f"trajectory: {asked.out}")
-    if stopped is not None:
-        raise stopped
-    if found.pose is None:
-        raise _no_start(found, stream.name, asked.rest_seconds)
+    if result.pose is not None:
+        say(following.line(result))
+        if request.out:
+            export(request.out, result.trajectory, "tum")
+            say(f"trajectory: {request.out}")
+    if interruption is not None:
+        raise interruption
+    if result.pose is None:
+        raise _no_start(result, stream.name, request.rest_seconds)
 
 
-def _listen(asked: LiveOptions) -> socket.socket:
+def _listen(request: LiveOptions) -> socket.socket:
     """The socket of udp:PORT, which only this machine reaches, or of udp:ADDRESS:PORT."""
-    host, _, port = asked.source.removeprefix(UDP).rpartition(":")
+    host, _, port = request.source.removeprefix(UDP).rpartition(":")
     if not (port.isascii() and port.isdecimal() and 0 < int(port[:6]) < 2**16):
-        raise InputError(asked.source, "names no port", "write udp:5555 or udp:0.0.0.0:5555")
+        raise InputError(request.source, "names no port", "write udp:5555 or udp:0.0.0.0:5555")
     inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         inbox.bind((host or "127.0.0.1", int(port)))
     except OSError as error:
         inbox.close()
         problem = f"cannot listen there ({error})"
-        raise InputError(asked.source, problem, "choose another port or address") from None
+        raise InputError(request.source, problem, "choose another port or address") from None
     return inbox
 
 
-def _no_start(found: Any, name: str, rest_seconds: float) -> InputError:
+def _no_start(result: Any, name: str, rest_seconds: float) -> InputError:
     """The error if there is no pose."""
-    if found.samples == 0:
+    if result.samples == 0:
         return InputError(
             name, "ended without a single sample", "check that samples are sent to it"
         )
-    seconds, samples = found.last - found.first, found.samples
+    seconds, samples = result.last - result.first, result.samples
     problem = f"ended after {samples} samples in {seconds:.1f} s, before {rest_seconds:g} s of rest"
     remedy = "let it run longer, or lower --rest-seconds"
     if seconds > 2 * rest_seconds:
@@ -191,13 +191,13 @@ def _shown() -> Iterator[Callable[[Any], None]]:
     it prints a line each second."""
     from gnio_jax.apps import live as following
 
-    output, shown = console.stdout(), -math.inf
+    output, last_shown = console.stdout(), -math.inf
 
-    def print_each_second(found: Any) -> None:
-        nonlocal shown
-        if found.pose.time >= shown + 1.0 - 1e-6:
-            output.print(following.line(found), soft_wrap=True)
-            shown = found.pose.time
+    def print_each_second(result: Any) -> None:
+        nonlocal last_shown
+        if result.pose.time >= last_shown + 1.0 - 1e-6:
+            output.print(following.line(result), soft_wrap=True)
+            last_shown = result.pose.time
 
     if not output.is_terminal:
         yield print_each_second
@@ -207,13 +207,13 @@ def _shown() -> Iterator[Callable[[Any], None]]:
 
     with Live(console=output, refresh_per_second=8, transient=True) as screen:
 
-        def draw(found: Any) -> None:
-            nonlocal shown
-            if time.monotonic() - shown < DRAWN_EVERY:
+        def draw(result: Any) -> None:
+            nonlocal last_shown
+            if time.monotonic() - last_shown < DRAWN_EVERY:
                 return
             columns, rows = max(10, output.width - 2), max(5, output.height - 4)
-            drawn = following.drawing(found.trajectory.position, columns, rows)
-            screen.update(Text(f"{drawn}\n{following.line(found)}"))
-            shown = time.monotonic()
+            picture = following.drawing(result.trajectory.position, columns, rows)
+            screen.update(Text(f"{picture}\n{following.line(result)}"))
+            last_shown = time.monotonic()
 
         yield draw

@@ -58,7 +58,7 @@ class Call(NamedTuple):
 
 
 Command = Callable[[Any, Call], None]
-"""A function of `asked`, a dataclass of options, and of the call; its docstring is the help."""
+"""A function of a dataclass of options and of the call; its docstring is the help."""
 
 
 class Option(NamedTuple):
@@ -91,8 +91,8 @@ def run(program: Group | str | Command, call: Call) -> None:
             print(_overview(program, call.prog))
             return
         if word not in program.commands:
-            known = f"give one of {', '.join(program.commands)}; --help explains them"
-            remedy = did_you_mean(word, program.commands).strip() or known
+            choices = f"give one of {', '.join(program.commands)}; --help explains them"
+            remedy = did_you_mean(word, program.commands).strip() or choices
             raise InputError("command", f"unknown '{word}'" if word else "is missing", remedy)
         program, call = program.commands[word], Call(f"{call.prog} {word}", call.argv[1:])
     command = function(program) if isinstance(program, str) else program
@@ -106,8 +106,8 @@ def function(command: str) -> Command:
 
 
 def options_type(command: Command) -> type:
-    """The dataclass of the options that a command takes."""
-    return typing.get_type_hints(command, include_extras=True)["asked"]
+    """The dataclass of the options that a command takes: the type of its first argument."""
+    return next(iter(typing.get_type_hints(command, include_extras=True).values()))
 
 
 def options_of(kind: type, path: tuple[str, ...] = (), prefix: str = "--") -> Iterator[Option]:
@@ -117,16 +117,16 @@ def options_of(kind: type, path: tuple[str, ...] = (), prefix: str = "--") -> It
     for field in dataclasses.fields(kind):
         hint, word = hints[field.name], field.name.replace("_", "-")
         markers = getattr(hint, "__metadata__", ())
-        words = next((each for each in markers if isinstance(each, Words)), Words())
-        inner, here = kind_of(hint), (*path, field.name)
+        words = next((marker for marker in markers if isinstance(marker, Words)), Words())
+        inner, field_path = kind_of(hint), (*path, field.name)
         if FILE_ONLY in markers:
             continue
         if dataclasses.is_dataclass(inner):
             below = f"{prefix}{word}." if words.named else prefix
-            yield from options_of(typing.cast(type, inner), here, below)
+            yield from options_of(typing.cast(type, inner), field_path, below)
         else:
             name = prefix + word if words.named else words.metavar or word.upper()
-            yield Option(name, here, kind, hint, words, field.default)
+            yield Option(name, field_path, kind, hint, words, field.default)
 
 
 # Reading
@@ -152,18 +152,18 @@ def read(command: Command, call: Call, default: Any = None) -> Any:
     if explained:
         print(parser.format_help(), end="")
         raise SystemExit(0)
-    known = {name for each in options.values() for name in (each.name, each.negation)}
+    names = {name for option in options.values() for name in (option.name, option.negation)}
     try:
-        words = [_known(word, known) for word in call.argv]
-        found, strays = parser.parse_known_intermixed_args(words)
+        words = [_normalise_word(word, names) for word in call.argv]
+        parsed, strays = parser.parse_known_intermixed_args(words)
     except argparse.ArgumentError as error:
         raise InputError(error.argument_name, error.message, "--help explains it") from None
     if strays:
         remedy = "options are --name VALUE; --help lists them"
         raise InputError(f"'{strays[0]}'", "is not an option", remedy)
     values = {} if default is None else dict(vars(default))
-    for place, value in vars(found).items():
-        option = options[place]
+    for dest, value in vars(parsed).items():
+        option = options[dest]
         if not isinstance(value, bool):
             words = [value] if isinstance(value, str) else value
             value = configuration.value_from_words(option.hint, words, option.name)
@@ -179,16 +179,20 @@ def read(command: Command, call: Call, default: Any = None) -> Any:
     return kind(**values)
 
 
-def _known(word: str, known: set[str]) -> str:
+def _normalise_word(word: str, names: set[str]) -> str:
     """The word of a command line; the name of an option with `-` for `_`."""
     name, equals, value = word.partition("=")
     is_name = name.startswith("-") and name.strip("-.0123456789eE") and " " not in name
     if not is_name:
         return word
     spelled = name.replace("_", "-")
-    if spelled not in known:
-        inner = {each.rpartition(".")[2]: each for each in known if "." in each}
-        hint = did_you_mean(spelled, known, cutoff=0.5) or did_you_mean(
+    if spelled not in names:
+        inner = {
+            option_name.rpartition(".")[2]: option_name
+            for option_name in names
+            if "." in option_name
+        }
+        hint = did_you_mean(spelled, names, cutoff=0.5) or did_you_mean(
             spelled.lstrip("-"), inner, inner.get
         )
         raise InputError(name, "unknown option", hint.strip() or "--help lists the known ones")
@@ -201,23 +205,24 @@ def _parser(
     """The parser that splits the words of these options and writes their help."""
     configs = ", ".join(configuration.names())
     text = (inspect.getdoc(command) or "").format(prog=prog, configs=configs)
-    about, _, examples = text.partition("\nexamples:\n")
+    description, _, examples = text.partition("\nexamples:\n")
     width = min(WIDTH, shutil.get_terminal_size().columns)
     words = (option for option in options.values() if not option.words.named)
     usage = (
-        each.name if each.default is dataclasses.MISSING else f"[{each.name}]" for each in words
+        option.name if option.default is dataclasses.MISSING else f"[{option.name}]"
+        for option in words
     )
 
     def paragraphs(text: str) -> str:
-        filled = (" ".join(each.split()) for each in text.strip().split("\n\n"))
+        filled = (" ".join(paragraph.split()) for paragraph in text.strip().split("\n\n"))
         return "\n\n".join(
-            textwrap.fill(each, width - 2, break_on_hyphens=False) for each in filled
+            textwrap.fill(paragraph, width - 2, break_on_hyphens=False) for paragraph in filled
         )
 
     parser = argparse.ArgumentParser(
         prog=prog,
         usage=" ".join([prog, *usage, "[OPTIONS]"]),
-        description=paragraphs(about),
+        description=paragraphs(description),
         epilog=(f"{prog} -H explains the options.\n\n" if brief else "") + f"examples:\n{examples}",
         formatter_class=partial(
             argparse.RawDescriptionHelpFormatter,
@@ -232,8 +237,8 @@ def _parser(
     for dest, option in options.items():
         name, *inner = option.path
         if inner and name not in sections:
-            about = paragraphs(option.section.__doc__ or "")
-            sections[name] = parser.add_argument_group(f"{name} options", about)
+            description = paragraphs(option.section.__doc__ or "")
+            sections[name] = parser.add_argument_group(f"{name} options", description)
         _add(sections[name] if inner else parser, option, dest, brief)
     return parser
 
@@ -250,25 +255,28 @@ def _add(group: Any, option: Option, dest: str, brief: bool) -> None:
     elif option.default is dataclasses.MISSING:
         text += " (required)"
     elif not any(option.default is nothing for nothing in (None, False, ())):
-        shown = option.default if isinstance(option.default, tuple) else (option.default,)
-        text += f" (default: {' '.join(map(str, shown))})"
+        default_words = option.default if isinstance(option.default, tuple) else (option.default,)
+        text += f" (default: {' '.join(map(str, default_words))})"
     if kind is bool:
         group.add_argument(option.name, action="store_true", dest=dest, help=text.strip())
         return
     choices = ",".join(map(str, typing.get_args(item)))
-    shown = (
+    placeholder = (
         f"{{{choices}}}"
         if choices
         else {int: "INT", float: "FLOAT", Path: "PATH"}.get(item, "TEXT")
     )
-    how = {"help": text.strip().replace("%", "%%"), "metavar": option.words.metavar or shown}
+    settings = {
+        "help": text.strip().replace("%", "%%"),
+        "metavar": option.words.metavar or placeholder,
+    }
     if not option.words.named:
-        group.add_argument(dest, nargs="*" if items else "?", **how | {"metavar": option.name})
+        group.add_argument(dest, nargs="*" if items else "?", **settings | {"metavar": option.name})
     elif option.words.repeated:
-        group.add_argument(option.name, dest=dest, action="append", **how)
+        group.add_argument(option.name, dest=dest, action="append", **settings)
     else:
         nargs = None if not items else "+" if ... in items else len(items)
-        group.add_argument(option.name, dest=dest, nargs=nargs, **how)
+        group.add_argument(option.name, dest=dest, nargs=nargs, **settings)
 
 
 # Help
@@ -277,8 +285,11 @@ def _add(group: Any, option: Option, dest: str, brief: bool) -> None:
 
 def comment(option: Option) -> str:
     """The string below the field of an option, as one paragraph."""
-    classes = (_comments(each.__module__).get(each.__name__, {}) for each in option.section.__mro__)
-    return next(found[option.path[-1]] for found in classes if option.path[-1] in found)
+    classes = (
+        _comments(ancestor.__module__).get(ancestor.__name__, {})
+        for ancestor in option.section.__mro__
+    )
+    return next(comments[option.path[-1]] for comments in classes if option.path[-1] in comments)
 
 
 @cache
@@ -288,19 +299,19 @@ def _comments(module: str) -> dict[str, dict[str, str]]:
         return {}
     tree = ast.parse(inspect.getsource(sys.modules[module]))
     return {
-        each.name: {
+        statement.name: {
             ast.unparse(field.target): " ".join(ast.literal_eval(after.value).split())
-            for field, after in itertools.pairwise(each.body)
+            for field, after in itertools.pairwise(statement.body)
             if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr)
         }
-        for each in tree.body
-        if isinstance(each, ast.ClassDef)
+        for statement in tree.body
+        if isinstance(statement, ast.ClassDef)
     }
 
 
 def _overview(group: Group, prog: str) -> str:
     """The help of a group, with the first line of the help of each command."""
-    about, _, examples = group.help.format(prog=prog).partition("\nexamples:\n")
+    description, _, examples = group.help.format(prog=prog).partition("\nexamples:\n")
     lines = []
     for name, command in group.commands.items():
         is_group = isinstance(command, Group)
@@ -308,7 +319,7 @@ def _overview(group: Group, prog: str) -> str:
         lines.append(f"  {name:<11}{text.partition(chr(10))[0]}")
     return "\n".join(
         [
-            f"{about}\nusage: {prog} COMMAND [OPTIONS]\n",
+            f"{description}\nusage: {prog} COMMAND [OPTIONS]\n",
             *lines,
             f"\nexamples:\n{examples}",
             f"\n{prog} COMMAND --help explains a command, with examples at its end.",
@@ -327,8 +338,10 @@ def completion(group: Group, prog: str) -> str:
                 names = " ".join(command.commands)
             else:
                 options = options_of(options_type(function(command)))
-                both = (each for option in options for each in (option.name, option.negation))
-                names = " ".join(each for each in both if each.startswith("--"))
+                spellings = (
+                    spelling for option in options for spelling in (option.name, option.negation)
+                )
+                names = " ".join(spelling for spelling in spellings if spelling.startswith("--"))
             yield f'        "{words}{name} "*) names="{names}" ;;'
 
     commands = " ".join(group.commands)

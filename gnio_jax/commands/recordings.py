@@ -34,7 +34,7 @@ class ExportFile:
     """File to write. Its ending chooses the format: .mcap, .csv or .tum."""
 
 
-def import_file(asked: ImportFile, _call: options.Call) -> None:
+def import_file(request: ImportFile, _call: options.Call) -> None:
     """Import a recording of a phone or robot as the package's HDF5.
 
     The format is recognised by the content: a zip or folder of Sensor Logger or phyphox, a ROS bag
@@ -52,33 +52,39 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
           "accel_y=Y (m/s^2)" "accel_z=Z (m/s^2)" --out recordings/walk.h5
       {prog} ios.csv --accel-sign ios --gyro-unit deg/s --rate 100 --out recordings/ios.h5
     """
-    if asked.out.suffix.lower() not in HDF5:
-        raise InputError("--out", f"'{asked.out}' is no name of an HDF5 file", "name it NAME.h5")
+    if request.out.suffix.lower() not in HDF5:
+        raise InputError("--out", f"'{request.out}' is no name of an HDF5 file", "name it NAME.h5")
     from gnio_jax.apps import importing  # late: mistakes do not wait for JAX
     from gnio_jax.data.readers import csv_files
 
-    name, folder = asked.name or asked.out.stem, asked.out.parent
-    recording = importing.import_recording(asked.file, asked.recording, rate=asked.rate, name=name)
-    importing.write_imported(asked.out, recording)
+    name, folder = request.name or request.out.stem, request.out.parent
+    recording = importing.import_recording(
+        request.file, request.recording, rate=request.rate, name=name
+    )
+    importing.write_imported(request.out, recording)
     sequence = recording.sequence
     lines = [*recording.notes, *importing.impressions(sequence)]
     start = "" if sequence.valid.any() else " --init static"
     following = f"gnio evaluate --dataset csv --data-root {folder} --split test{start}"
     lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
-    beside = [path for path in csv_files.files_of(folder) if path.name != asked.out.name]
-    others = [p for p in beside if p.suffix.lower() not in HDF5 or p.stem == asked.out.stem]
+    neighbours = [path for path in csv_files.files_of(folder) if path.name != request.out.name]
+    others = [
+        path
+        for path in neighbours
+        if path.suffix.lower() not in HDF5 or path.stem == request.out.stem
+    ]
     if lists:
-        line = f"add the line {asked.out.name} to {lists[-1]}.txt"
+        line = f"add the line {request.out.name} to {lists[-1]}.txt"
         lines.append(
             f"{folder} has lists of its splits: {line}, otherwise this recording is not read"
         )
     elif others:
-        following = f"gnio track {asked.out}"
+        following = f"gnio track {request.out}"
         lines.append(
             f"{folder} holds {others[0].name} too, which gnio evaluate would read as a recording; "
             "write the imported ones to a folder of their own"
         )
-    console.say(f"{asked.out}: {sequence.name}")
+    console.say(f"{request.out}: {sequence.name}")
     for line in lines:
         console.say(f"  {line}")
     for warning in recording.warnings:
@@ -86,7 +92,7 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
     console.say(f"next: {following}")
 
 
-def export_file(asked: ExportFile, _call: options.Call) -> None:
+def export_file(request: ExportFile, _call: options.Call) -> None:
     """Write a trajectory of gnio evaluate or gnio track in the format of another program.
 
     examples:
@@ -96,7 +102,7 @@ def export_file(asked: ExportFile, _call: options.Call) -> None:
     from gnio_jax.apps.export import export  # late: mistakes do not wait for JAX
     from gnio_jax.evaluation.trajectory import read_tum
 
-    trajectory = read_tum(asked.trajectory)
-    count = export(asked.out, trajectory)
+    trajectory = read_tum(request.trajectory)
+    count = export(request.out, trajectory)
     seconds = trajectory.time[-1] - trajectory.time[0]
-    console.say(f"{asked.out}: {count} poses, {seconds:.1f} s")
+    console.say(f"{request.out}: {count} poses, {seconds:.1f} s")

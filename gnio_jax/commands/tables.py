@@ -9,7 +9,7 @@ from gnio_jax.config import TablesConfig
 from gnio_jax.cores import usable_cores
 
 
-def tables(asked: TablesConfig, _call: options.Call) -> None:
+def tables(request: TablesConfig, _call: options.Call) -> None:
     """Reproduce a table of the paper: train and evaluate its rows under equal conditions.
 
     Every row is trained with the same recordings, batches, epochs, learning rate and augmentation,
@@ -32,8 +32,8 @@ def tables(asked: TablesConfig, _call: options.Call) -> None:
     console.prepare_filter()
     try:
         with console.terminal() as terminal:
-            text = make.make(asked, terminal, usable_cores())
-    except runs.Interrupted as stopped:
+            text = make.make(request, terminal, usable_cores())
+    except runs.Interrupted as interruption:
         print("stopped and saved; the same command continues from here", file=sys.stderr)
-        sys.exit(128 + stopped.args[0])
+        sys.exit(128 + interruption.args[0])
     console.say(text)

@@ -35,7 +35,7 @@ class TrackOptions:
     recording: Annotated[ImportOptions, UNNAMED] = ImportOptions()  # noqa: RUF009 - it is frozen
 
 
-def track(asked: TrackOptions, call: options.Call) -> None:
+def track(request: TrackOptions, call: options.Call) -> None:
     """Compute the trajectory of a recording and its expected accuracy.
 
     FILE is anything that gnio data import reads, or an HDF5 file that it has written. Stand still
@@ -57,21 +57,21 @@ def track(asked: TrackOptions, call: options.Call) -> None:
     from gnio_jax.apps.importing import read_imported
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    recording = read_imported(asked.file, asked.recording)
-    weights = packages.choose(asked.weights)
-    out = asked.out or Path("tracks") / _folder_name(recording.sequence.name)
+    recording = read_imported(request.file, request.recording)
+    weights = packages.choose(request.weights)
+    out = request.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)
-        how = {"command": str(call), "rerun_file": asked.rerun}
-        found = tracking.track(recording, weights, out, asked.format, **how)
-    for note in found.summary.notes:
+        details = {"command": str(call), "rerun_file": request.rerun}
+        result = tracking.track(recording, weights, out, request.format, **details)
+    for note in result.summary.notes:
         console.say(f"  {note}")
-    console.say(_table(found.summary))
-    for warning in found.summary.warnings:
+    console.say(_table(result.summary))
+    for warning in result.summary.warnings:
         console.say(f"warning: {warning}")
-    console.say(f"weights: {weights.name}, trained on {weights.about}")
-    console.say(found.summary.limits)
-    console.say(f"results: {found.folder} (look at track.png, report.html)")
+    console.say(f"weights: {weights.name}, trained on {weights.trained_on}")
+    console.say(result.summary.limits)
+    console.say(f"results: {result.folder} (look at track.png, report.html)")
 
 
 def _folder_name(name: str) -> str:
@@ -95,7 +95,7 @@ def _table(summary: Any) -> Table:
     grid.add_row("at rest (quieter than a hand)", f"{summary.rest:.0%}")
     if summary.accepted is not None:
         grid.add_row("displacements used", f"{summary.accepted:.0%}")
-    for name in [each for each in ERRORS if each in summary.errors]:
+    for name in [metric for metric in ERRORS if metric in summary.errors]:
         column = tabulate.column(name)
         text = tabulate.number(summary.errors.get(name), column.digits)
         grid.add_row(f"{column.heading} (against the reference)", f"{text} {column.unit}".strip())

@@ -32,7 +32,7 @@ class TrainOptions(TrainConfig):
     Open MPI and Kubernetes."""
 
 
-def train(asked: TrainOptions, call: options.Call) -> None:
+def train(request: TrainOptions, call: options.Call) -> None:
     """Train a network and write a run: config.yaml, checkpoints and logs in its work folder.
 
     Settings come from four places, and later ones override earlier ones: the paper's defaults;
@@ -52,28 +52,28 @@ def train(asked: TrainOptions, call: options.Call) -> None:
       {prog} --config quickstart --set filter.noise.gyro_density=1e-3 --set optim.clip_norm=null
       {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
     """
-    config = experiment(asked, call)
+    config = experiment(request, call)
     from gnio_jax import filtering, parallel  # late: mistakes do not wait for JAX
     from gnio_jax.apps import packages
     from gnio_jax.training import loop
 
     if config.through_filter.learn:
         filtering.cores_as_devices()  # the filter's operations are too small for several cores
-    parallel.initialise(asked.distributed, asked.devices)
+    parallel.initialise(request.distributed, request.devices)
     with console.terminal(shown=parallel.is_first()) as terminal:
-        configs = configuration.with_seeds(config, asked.seeds) if asked.seeds else [config]
-        given = terminal, usable_cores(), asked.devices, packages.load_pretrained
+        configs = configuration.with_seeds(config, request.seeds) if request.seeds else [config]
+        resources = terminal, usable_cores(), request.devices, packages.load_pretrained
         try:
-            outcomes = loop.train_all(configs, asked.resume, *given)
+            outcomes = loop.train_all(configs, request.resume, *resources)
         except FloatingPointError as error:
             terminal.line(str(error))
             sys.exit(1)
-    stopped_by = next((each.stopped_by for each in outcomes if each.stopped_by), None)
+    stopped_by = next((outcome.stopped_by for outcome in outcomes if outcome.stopped_by), None)
     if not parallel.is_first():
         pass
     elif stopped_by:
         workdir = configuration.default_workdir(config)
-        seeds = f" --seeds {' '.join(map(str, asked.seeds))}" if asked.seeds else ""
+        seeds = f" --seeds {' '.join(map(str, request.seeds))}" if request.seeds else ""
         remedy = f"{call.prog} --workdir {workdir}{seeds} --resume"
         print(f"stopped and saved; continue with: {remedy}", file=sys.stderr)
     else:
@@ -88,30 +88,30 @@ def train(asked: TrainOptions, call: options.Call) -> None:
         sys.exit(128 + stopped_by)
 
 
-def experiment(asked: TrainOptions, call: options.Call) -> TrainConfig:
+def experiment(request: TrainOptions, call: options.Call) -> TrainConfig:
     """The experiment that the options describe.
 
     Training through the filter begins with the filter of the run that it starts from, except for
     settings of the file or of --set. The consider covariance of that filter is not used, because it
     belongs to another covariance than the one that will be trained.
     """
-    file = None if asked.config is None else configuration.find(asked.config)
+    file = None if request.config is None else configuration.find(request.config)
     content = None if file is None else configuration.read(file)  # once, as it may be a pipe
 
-    def combined(base: TrainConfig) -> TrainConfig:
-        found = base if content is None else configuration.parse(content, str(file), base)
-        given = options.read(train, call, TrainOptions(**vars(found)))
-        chosen = TrainConfig(**{name: getattr(given, name) for name in vars(base)})
-        return configuration.assign(chosen, asked.set)
+    def combine(base: TrainConfig) -> TrainConfig:
+        base_config = base if content is None else configuration.parse(content, str(file), base)
+        parsed = options.read(train, call, TrainOptions(**vars(base_config)))
+        chosen = TrainConfig(**{name: getattr(parsed, name) for name in vars(base)})
+        return configuration.assign(chosen, request.set)
 
-    config = combined(TrainConfig())
-    first = configuration.with_seeds(config, asked.seeds)[0] if asked.seeds else config
-    kept = configuration.default_workdir(first) / "config.yaml"
-    if asked.resume and kept.exists():
-        begun = configuration.load(kept)
+    config = combine(TrainConfig())
+    first = configuration.with_seeds(config, request.seeds)[0] if request.seeds else config
+    saved = configuration.default_workdir(first) / "config.yaml"
+    if request.resume and saved.exists():
+        earlier = configuration.load(saved)
         if file is None:
-            file, content = kept, configuration.text(begun)
-        resumed = combined(TrainConfig(filter=begun.filter))
+            file, content = saved, configuration.text(earlier)
+        resumed = combine(TrainConfig(filter=earlier.filter))
         return dataclasses.replace(resumed, workdir=config.workdir)  # not that of the first seed
     if not config.through_filter.learn or config.init_from is None:
         return config
@@ -119,6 +119,6 @@ def experiment(asked: TrainOptions, call: options.Call) -> TrainConfig:
     from gnio_jax.apps import packages
 
     filtering.cores_as_devices()  # before the checkpoint's arrays fix the devices
-    trained = packages.load_pretrained(config.init_from).config.filter
-    begins = dataclasses.replace(trained, considered=ConsideredStd())
-    return combined(TrainConfig(filter=begins))
+    source = packages.load_pretrained(config.init_from).config.filter
+    start = dataclasses.replace(source, considered=ConsideredStd())
+    return combine(TrainConfig(filter=start))

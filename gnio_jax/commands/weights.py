@@ -45,7 +45,7 @@ class ExportOptions:
     """Folder to write; by default exports/NAME_onnx, with the name of RUN."""
 
 
-def weights(asked: WeightsOptions, _call: options.Call) -> None:
+def weights(request: WeightsOptions, _call: options.Call) -> None:
     """List the trained networks that are found here: name, size, training data, key metric.
 
     Packages are looked for in the installed gnio-jax and in the folders of $GNIO_WEIGHTS. gnio
@@ -58,28 +58,28 @@ def weights(asked: WeightsOptions, _call: options.Call) -> None:
       {prog} pedestrian --out runs/pedestrian    a run of it
       GNIO_WEIGHTS=~/packages {prog}
     """
-    if asked.name is None and asked.out is not None:
-        raise InputError(f"--out {asked.out}", "is for one package", "name it before --out")
+    if request.name is None and request.out is not None:
+        raise InputError(f"--out {request.out}", "is for one package", "name it before --out")
     from gnio_jax.apps import packages  # late: mistakes do not wait for JAX
 
-    if asked.name is not None and asked.out is not None:
-        packages.write_run(asked.name, asked.out)
-        following = f"gnio evaluate --workdir {asked.out} --dataset ..."
-        console.say(f"run: {asked.out}; next: {following}")
+    if request.name is not None and request.out is not None:
+        packages.write_run(request.name, request.out)
+        following = f"gnio evaluate --workdir {request.out} --dataset ..."
+        console.say(f"run: {request.out}; next: {following}")
         return
-    if asked.name is not None:
-        console.say(packages.card_of(asked.name))
+    if request.name is not None:
+        console.say(packages.card_of(request.name))
         return
     damaged, headings = [], ("name", "size", "network", "trained on", "licence", "measured")
     grid = console.columns(*headings, box=box.SIMPLE_HEAD)
-    for name, place in packages.packages().items():
+    for name, path in packages.packages().items():
         try:
-            about = packages.read_about(place)
+            manifest = packages.read_manifest(path)
         except InputError as error:
             damaged.append(str(error))
             continue
-        size, measured = f"{about.weights['bytes'] / 1e6:.2f} MB", about.measured or "–"
-        grid.add_row(name, size, about.network, about.data, about.license, measured)
+        size, measured = f"{manifest.weights['bytes'] / 1e6:.2f} MB", manifest.measured or "–"
+        grid.add_row(name, size, manifest.network, manifest.data, manifest.license, measured)
     if grid.row_count:
         console.say(grid)
     elif not damaged:
@@ -89,7 +89,7 @@ def weights(asked: WeightsOptions, _call: options.Call) -> None:
         console.say(line)
 
 
-def publish(asked: PublishOptions, _call: options.Call) -> None:
+def publish(request: PublishOptions, _call: options.Call) -> None:
     """Make a package from a run: weights, settings, model card, checksums.
 
     It contains no data, and no code that runs when it is loaded. It includes the figures of the
@@ -103,18 +103,18 @@ def publish(asked: PublishOptions, _call: options.Call) -> None:
     """
     from gnio_jax.apps import packages  # late: mistakes do not wait for JAX
 
-    name = asked.name or asked.out.name.removesuffix(".zip")
-    said = (name, asked.data, asked.license, asked.fails)
-    about = packages.publish(asked.run, asked.out, *said)
-    size = f"{about.weights['bytes'] / 1e6:.2f} MB"
-    console.say(f"{asked.out}: {about.name}, network {about.network}, {size}")
-    if not about.measured:
+    name = request.name or request.out.name.removesuffix(".zip")
+    card_fields = (name, request.data, request.license, request.fails)
+    manifest = packages.publish(request.run, request.out, *card_fields)
+    size = f"{manifest.weights['bytes'] / 1e6:.2f} MB"
+    console.say(f"{request.out}: {manifest.name}, network {manifest.network}, {size}")
+    if not manifest.measured:
         line = "the run holds no evaluation, so the card has no figures: gnio evaluate"
-        console.say(f"warning: {line} --workdir {asked.run}")
-    console.say(f"next: gnio track RECORDING --weights {asked.out}")
+        console.say(f"warning: {line} --workdir {request.run}")
+    console.say(f"next: gnio track RECORDING --weights {request.out}")
 
 
-def export(asked: ExportOptions, _call: options.Call) -> None:
+def export(request: ExportOptions, _call: options.Call) -> None:
     """Export a run as ONNX models for programs without Python.
 
     The models are network, start, window and filter step, and the filter is that of gnio track.
@@ -131,18 +131,20 @@ def export(asked: ExportOptions, _call: options.Call) -> None:
     from gnio_jax.apps import onnx
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    name = Path(asked.run).name.removesuffix(".zip")
-    out = asked.out or Path("exports") / f"{name}_onnx"
+    name = Path(request.run).name.removesuffix(".zip")
+    out = request.out or Path("exports") / f"{name}_onnx"
     with console.terminal() as terminal:
         terminal.progress("exporting and measuring", 0.0)
-        found = onnx.export_run(asked.run, out)
-    for file, size in found.bytes.items():
+        exported = onnx.export_run(request.run, out)
+    for file, size in exported.bytes.items():
         console.say(f"  {out / file}  {size / 1e6:.2f} MB")
-    far = found.deviation
-    rms, largest = f"rms {far.displacement_rms:.2g} m", f"{far.displacement_largest:.2g} m"
+    deviation = exported.deviation
+    rms, largest = (
+        f"rms {deviation.displacement_rms:.2g} m",
+        f"{deviation.displacement_largest:.2g} m",
+    )
     console.say("  against gnio-jax, over a simulated walk:")
     console.say(f"    displacement of a window  {rms}, largest {largest}")
-    console.say(f"    position                  largest {far.position_largest:.2g} m")
-    console.say(
-        f"    ATE                       {far.ate:.3f} m (gnio-jax {far.ate_of_package:.3f} m)"
-    )
+    console.say(f"    position                  largest {deviation.position_largest:.2g} m")
+    errors = f"{deviation.ate:.3f} m (gnio-jax {deviation.ate_of_package:.3f} m)"
+    console.say(f"    ATE                       {errors}")

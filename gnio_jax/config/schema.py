@@ -378,8 +378,55 @@ class ConsideredStd(NamedTuple):
     raw if its recording has `imu_compensated: no` and its bias starts from zero."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FilterOptions:
+    """The options of the filter, which are fixed when it is compiled. The defaults are TLIO's."""
+
+    mahalanobis_fail_scale: NonNegative = 0.0
+    """0 skips a rejected measurement; above 0 it is applied with its covariance multiplied by
+    this."""
+    log_std_min: Finite = -4.0
+    """The network's log standard deviation is raised to at least this (`run_odometry` only)."""
+    gate_threshold: Positive = 11.345
+    """Largest rᵀ S⁻¹ r that passes, of a displacement and of a velocity at rest: 99 % of χ² with
+    three degrees of freedom."""
+    convergence_seconds: NonNegative = 10.0
+    """The gate remains open until the oldest clone is more than this after initialisation, s."""
+    success_seconds: NonNegative = 0.5
+    """When the last success is older than this, the gate pauses: everything passes, s."""
+    pause_seconds: NonNegative = 1.0
+    """Length of such a pause, s."""
+    zero_velocity_std: NonNegative = 0.0
+    """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
+    quiet; 0 for no such update. If a displacement is tested in the same interval and its gate is
+    active, a rest that fails the χ² test is refused, independently of `mahalanobis_fail_scale` and
+    `gate_softness`."""
+    rest_gyro: NonNegative = 0.05
+    """Bound of |gyro − b_g| in every sample of a quiet IMU, rad/s."""
+    rest_accel: NonNegative = 0.3
+    """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
+    rest_seconds: NonNegative = 0.5
+    """How long the IMU is quiet before its velocity is measured as zero, s."""
+    bridge_seconds: NonNegative = 0.1
+    """For this long, s, the last IMU sample stands in for missing ones; then the filter coasts with
+    constant attitude and velocity, and windows are no measurements."""
+    gap_gyro_std: NonNegative = 1.0
+    """Standard deviation of the rate that a gap may hide, rad/s. That of a held sample grows with
+    its age and reaches this value at `bridge_seconds`."""
+    gap_accel_std: NonNegative = 3.0
+    """Standard deviation of the acceleration that a gap may hide, m/s²."""
+    error: Literal["invariant", "additive"] | None = None
+    """The error of velocity and positions. invariant: after an update it is expressed at the new
+    estimate, so that no later displacement shows a yaw that nobody measured (right-invariant EKF,
+    Barrau and Bonnabel). additive: it is not, as in TLIO. By default additive where
+    `window_rotation` is tlio, else invariant."""
+    speed_limit: Positive = 100.0
+    """Largest plausible speed, m/s: an estimate that exceeds it has diverged, and is not `healthy`
+    from then on (ours)."""
+
+
 @dataclass(frozen=True)
-class FilterSettings:
+class FilterSettings(FilterOptions):
     """The stochastic-cloning EKF of an experiment (paper §III-G; TLIO's values). Its sections are
     the tuples that `filtering.run_odometry` takes."""
 
@@ -389,9 +436,6 @@ class FilterSettings:
     """Standard deviations of the initial state."""
     considered: ConsideredStd = field(default_factory=ConsideredStd)
     """Errors that are not estimated but included in the covariance (Schmidt's consider states)."""
-    mahalanobis_fail_scale: NonNegative = 0.0
-    """0 skips an update that the χ² gate rejects; above 0 the update is applied with its covariance
-    multiplied by this."""
     window_rotation: Literal["per_sample", "single", "tlio"] | None = None
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,

@@ -1,8 +1,9 @@
-"""Every dataset as a list of `Sequence`: `load(name, root, split)`, `names()`."""
+"""Every dataset as a list of `Sequence`: `load(name, root, split)`, `names()`, `register`."""
 
-from gnio_jax.data.dataset import Dataset, find_root, get, names
+from gnio_jax.data.dataset import Dataset
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.data.loading import load, load_each
+from gnio_jax.data.registry import find_root, get, names, register
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.self_check import SelfCheck, self_check
 from gnio_jax.data.splits import Fold, folds, group, parse_fold
@@ -24,6 +25,7 @@ __all__ = [
     "names",
     "parse_fold",
     "read_hdf5",
+    "register",
     "resample",
     "self_check",
     "validate",

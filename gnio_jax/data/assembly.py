@@ -2,7 +2,7 @@
 
 A reader gives gyro and accelerometer, each on stamps of its own, and the reference, if there is
 one: poses or waypoints. `assemble` puts rows in order, checks units, rates and gaps, resamples to
-one uniform clock, and marks what can be trusted.
+one uniform clock, and sets `valid` where the reference can be trusted.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.parsing.stamps import check_seconds, in_order, rounded_rate
 from gnio_jax.data.reference import Poses as Poses
 from gnio_jax.data.reference import Reference, reference_at
-from gnio_jax.data.resampling import is_uniform, resampled, slerped, uniform_clock
+from gnio_jax.data.resampling import interpolate_attitudes, is_uniform, resample_imu, uniform_clock
 from gnio_jax.data.validation import (
     FARTHEST,
     FEWEST_WAYPOINTS,
@@ -73,8 +73,8 @@ class Streams(NamedTuple):
         cls, name: str, source: object, time: np.ndarray, gyro: np.ndarray, accel: np.ndarray
     ) -> Streams:
         """Streams of an IMU whose two sensors share their stamps."""
-        both = (Samples(time, values, str(source)) for values in (gyro, accel))
-        return cls(name, str(source), *both)
+        sensors = (Samples(time, values, str(source)) for values in (gyro, accel))
+        return cls(name, str(source), *sensors)
 
 
 def assemble(
@@ -106,43 +106,46 @@ def assemble(
     Raises `InputError` naming a damaged file, and `Refusal` for a recording without a window of IMU
     and reference.
     """
-    streams = ordered(streams)
+    streams = sort_streams(streams)
     gyro, accel = streams.gyro, streams.accel
     for sensor in (gyro, accel):
         check_seconds(sensor.time, sensor.source)
-    found = _shared_spans(streams, whole)
-    if len(found) > 1 and not divide:
-        last, first = found[0][1], found[1][0]
+    intervals = _shared_spans(streams, whole)
+    if len(intervals) > 1 and not divide:
+        last, first = intervals[0][1], intervals[1][0]
         problem = f"has a gap of {first - last:.3f} s after {last - gyro.time[0]:.2f} s"
         problem = f"field 'time' {problem}, longer than {WINDOW_SECONDS:g} s"
         raise InputError(gyro.source, problem, "cut the recording there")
     recorded = max(rounded_rate(gyro.time), rounded_rate(accel.time))
     streams = streams._replace(attributes=streams.attributes | {RECORDED_RATE: recorded})
     rate = rate or recorded
-    pieces = [_on_clock(streams, rate, *span, max_speed, max_drift) for span in found]
+    pieces = [_sequence_on_clock(streams, rate, *span, max_speed, max_drift) for span in intervals]
     shortest = WINDOW_SECONDS - STAMP_ROUNDING
-    kept = [piece for piece in pieces if _seconds_of_use(streams, piece, whole) >= shortest]
+    usable = [piece for piece in pieces if _seconds_of_use(streams, piece, whole) >= shortest]
     problem = f"no {WINDOW_SECONDS:g} s of it have an IMU and a reference that can be trusted"
-    if len(found) > 1:
-        gaps = [after[0] - before[1] for before, after in itertools.pairwise(found)]
+    if len(intervals) > 1:
+        gaps = [after[0] - before[1] for before, after in itertools.pairwise(intervals)]
         problem = f"field 'time' has gaps longer than {WINDOW_SECONDS:g} s"
         problem += f" ({len(gaps)}, up to {max(gaps):.1f} s)"
-    if not kept:
-        rest = ", and no piece between them holds a window with a reference"
-        raise Refusal(streams.source, problem + rest * (len(found) > 1))
-    if len(found) > 1:
-        seconds, total = sum(piece.time[-1] for piece in kept), found[-1][1] - found[0][0]
-        pieces = f"{len(kept)} of {len(pieces)} pieces"
+    if not usable:
+        advice = ", and no piece between them holds a window with a reference"
+        raise Refusal(streams.source, problem + advice * (len(intervals) > 1))
+    if len(intervals) > 1:
+        seconds, total = sum(piece.time[-1] for piece in usable), intervals[-1][1] - intervals[0][0]
+        pieces = f"{len(usable)} of {len(pieces)} pieces"
         problem += f"; kept: {seconds:.1f} of {total:.1f} s, {pieces}"
         warnings.warn(f"{streams.source}: {problem}", stacklevel=2)
-    if len(kept) > 1:
-        kept = [piece._replace(name=f"{piece.name}_piece{n}") for n, piece in enumerate(kept, 1)]
-    return [validate(piece, streams.source) for piece in kept]
+    if len(usable) > 1:
+        usable = [
+            piece._replace(name=f"{piece.name}_piece{n}") for n, piece in enumerate(usable, 1)
+        ]
+    return [validate(piece, streams.source) for piece in usable]
 
 
-def ordered(streams: Streams) -> Streams:
-    """Every stream sorted by stamps, only poses within `FARTHEST`, and the counts of the gyro's
-    repaired rows. Raises `InputError` for samples that cannot be those of an IMU in SI units."""
+def sort_streams(streams: Streams) -> Streams:
+    """The streams with their rows sorted by stamps, without poses beyond `FARTHEST`, and with the
+    counts of the gyro's repaired rows as attributes. Raises `InputError` for samples that cannot be
+    those of an IMU in SI units."""
 
     def by_stamps(samples: Samples) -> tuple[Samples, dict[str, float]]:
         rows, repairs = in_order(samples.time, samples.values, samples.source)
@@ -183,21 +186,23 @@ def _shared_spans(streams: Streams, whole: bool) -> list[tuple[float, float]]:
     """First and last time of the stretches in which no stream has a gap longer than a window."""
     gyro, accel, poses = streams.gyro, streams.accel, streams.poses
     clocks, outermost = [gyro.time, accel.time], (-np.inf, np.inf)
-    both = gyro.time[(gyro.time >= accel.time[0]) & (gyro.time <= accel.time[-1])]
-    for each, imu in ((accel, gyro.time), (streams.device, gyro.time), (poses, both)):
-        if each is not None:
-            _check_overlap(each.time, each.source, imu)
+    imu_time = gyro.time[(gyro.time >= accel.time[0]) & (gyro.time <= accel.time[-1])]
+    for stream, imu in ((accel, gyro.time), (streams.device, gyro.time), (poses, imu_time)):
+        if stream is not None:
+            _check_overlap(stream.time, stream.source, imu)
     if poses is not None and poses.ends_pieces:
         clocks.append(poses.time)
     elif poses is not None and not whole:
         outermost = (float(poses.time[0]), float(poses.time[-1]))
-    found = [outermost]
+    intervals = [outermost]
     for time in clocks:
         unbroken = stretches(np.diff(time) > WINDOW_SECONDS)
         runs = [(time[run.start], time[run.stop - 1]) for run in unbroken]
-        found = [(max(a, c), min(b, d)) for a, b in found for c, d in runs if min(b, d) > max(a, c)]
+        intervals = [
+            (max(a, c), min(b, d)) for a, b in intervals for c, d in runs if min(b, d) > max(a, c)
+        ]
     # Each begins and ends at a sample of the gyro, so that the clock has the gyro's stamps.
-    inside = [gyro.time[(gyro.time >= a - 1e-9) & (gyro.time <= b + 1e-9)] for a, b in found]
+    inside = [gyro.time[(gyro.time >= a - 1e-9) & (gyro.time <= b + 1e-9)] for a, b in intervals]
     return [(float(time[0]), float(time[-1])) for time in inside if len(time) > 1]
 
 
@@ -210,7 +215,7 @@ def _check_overlap(time: np.ndarray, source: str, imu: np.ndarray) -> None:
     raise InputError(source, problem, "check that the files are of one recording and one clock")
 
 
-def _on_clock(
+def _sequence_on_clock(
     streams: Streams, rate: float, first: float, last: float, max_speed: float, max_drift: float
 ) -> Sequence:
     gyro, accel, poses = streams.gyro, streams.accel, streams.poses
@@ -222,13 +227,13 @@ def _on_clock(
         rates, forces = gyro.values[rows], accel.values[rows]
     else:
         clock = uniform_clock(first, last, rate)
-        rates, measured = resampled(gyro.time, gyro.values, clock, rate)
-        forces, also = resampled(accel.time, accel.values, clock, rate)
-        measured &= also
+        rates, measured = resample_imu(gyro.time, gyro.values, clock, rate)
+        forces, accel_measured = resample_imu(accel.time, accel.values, clock, rate)
+        measured &= accel_measured
     reference = Reference.none(len(clock))
     if poses is not None:
         reference = reference_at(clock, rates, poses, max_speed, max_drift)
-    known = reference.valid[:, None]
+    has_reference = reference.valid[:, None]
     if waypoints is not None:
         inside = (waypoints.time >= first) & (waypoints.time <= last)
         waypoints = Waypoints(waypoints.time[inside] - first, waypoints.values[inside])
@@ -237,11 +242,11 @@ def _on_clock(
         time=clock - first,
         gyro=rates,
         accel=forces,
-        orientation=np.where(known, reference.orientation, np.nan),
-        position=np.where(known, reference.position, np.nan),
-        velocity=np.where(known, reference.velocity, np.nan),
+        orientation=np.where(has_reference, reference.orientation, np.nan),
+        position=np.where(has_reference, reference.position, np.nan),
+        velocity=np.where(has_reference, reference.velocity, np.nan),
         valid=reference.valid & measured,
-        device_orientation=device and slerped(device.time, device.values, clock),
+        device_orientation=device and interpolate_attitudes(device.time, device.values, clock),
         imu_valid=None if measured.all() else measured,
         waypoints=waypoints,
         attributes=streams.attributes | {"start_time": streams.start + first},

@@ -1,18 +1,13 @@
-"""The description of a dataset by its reader, the datasets by name, and their folders.
-
-A new dataset is one module in `readers` that ends with `DATASET = Dataset(...)`, and one line in
-`readers/__init__.py`.
-"""
+"""What a reader gives: the description of its dataset, and recordings that are not yet read."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gnio_jax.errors import InputError, did_you_mean
+from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
 
@@ -25,8 +20,8 @@ class Refusal(InputError):
         super().__init__(where, problem, remedy)
 
 
-class Recording(NamedTuple):
-    """One recording that was found, but not yet read. It can be sent to another process."""
+class RecordingSource(NamedTuple):
+    """A recording that a reader has found, but not yet read. It can be sent to another process."""
 
     name: str
     """Name that is unique within a dataset, and that of its sequence, if there is only one."""
@@ -42,17 +37,17 @@ class Recording(NamedTuple):
     """Attributes from lists and splits, which are added to those of its sequences."""
     form: str = ""
     """Name of this form in messages, if the recording has several."""
-    fallback: Recording | None = None
+    fallback: RecordingSource | None = None
     """Another form of the same recording, which is read if this one is refused."""
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """One dataset."""
+    """The description of a dataset, with the function that finds its recordings."""
 
     name: str
     """The name of `--dataset`."""
-    recordings: Callable[[Path, str], list[Recording]]
+    recordings: Callable[[Path, str], list[RecordingSource]]
     """(root, split) -> recordings, not yet read. The split must be a possible one. The result is
     empty if there is nothing of the dataset; `InputError` is raised if only the split is
     missing."""
@@ -85,51 +80,7 @@ class Dataset:
         """The splits that may be asked for at this root."""
         return self.list_splits(root) if self.list_splits else self.splits
 
-    def described(self, sequence: Sequence) -> Sequence:
+    def with_origin(self, sequence: Sequence) -> Sequence:
         """A sequence with the name and licence of its dataset; a converted one keeps its own."""
-        about = {"dataset": self.name, "licence": self.licence}
-        return sequence._replace(attributes=about | sequence.attributes)
-
-
-# --- by name
-
-
-def _datasets() -> dict[str, Dataset]:
-    from gnio_jax.data.readers import DATASETS  # the readers import this module
-
-    return DATASETS
-
-
-def names() -> list[str]:
-    """Names of the known datasets."""
-    return sorted(_datasets())
-
-
-def get(name: str) -> Dataset:
-    """The dataset of that name; raises `InputError` that lists the known ones."""
-    if name not in _datasets():
-        known = f"known datasets: {', '.join(names())}"
-        raise InputError(
-            "dataset", f"unknown name '{name}'", f"{did_you_mean(name, names())}{known}"
-        )
-    return _datasets()[name]
-
-
-def find_root(name: str, root: str | os.PathLike[str] | None = None) -> Path:
-    """The folder of dataset `name`: `root` if given, else $GNIO_DATA/<name>, else data/<name>.
-
-    Raises `InputError` if it is missing, with the ways to name it, the place of the public set, and
-    the expected layout.
-    """
-    dataset = get(name)
-    bases = [base for base in (os.environ.get("GNIO_DATA"), "data") if base]
-    candidates = [Path(base) / folder for base in bases for folder in dataset.folders or (name,)]
-    if root is not None:
-        candidates = [Path(root)]
-    for candidate in candidates:
-        if candidate.is_dir():
-            return candidate
-    looked = ", ".join(dict.fromkeys(str(candidate) for candidate in candidates))
-    remedy = f"give --data-root, or set GNIO_DATA to its parent; source: {dataset.source}"
-    layout = f"expected layout: {dataset.layout}"
-    raise InputError(looked, f"no folder of dataset '{name}'", f"{remedy}; {layout}")
+        attributes = {"dataset": self.name, "licence": self.licence}
+        return sequence._replace(attributes=attributes | sequence.attributes)

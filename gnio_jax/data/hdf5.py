@@ -54,8 +54,8 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
     if not path.exists():
         raise InputError(path, "no such file")
     with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
-        stored = _stored(file, path)
-    return _sequence(stored, path)
+        stored = _read_group(file, path)
+    return _stored_sequence(stored, path)
 
 
 def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
@@ -74,42 +74,44 @@ def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
         attributes[key] = value
 
 
-_Stored = tuple[dict[str, Any], dict[str, np.ndarray | None], dict[str, Any]]
+_StoredGroup = tuple[dict[str, Any], dict[str, np.ndarray | None], dict[str, Any]]
 """Attributes of a group, its fields (None for what is missing), attributes of the sequence."""
 
 
-def _stored(group: h5py.Group, path: Path) -> _Stored:
+def _read_group(group: h5py.Group, path: Path) -> _StoredGroup:
     """Read a group, and check only its size: a failure here is due to the file."""
-    about, names = dict(group.attrs), (*_FIELDS, *_OPTIONAL_FIELDS, *_WAYPOINTS)
-    ours = about.get("format") == _FORMAT
-    fields = {name: hdf5_field(group, name, path) for name in names if ours}
+    header, names = dict(group.attrs), (*_FIELDS, *_OPTIONAL_FIELDS, *_WAYPOINTS)
+    is_ours = header.get("format") == _FORMAT
+    fields = {name: hdf5_field(group, name, path) for name in names if is_ours}
     inner = hdf5_node(group, "attributes", path)
-    return about, fields, {} if inner is None else dict(inner.attrs)
+    return header, fields, {} if inner is None else dict(inner.attrs)
 
 
-def _sequence(stored: _Stored, path: Path) -> Sequence:
+def _stored_sequence(stored: _StoredGroup, path: Path) -> Sequence:
     """The sequence of a group, validated. Raises `InputError`."""
-    about, fields, attributes = stored
-    if (form := about.get("format")) != _FORMAT:
-        problem = f"is not a '{_FORMAT}' file (format: {form!r})"
+    header, fields, attributes = stored
+    if (format_name := header.get("format")) != _FORMAT:
+        problem = f"is not a '{_FORMAT}' file (format: {format_name!r})"
         raise InputError(path, problem, "convert the recording with gnio data convert")
 
-    def values(field: str) -> np.ndarray:
+    def field_values(field: str) -> np.ndarray:
         """A field: booleans if it is a mask, else float64."""
         kind, content = ("b", "booleans") if field.endswith("valid") else ("f", "numbers")
-        found = fields[field]
-        if found is not None and found.dtype.kind == kind and found.shape:
-            return found if kind == "b" else found.astype(np.float64, copy=False)
-        problem = "is missing" if found is None else f"is not an array of {content}"
+        array = fields[field]
+        if array is not None and array.dtype.kind == kind and array.shape:
+            return array if kind == "b" else array.astype(np.float64, copy=False)
+        problem = "is missing" if array is None else f"is not an array of {content}"
         raise InputError(path, f"field '{field}' {problem}", "convert the recording again")
 
-    there = {name for name, found in fields.items() if found is not None}
-    optional: dict[str, Any] = {each: values(each) for each in _OPTIONAL_FIELDS if each in there}
-    if there.intersection(_WAYPOINTS):
-        optional["waypoints"] = Waypoints(*map(values, _WAYPOINTS))
-    name = str(about.get("name", path.stem))
+    present = {name for name, array in fields.items() if array is not None}
+    optional: dict[str, Any] = {
+        field: field_values(field) for field in _OPTIONAL_FIELDS if field in present
+    }
+    if present.intersection(_WAYPOINTS):
+        optional["waypoints"] = Waypoints(*map(field_values, _WAYPOINTS))
+    name = str(header.get("name", path.stem))
     plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in attributes.items()}
-    required = map(values, _FIELDS)
+    required = map(field_values, _FIELDS)
     return validate(Sequence(name, *required, **optional, attributes=plain), path)
 
 
@@ -152,8 +154,8 @@ def cache_entry(name: str, files: Iterable[str | os.PathLike[str]]) -> Path:
         with contextlib.suppress(OSError):  # a file that is absent
             states[-1] += [path.stat().st_size, path.stat().st_mtime_ns]
     recording, state = (
-        hashlib.sha256(json.dumps(each).encode()).hexdigest()[:32]
-        for each in ([name, [path for path, *_ in states[:1]]], [_sources(), states])
+        hashlib.sha256(json.dumps(key).encode()).hexdigest()[:32]
+        for key in ([name, [path for path, *_ in states[:1]]], [_sources(), states])
     )
     return cache_folder() / f"{recording}-{state}.h5"
 
@@ -189,11 +191,11 @@ def read_reading(entry: Path) -> Reading | None:
     """A reading from the cache; None if there is no intact one."""
     try:
         with parsed_as(entry, "HDF5"), h5py.File(entry, "r") as file:
-            stored = [_stored(file[number], entry) for number in sorted(file)]
+            groups = [_read_group(file[number], entry) for number in sorted(file)]
             notes, refusals = (
                 tuple(json.loads(file.attrs[name])) for name in ("notes", "refusals")
             )
-        sequences = [_sequence(each, entry) for each in stored]
+        sequences = [_stored_sequence(group, entry) for group in groups]
     except InputError:
         return None
     return Reading(sequences, notes, refusals) if sequences or refusals else None

@@ -17,19 +17,18 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from gnio_jax.cores import usable_cores
-from gnio_jax.data.dataset import Dataset, Recording, Refusal, find_root, get
+from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.hdf5 import Reading, cache_entry, read_reading, write_hdf5, write_reading
+from gnio_jax.data.registry import find_root, get
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.self_check import SelfCheck, check_sequence
 from gnio_jax.data.splits import parse_fold
 from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.files import file_stem, replacing_folder, write_text
+from gnio_jax.reporting import Progress, silent
 from gnio_jax.types import Sequence
 
 Result = TypeVar("Result")
-Progress = Callable[[float], None]
-"""A function that is called with the finished share."""
-
 FEW = 8
 """Number of recordings up to which reading them is faster than starting processes."""
 CONVERSION = "conversion.json"
@@ -44,7 +43,7 @@ def load(
     root: str | os.PathLike[str] | None = None,
     split: str = "test",
     workers: int = 1,
-    progress: Progress = lambda share: None,
+    progress: Progress = silent,
 ) -> list[Sequence]:
     """The sequences of a split of a dataset, validated and self-checked, at its native rate
     (`resample` changes that), in the order of its recordings. A split may be a fold, or all but a
@@ -64,7 +63,7 @@ def load_each(
     root: str | os.PathLike[str] | None = None,
     split: str = "test",
     workers: int = 1,
-    progress: Progress = lambda share: None,
+    progress: Progress = silent,
 ) -> Iterator[Sequence]:
     """The sequences of `load` one after another, if together they do not fit into memory."""
     if fold := parse_fold(split):
@@ -82,12 +81,12 @@ def read_split(
     root: Path,
     split: str,
     workers: int = 1,
-    progress: Progress = lambda share: None,
+    progress: Progress = silent,
 ) -> Iterator[Sequence]:
-    """`load_each` for a `Dataset`."""
+    """The sequences of `load_each` for a `Dataset`, which need not be registered."""
     recordings = dataset.recordings(root, split)
     if not recordings:
-        raise _nothing(dataset, root, split, "sequence")
+        raise _empty_split(dataset, root, split, "sequence")
     names, left_out = set(), []
     refused: dict[str, list[str]] = {}  # reason without the file -> all whole lines
     for recording, reading in zip(
@@ -99,9 +98,9 @@ def read_split(
             why = reason.partition(": ")[2]
             refused.setdefault(why, []).append(f"{recording.name}: left out: {reason}")
         if reading.damage is not None:
-            _warn_of(refused)
+            _warn_of_refusals(refused)
             raise reading.damage
-        for sequence in map(dataset.described, reading.sequences):
+        for sequence in map(dataset.with_origin, reading.sequences):
             if sequence.name in names:
                 problem = f"two sequences of split '{split}' have the name '{sequence.name}'"
                 raise InputError(root, problem, "rename or remove one of them")
@@ -113,7 +112,7 @@ def read_split(
                 left_out.append(sequence.name)
             else:
                 yield sequence
-    _warn_of(refused)
+    _warn_of_refusals(refused)
     if not names:
         problem = f"none of the {len(recordings)} recordings of split '{split}' can be used"
         raise InputError(root, problem, "see the warnings above")
@@ -123,34 +122,41 @@ def read_split(
         raise InputError(", ".join(left_out[:3]), problem, remedy)
 
 
-def _warn_of(refused: dict[str, list[str]]) -> None:
+def _warn_of_refusals(refused: dict[str, list[str]]) -> None:
     """Warn once for each reason, with the number of recordings if there are several."""
     for lines in refused.values():
         several = f"{len(lines)} recordings are left out for the same reason, the first: "
         warnings.warn(f"{several if lines[1:] else ''}{lines[0]}", stacklevel=3)
 
 
-def _nothing(dataset: Dataset, root: Path, split: str, what: str) -> InputError:
+def _empty_split(dataset: Dataset, root: Path, split: str, what: str) -> InputError:
     problem = f"split '{split}' of dataset '{dataset.name}' holds no {what}"
     return InputError(root, problem, f"expected layout: {dataset.layout}")
 
 
-def _check_split(dataset: Dataset, split: str, known: Iterable[str]) -> None:
-    if split not in known:
-        remedy = f"{did_you_mean(split, known)}known splits: {', '.join(known)}"
+def _check_split(dataset: Dataset, split: str, splits: Iterable[str]) -> None:
+    if split not in splits:
+        remedy = f"{did_you_mean(split, splits)}known splits: {', '.join(splits)}"
         raise InputError(f"dataset {dataset.name}", f"unknown split '{split}'", remedy)
 
 
-def _read_all(recordings: list[Recording], workers: int, progress: Progress) -> Iterator[Reading]:
-    """The reading of each of them, in their order. Processes read recordings that are slow to read
-    and not in the cache. For quick recordings a process and the transfer of their sequences would
-    take longer.
+def _read_all(
+    recordings: list[RecordingSource], workers: int, progress: Progress
+) -> Iterator[Reading]:
+    """The readings of the recordings, in their order.
+
+    Processes read recordings that are slow to read and not in the cache. For quick recordings a
+    process and the transfer of their sequences would take longer.
     """
-    slow = [e for e in recordings if workers > 1 and e.slow and not _entry(e).is_file()]
-    readings = in_processes(read_recording, [(each,) for each in slow], workers, progress)
-    sent, died = {id(each) for each in slow}, False
+    slow = [
+        recording
+        for recording in recordings
+        if workers > 1 and recording.slow and not _entry(recording).is_file()
+    ]
+    readings = in_processes(read_recording, [(recording,) for recording in slow], workers, progress)
+    in_pool, died = {id(recording) for recording in slow}, False
     for recording in recordings:
-        if id(recording) in sent and not died:
+        if id(recording) in in_pool and not died:
             try:
                 reading = next(readings)
                 if reading.damage is not None:  # an error ends the work
@@ -166,25 +172,28 @@ def _read_all(recordings: list[Recording], workers: int, progress: Progress) -> 
 # --- one recording
 
 
-def read_recording(recording: Recording) -> Reading:
+def read_recording(recording: RecordingSource) -> Reading:
     """Read a recording, or its fallback if it is refused, through the cache."""
-    form: Recording | None = recording
-    before = Reading([])
+    form: RecordingSource | None = recording
+    previous = Reading([])
     while form is not None:
-        found = _read_form(form)
-        notes, refusals = before.notes + found.notes, before.refusals
-        if found.damage is not None:
-            return found._replace(notes=notes, refusals=refusals)
-        if found.sequences:
+        reading = _read_form(form)
+        notes, refusals = previous.notes + reading.notes, previous.refusals
+        if reading.damage is not None:
+            return reading._replace(notes=notes, refusals=refusals)
+        if reading.sequences:
             notes += tuple(f"{recording.name}: {form.form} is used: {why}" for why in refusals)
-            about = form.attributes
-            sequences = [e._replace(attributes=e.attributes | about) for e in found.sequences]
+            attributes = form.attributes
+            sequences = [
+                sequence._replace(attributes=sequence.attributes | attributes)
+                for sequence in reading.sequences
+            ]
             return Reading(sequences, notes)
-        before, form = Reading([], notes, refusals + found.refusals), form.fallback
-    return before
+        previous, form = Reading([], notes, refusals + reading.refusals), form.fallback
+    return previous
 
 
-def _read_form(form: Recording) -> Reading:
+def _read_form(form: RecordingSource) -> Reading:
     """Read a recording in this form, from the cache if it is there."""
     entry, reading = None, Reading([])
     with warnings.catch_warnings(record=True) as caught:
@@ -192,20 +201,20 @@ def _read_form(form: Recording) -> Reading:
         try:
             if form.slow:
                 entry = _entry(form)
-                if (kept := read_reading(entry)) is not None:
-                    return kept
+                if (cached := read_reading(entry)) is not None:
+                    return cached
             reading = Reading(form.read())
         except Refusal as refusal:
             reading = Reading([], refusals=(str(refusal),))
         except InputError as damage:
             reading = Reading([], damage=damage)
-    reading = reading._replace(notes=tuple(str(each.message) for each in caught))
+    reading = reading._replace(notes=tuple(str(warning.message) for warning in caught))
     if entry is not None and reading.damage is None:
         write_reading(entry, reading)
     return reading
 
 
-def _entry(form: Recording) -> Path:
+def _entry(form: RecordingSource) -> Path:
     """The file of this form of a recording in the cache."""
     return cache_entry(f"{form.name} {form.form}", form.files)
 
@@ -221,7 +230,7 @@ def in_processes(
     function: Callable[..., Result],
     items: list[tuple],
     workers: int | None,
-    progress: Progress = lambda share: None,
+    progress: Progress = silent,
 ) -> Generator[Result, None, None]:
     """`function(*item)` for every item, in their order, by `workers` processes; 1 starts none, and
     None chooses a useful number. A process that may have no children does the work itself.
@@ -251,10 +260,10 @@ def in_processes(
     # this process handles Ctrl-C.
     ignore = (signal.SIGINT, signal.SIG_IGN)
     pool = ProcessPoolExecutor(workers, initializer=signal.signal, initargs=ignore)
-    left, waiting = iter(items), deque[Future[Result]]()
+    pending, waiting = iter(items), deque[Future[Result]]()
     try:
         for number in range(1, len(items) + 1):
-            new = islice(left, workers + 2 - len(waiting))
+            new = islice(pending, workers + 2 - len(waiting))
             waiting.extend(pool.submit(function, *item) for item in new)
             result = waiting.popleft().result()
             progress(number / len(items))
@@ -272,10 +281,10 @@ def in_processes(
 # --- the recordings of a whole dataset: finding, checking, writing
 
 
-class Found(NamedTuple):
+class RecordingIndex(NamedTuple):
     """The recordings of one split, or of all."""
 
-    recordings: dict[str, Recording]
+    recordings: dict[str, RecordingSource]
     """Recordings by name."""
     splits: dict[str, tuple[str, ...]]
     """Split -> the names of its recordings."""
@@ -283,40 +292,42 @@ class Found(NamedTuple):
     """Warnings, and the splits that have no recording."""
 
 
-def find_recordings(dataset: Dataset, root: Path, wanted: str) -> Found:
+def find_recordings(dataset: Dataset, root: Path, split: str) -> RecordingIndex:
     """The recordings of a split, or of every split: "all".
 
     A dataset's own split of that name is every recording below the root. Raises `InputError` for an
     unknown split, or if no split has a recording.
     """
-    known = dataset.splits_at(root)
-    _check_split(dataset, wanted, dict.fromkeys((*known, "all")))
-    found, mistakes = Found({}, {}, []), {}
-    for split in known if wanted == "all" else (wanted,):
+    splits = dataset.splits_at(root)
+    _check_split(dataset, split, dict.fromkeys((*splits, "all")))
+    index, mistakes = RecordingIndex({}, {}, []), {}
+    for name in splits if split == "all" else (split,):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                here = dataset.recordings(root, split)
-                found.splits[split] = tuple(recording.name for recording in here)
-                for recording in here:
-                    found.recordings.setdefault(recording.name, recording)
+                recordings = dataset.recordings(root, name)
+                index.splits[name] = tuple(recording.name for recording in recordings)
+                for recording in recordings:
+                    index.recordings.setdefault(recording.name, recording)
             except InputError as error:
-                mistakes[split] = error
-        for text in (str(each.message) for each in caught):
-            found.notes.extend([text] if text not in found.notes else [])
-    if not found.recordings and len(mistakes) == (len(known) if wanted == "all" else 1):
+                mistakes[name] = error
+        for text in (str(warning.message) for warning in caught):
+            index.notes.extend([text] if text not in index.notes else [])
+    if not index.recordings and len(mistakes) == (len(splits) if split == "all" else 1):
         # A split of all recordings gives the best reason why there are none.
         raise mistakes.get("all", next(iter(mistakes.values())))
-    if not found.recordings:
-        raise _nothing(dataset, root, wanted, "recording")
-    reasons = {split: str(e).partition("; expected layout")[0] for split, e in mistakes.items()}
+    if not index.recordings:
+        raise _empty_split(dataset, root, split, "recording")
+    reasons = {
+        name: str(error).partition("; expected layout")[0] for name, error in mistakes.items()
+    }
     for reason in dict.fromkeys(reasons.values()):
-        splits = ", ".join(split for split, each in reasons.items() if each == reason)
-        found.notes.append(f"nothing in split {splits}: {reason}")
-    return found
+        names = ", ".join(name for name, other in reasons.items() if other == reason)
+        index.notes.append(f"nothing in split {names}: {reason}")
+    return index
 
 
-class Checked(NamedTuple):
+class CheckResult(NamedTuple):
     """The self-check of one sequence, or the reason why a recording has none."""
 
     name: str
@@ -334,8 +345,8 @@ def check(
     split: str = "all",
     pictures: Path | None = None,
     workers: int | None = 1,
-    progress: Progress = lambda share: None,
-) -> tuple[list[Checked], list[str]]:
+    progress: Progress = silent,
+) -> tuple[list[CheckResult], list[str]]:
     """Read every recording of a split (or of all) and check it. The result is the checked
     sequences, notes of the readers, and notes about missing recordings.
 
@@ -344,17 +355,19 @@ def check(
     recordings, splits, notes = find_recordings(dataset, root, split)
     items = [(recording, dataset, pictures) for recording in recordings.values()]
     results, checked = in_processes(_check_and_draw, items, workers, progress), []
-    for name, (rows, told) in zip(recordings, results, strict=True):
-        own = [each for each, names in splits.items() if name in names]
-        own = tuple(each for each in own if each != "all" or len(own) == 1)
-        checked += [row._replace(splits=own) for row in rows]
-        notes += [note for note in told if note not in notes]
+    for name, (rows, reader_notes) in zip(recordings, results, strict=True):
+        containing = [split_name for split_name, names in splits.items() if name in names]
+        containing = tuple(
+            split_name for split_name in containing if split_name != "all" or len(containing) == 1
+        )
+        checked += [row._replace(splits=containing) for row in rows]
+        notes += [note for note in reader_notes if note not in notes]
     return checked, notes
 
 
 def _check_and_draw(
-    recording: Recording, dataset: Dataset, pictures: Path | None
-) -> tuple[list[Checked], tuple[str, ...]]:
+    recording: RecordingSource, dataset: Dataset, pictures: Path | None
+) -> tuple[list[CheckResult], tuple[str, ...]]:
     """The rows of one recording, without its splits, and the reader's notes."""
     rows, reading = check_recording(recording, dataset)
     if pictures is not None:
@@ -366,20 +379,24 @@ def _check_and_draw(
     return rows, reading.notes
 
 
-def check_recording(recording: Recording, dataset: Dataset) -> tuple[list[Checked], Reading]:
+def check_recording(
+    recording: RecordingSource, dataset: Dataset
+) -> tuple[list[CheckResult], Reading]:
     """Read a recording and check its sequences; problems are reported, not raised."""
     reading = read_recording(recording)
-    reading = reading._replace(sequences=[*map(dataset.described, reading.sequences)])
+    reading = reading._replace(sequences=[*map(dataset.with_origin, reading.sequences)])
     checks = [(sequence.name, check_sequence(sequence, dataset)) for sequence in reading.sequences]
     if checks:
-        return [Checked(name, (), c, "; ".join(c.failures)) for name, c in checks], reading
+        return [
+            CheckResult(name, (), check, "; ".join(check.failures)) for name, check in checks
+        ], reading
     reasons = reading.refusals if reading.damage is None else (str(reading.damage),)
-    reason = "; ".join(each.removeprefix(f"{recording.name}: ") for each in reasons)
-    row = Checked(recording.name, (), None, reason or "no segment of it is long enough")
+    reason = "; ".join(text.removeprefix(f"{recording.name}: ") for text in reasons)
+    row = CheckResult(recording.name, (), None, reason or "no segment of it is long enough")
     return [row], reading
 
 
-class Converted(NamedTuple):
+class ConversionResult(NamedTuple):
     """The result of a conversion."""
 
     sequences: dict[str, list[str]]
@@ -398,8 +415,8 @@ def convert(
     split: str = "all",
     rate: float | None = None,
     workers: int | None = 1,
-    progress: Progress = lambda share: None,
-) -> Converted:
+    progress: Progress = silent,
+) -> ConversionResult:
     """Write the sequences that pass the self-check as one file each, and the list of each split.
 
     The folder `out` is written whole or not at all. It must be new or empty, or hold an earlier
@@ -427,27 +444,29 @@ def convert(
     with replacing_folder(out) as folder:
         items = [(recording, dataset, folder, rate) for recording in recordings.values()]
         results = in_processes(_check_and_write, items, workers, progress)
-        for name, (rows, told) in zip(recordings, results, strict=True):
+        for name, (rows, reader_notes) in zip(recordings, results, strict=True):
             used = [row for row in rows if not row.reason]
             for row in used:  # pieces of a recording have names of their own
                 check_file(row.name, name)
             stems[name] = [file_stem(row.name) for row in used]
             left_out |= {row.name: row.reason for row in rows if row.reason}
             hours += sum(row.check.duration for row in used if row.check) / 3600.0
-            notes += [note for note in told if note not in notes]
+            notes += [note for note in reader_notes if note not in notes]
         if not any(stems.values()):
             problem = f"none of {len(recordings)} recordings can be used"
             raise InputError(root, problem, "; ".join(list(left_out.values())[:3]))
         lists = {}
-        for each, names in splits.items():
-            lists[each] = [stem for name in names for stem in stems[name]]
-            if lists[each]:
-                write_text(folder / f"{each}.txt", "".join(f"{stem}\n" for stem in lists[each]))
+        for split_name, names in splits.items():
+            lists[split_name] = [stem for name in names for stem in stems[name]]
+            if lists[split_name]:
+                write_text(
+                    folder / f"{split_name}.txt", "".join(f"{stem}\n" for stem in lists[split_name])
+                )
             else:
                 problem = f"none of its {len(names)} recordings can be used"
-                notes.append(f"split '{each}' has no list: {problem}")
+                notes.append(f"split '{split_name}' has no list: {problem}")
         write_text(folder / CONVERSION, json.dumps(settings, indent=2) + "\n")
-    return Converted(lists, sum(map(len, stems.values())), hours, left_out, notes)
+    return ConversionResult(lists, sum(map(len, stems.values())), hours, left_out, notes)
 
 
 def _check_target(out: Path, settings: dict) -> None:
@@ -459,25 +478,25 @@ def _check_target(out: Path, settings: dict) -> None:
     if not out.is_dir() or not any(out.iterdir()):
         return
     try:
-        there = json.loads((out / CONVERSION).read_text(encoding="utf-8"))
+        earlier = json.loads((out / CONVERSION).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise InputError(out, "holds files of another origin", "choose another folder") from None
-    if there != settings:
-        named = ", ".join(f"{key} {value}" for key, value in there.items())
+    if earlier != settings:
+        named = ", ".join(f"{key} {value}" for key, value in earlier.items())
         raise InputError(out, f"holds another conversion ({named})", "choose another folder")
 
 
 def _check_and_write(
-    recording: Recording, dataset: Dataset, folder: Path, rate: float | None
-) -> tuple[list[Checked], tuple[str, ...]]:
+    recording: RecordingSource, dataset: Dataset, folder: Path, rate: float | None
+) -> tuple[list[CheckResult], tuple[str, ...]]:
     """Write the sequences of one recording that pass, and return its rows and the reader's
     notes."""
     rows, reading = check_recording(recording, dataset)
     # Requirements of the dataset, for the self-check of the converted recordings.
-    asked = {"check_pedestrian": dataset.pedestrian, "check_correlation": dataset.correlates}
+    requirements = {"check_pedestrian": dataset.pedestrian, "check_correlation": dataset.correlates}
     for sequence, row in zip(reading.sequences, rows, strict=False):
         if not row.reason:
-            sequence = sequence._replace(attributes=asked | sequence.attributes)
+            sequence = sequence._replace(attributes=requirements | sequence.attributes)
             sequence = sequence if rate is None else resample(sequence, rate)
             write_hdf5(folder / f"{file_stem(sequence.name)}.h5", sequence)
     return rows, reading.notes

@@ -81,8 +81,8 @@ def overview(sequence: Sequence, check: SelfCheck) -> Figure:
 
 def _over_time(axes: Axes, sequence: Sequence, values: np.ndarray, **style: Any) -> None:
     """Draw one value per sample, but at most as many as the picture has pixels."""
-    every = max(len(values) // POINTS, 1)
-    axes.plot((sequence.time - sequence.time[0])[::every], values[::every], **style)
+    stride = max(len(values) // POINTS, 1)
+    axes.plot((sequence.time - sequence.time[0])[::stride], values[::stride], **style)
 
 
 def _speed(axes: Axes, sequence: Sequence) -> None:
@@ -106,14 +106,14 @@ def _gyro(axes: Axes, sequence: Sequence) -> None:
 
 def _plan(axes: Axes, sequence: Sequence) -> None:
     """The trajectory from above."""
-    place = np.where(sequence.valid[:, None], sequence.position, np.nan)[:, :2]
-    known = place[finite_rows(place)]
-    if len(known):
-        every = max(len(place) // POINTS, 1)
-        axes.plot(place[::every, 0], place[::every, 1], color=BLUE, lw=0.9)
+    position = np.where(sequence.valid[:, None], sequence.position, np.nan)[:, :2]
+    finite = position[finite_rows(position)]
+    if len(finite):
+        stride = max(len(position) // POINTS, 1)
+        axes.plot(position[::stride, 0], position[::stride, 1], color=BLUE, lw=0.9)
         marks: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 4}
-        axes.plot(*known[0], "o", mfc="white", ms=8, mew=1.8, label="start", **marks)
-        axes.plot(*known[-1], "s", ms=7, label="end", **marks)
+        axes.plot(*finite[0], "o", mfc="white", ms=8, mew=1.8, label="start", **marks)
+        axes.plot(*finite[-1], "s", ms=7, label="end", **marks)
         axes.legend(loc="best", fontsize=8, framealpha=0.9)
         axes.margins(0.08)
     else:

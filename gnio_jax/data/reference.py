@@ -15,7 +15,7 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.resampling import known_at, runs_within, splined
+from gnio_jax.data.resampling import covered_at, interpolate_splines, runs_within
 from gnio_jax.numerics import (
     integrate_gyro,
     interpolate,
@@ -69,9 +69,9 @@ class Poses(NamedTuple):
     def rows(self, rows: np.ndarray | slice) -> Poses:
         """The poses in some rows."""
         velocity = None if self.velocity is None else self.velocity[rows]
-        place, attitude = self.position[rows], self.attitude[rows]
+        position, attitude = self.position[rows], self.attitude[rows]
         return self._replace(
-            time=self.time[rows], attitude=attitude, position=place, velocity=velocity
+            time=self.time[rows], attitude=attitude, position=position, velocity=velocity
         )
 
 
@@ -105,11 +105,13 @@ def reference_at(
     by more than `max_drift` (m).
     """
     return (
-        _fused(clock, gyro, poses) if poses.noisy else _splined(clock, poses, max_speed, max_drift)
+        _fuse_reference(clock, gyro, poses)
+        if poses.noisy
+        else _spline_reference(clock, poses, max_speed, max_drift)
     )
 
 
-def _splined(
+def _spline_reference(
     clock: Float[np.ndarray, " m"], poses: Poses, max_speed: float, max_drift: float
 ) -> Reference:
     """Splines within unbroken runs. A run also ends where the position contradicts the velocity,
@@ -120,14 +122,14 @@ def _splined(
     parts = [one_sign(quaternions(poses.attitude)), poses.position]
     if poses.velocity is not None:
         parts.append(poses.velocity)
-        moved = midpoints(poses.velocity) * steps[:, None]
-        contradiction = np.linalg.norm(np.diff(poses.position, axis=0) - moved, axis=1)
+        integrated = midpoints(poses.velocity) * steps[:, None]
+        contradiction = np.linalg.norm(np.diff(poses.position, axis=0) - integrated, axis=1)
         # Over long steps the trapezoidal rule is only a rough integral of the velocity.
         broken |= contradiction > LARGEST_JUMP + 2.0 * steps**2
     # Attitudes are interpolated by splines too: at 30 Hz the shorter arc between two of them has an
     # error of half a degree in a walker's hand. There a spline of quaternions is as accurate as one
     # of rotations.
-    values = splined(stamps, np.concatenate(parts, axis=1), clock, broken)
+    values = interpolate_splines(stamps, np.concatenate(parts, axis=1), clock, broken)
     orientation, position, velocity = np.split(values, [4, 7], axis=1)
     orientation = orientation / np.linalg.norm(orientation, axis=1, keepdims=True)
     valid = np.zeros(len(clock), dtype=bool)
@@ -154,15 +156,15 @@ def _drifts(
     """True in every second in which position and integrated velocity differ by more than `most`
     (m), for example where a satellite receiver corrects itself by jumps."""
     second = round(1.0 / step)
-    moved = np.cumsum(midpoints(velocity) * step, axis=0)
-    error = position - np.concatenate([np.zeros((1, 3)), moved])
-    far = np.linalg.norm(error[second:] - error[:-second], axis=1) > most
+    integrated = np.cumsum(midpoints(velocity) * step, axis=0)
+    error = position - np.concatenate([np.zeros((1, 3)), integrated])
+    drifting = np.linalg.norm(error[second:] - error[:-second], axis=1) > most
     middle = np.zeros(len(position), dtype=bool)
-    middle[second // 2 : second // 2 + len(far)] = far
+    middle[second // 2 : second // 2 + len(drifting)] = drifting
     return within(middle, second // 2)
 
 
-def _fused(
+def _fuse_reference(
     clock: Float[np.ndarray, " m"], gyro: Float[np.ndarray, "m 3"], poses: Poses
 ) -> Reference:
     """The reference with the attitude carried by the gyro between the tracker's, and with smoothed
@@ -171,29 +173,29 @@ def _fused(
     bridge = longest_trusted(poses.time)
     # Single poses between gaps are unreliable.
     runs = stretches(np.diff(poses.time) > usual)
-    sure = [np.arange(run.start, run.stop) for run in runs if run.stop - run.start >= SHORTEST_RUN]
-    poses = poses.rows(np.concatenate(sure)) if sure else poses
+    rows = [np.arange(run.start, run.stop) for run in runs if run.stop - run.start >= SHORTEST_RUN]
+    poses = poses.rows(np.concatenate(rows)) if rows else poses
     stamps, unknown = poses.time, Reference.none(len(clock))
-    measured = known_at(stamps, clock, usual)
+    measured = covered_at(stamps, clock, usual)
     if measured.sum() < SHORTEST_RUN:
         return unknown
-    turned = slerp(clock, stamps, poses.attitude)
+    tracked = slerp(clock, stamps, poses.attitude)
     # The gyro's constant bias would distort the correction at its ends.
-    both = measured[:-1] & measured[1:]
-    drift = (midpoints(gyro) - turns_between(turned) / step)[both]
+    adjacent = measured[:-1] & measured[1:]
+    drift = (midpoints(gyro) - turns_between(tracked) / step)[adjacent]
     rate = gyro - np.median(drift, axis=0) if len(drift) else gyro
-    fused, believed = fuse_attitude(integrate_gyro(rate, step), turned, measured, step)
+    fused, trusted = fuse_attitude(integrate_gyro(rate, step), tracked, measured, step)
     arm = fused.apply(poses.lever)
-    place = splined(stamps, poses.position, clock, np.diff(stamps) > usual) + arm
-    smoothed, velocity, kept = smooth_positions(place, measured & believed, step)
+    position = interpolate_splines(stamps, poses.position, clock, np.diff(stamps) > usual) + arm
+    smoothed, velocity, used = smooth_positions(position, measured & trusted, step)
     # A pose that the smoother rejects is bridged like a lost one. If few poses are left between
     # gaps, the smoother may oscillate; its result must stay near the measured poses.
-    sure = np.flatnonzero(kept)
-    if len(sure) < SHORTEST_RUN:
+    rows = np.flatnonzero(used)
+    if len(rows) < SHORTEST_RUN:
         return unknown
-    close = np.linalg.norm(smoothed - interpolate(clock, clock[sure], place[sure]), axis=1)
+    close = np.linalg.norm(smoothed - interpolate(clock, clock[rows], position[rows]), axis=1)
     gap = bridge + 2.0 * step  # between rows of the clock that are beside the poses
-    bridged = known_at(clock[sure], clock, gap) & known_at(stamps, clock, bridge)
+    bridged = covered_at(clock[rows], clock, gap) & covered_at(stamps, clock, bridge)
     return Reference(quaternions(fused), smoothed, velocity, bridged & (close < LARGEST_JUMP))
 
 
@@ -208,7 +210,7 @@ def longest_trusted(stamps: Float[np.ndarray, " n"]) -> float:
 def fuse_attitude(
     integrated: Rotation,
     measured: Rotation,
-    good: Bool[np.ndarray, " n"],
+    usable: Bool[np.ndarray, " n"],
     step: float,
 ) -> tuple[Rotation, Bool[np.ndarray, " n"]]:
     """Integrated attitude times a smooth correction towards the measured one, and where the
@@ -220,13 +222,13 @@ def fuse_attitude(
     interpolated, so that the gyro bridges the gap.
     """
     correction = quaternions(measured * integrated.inv())
-    correction[good] = one_sign(correction[good])
-    rows = np.arange(len(good))
+    correction[usable] = one_sign(correction[usable])
+    rows = np.arange(len(usable))
 
-    def filled(believed: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n 4"]:
-        return interpolate(rows, np.flatnonzero(believed), correction[believed])
+    def interpolate_over(trusted: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n 4"]:
+        return interpolate(rows, np.flatnonzero(trusted), correction[trusted])
 
-    course, believed = filled(good), good
+    course, trusted = interpolate_over(usable), usable
     for flip, sigma, least in [
         *[(np.radians(FLIP_DEGREES), COURSE_SECONDS / step, np.radians(1.0))] * 4,
         *[(np.pi, CORRECTION_SECONDS / step, np.radians(0.3))] * 3,
@@ -235,13 +237,15 @@ def fuse_attitude(
         angle = 2.0 * np.arccos(np.clip((correction * course).sum(axis=1), -1.0, 1.0))
         # Flips remain flips in later rounds; a median that rejects four fifths of all samples is
         # not used.
-        near = (good if flip < np.pi else believed) & (angle < flip)
-        believed = near if near.sum() > 0.2 * good.sum() else good
-        scale = max(3.0 * float(np.median(angle[believed])), least)
-        weight = np.where(believed, 1.0 / (1.0 + (angle / scale) ** 2) ** 2, 1.0)[:, None]
-        course = gaussian_filter1d(weight * filled(believed), sigma, axis=0, mode="nearest")
+        near = (usable if flip < np.pi else trusted) & (angle < flip)
+        trusted = near if near.sum() > 0.2 * usable.sum() else usable
+        scale = max(3.0 * float(np.median(angle[trusted])), least)
+        weight = np.where(trusted, 1.0 / (1.0 + (angle / scale) ** 2) ** 2, 1.0)[:, None]
+        course = gaussian_filter1d(
+            weight * interpolate_over(trusted), sigma, axis=0, mode="nearest"
+        )
         course /= np.linalg.norm(course, axis=1, keepdims=True)
-    return rotations(course) * integrated, believed
+    return rotations(course) * integrated, trusted
 
 
 def one_sign(wxyz: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 4"]:
@@ -256,7 +260,7 @@ def one_sign(wxyz: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 4"]:
 
 def smooth_positions(
     position: Float[np.ndarray, "n 3"],
-    good: Bool[np.ndarray, " n"],
+    usable: Bool[np.ndarray, " n"],
     step: float,
     cutoff: float = 12.0,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
@@ -275,15 +279,15 @@ def smooth_positions(
         for b in range(a, 4):
             smoothness[3 - (b - a), b : count - 3 + b] += stencil[a] * stencil[b]
     smoothness *= (2.0 * np.sin(np.pi * cutoff * step)) ** -6
-    filled = np.where(good[:, None], position, 0.0)
-    weight = good.astype(float)
+    filled = np.where(usable[:, None], position, 0.0)
+    weight = usable.astype(float)
     smoothed = filled
     for _ in range(5):
         system = smoothness.copy()
         system[-1] += weight + 1e-9  # the diagonal
         smoothed = solveh_banded(system, weight[:, None] * filled)
         distance = np.linalg.norm(filled - smoothed, axis=1)
-        scale = max(4.0 * float(np.median(distance[good])), 2e-3) if good.any() else 1.0
-        weight = good / (1.0 + (distance / scale) ** 2) ** 2
+        scale = max(4.0 * float(np.median(distance[usable])), 2e-3) if usable.any() else 1.0
+        weight = usable / (1.0 + (distance / scale) ** 2) ** 2
     velocity = np.gradient(smoothed, step, axis=0, edge_order=2)
-    return smoothed, velocity, good & (weight > 0.1)
+    return smoothed, velocity, usable & (weight > 0.1)

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.decimation import decimation_factor, low_pass
-from gnio_jax.numerics import convolved, finite_rows, quaternions, rotations, stretches
+from gnio_jax.numerics import convolve, finite_rows, quaternions, rotations, stretches
 from gnio_jax.types import Sequence
 
 SPLINE_INTERVALS = 3.5
@@ -45,7 +45,7 @@ def uniform_clock(first: float, last: float, rate: float) -> Float[np.ndarray, "
     return clock
 
 
-def resampled(
+def resample_imu(
     time: Float[np.ndarray, " n"],
     values: Float[np.ndarray, "n w"],
     clock: Float[np.ndarray, " m"],
@@ -59,21 +59,21 @@ def resampled(
     """
     step = float(np.median(np.diff(time)))
     factor, broken = decimation_factor(1.0 / step, rate), np.diff(time) > SPLINE_INTERVALS * step
-    measured = known_at(time, clock, longest_bridge(1.0 / step))
+    measured = covered_at(time, clock, longest_bridge(1.0 / step))
     if factor == 1:
-        return splined(time, values, clock, broken), measured
+        return interpolate_splines(time, values, clock, broken), measured
     fine = clock[0] + np.arange((len(clock) - 1) * factor + 1) / (rate * factor)
-    fine = splined(time, values, np.minimum(fine, time[-1]), broken)
+    fine = interpolate_splines(time, values, np.minimum(fine, time[-1]), broken)
     taps = low_pass(factor)
     half = len(taps) // 2
     padded = np.pad(fine, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
-    return convolved(padded, taps)[::factor], measured
+    return convolve(padded, taps)[::factor], measured
 
 
 def resample(sequence: Sequence, rate: float) -> Sequence:
     """`sequence` on a uniform clock of `rate` Hz that starts at its first stamp.
 
-    A sequence on such a clock is unchanged. The IMU is resampled by `resampled`, position and
+    A sequence on such a clock is unchanged. The IMU is resampled by `resample_imu`, position and
     velocity by splines, and attitudes by slerp along the shorter arc. `valid` is False between
     samples of which one is invalid, and in gaps of the IMU, where `imu_valid` is also False. A
     reference value next to a NaN is NaN. Waypoints have stamps of their own and do not change.
@@ -86,19 +86,19 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
     bridge = longest_bridge(1.0 / step)
     broken = (np.diff(time) > SPLINE_INTERVALS * step) | ~(valid[1:] & valid[:-1])
     imu = np.concatenate([sequence.gyro, sequence.accel], axis=1)
-    imu, measured = resampled(time, imu, clock, rate)
+    imu, measured = resample_imu(time, imu, clock, rate)
     if sequence.imu_valid is not None:
-        measured = known_at(time, clock, bridge, sequence.imu_valid)
+        measured = covered_at(time, clock, bridge, sequence.imu_valid)
     device = sequence.device_orientation
     return sequence._replace(
         time=clock,
         gyro=imu[:, :3],
         accel=imu[:, 3:],
-        orientation=slerped(time, sequence.orientation, clock),
-        position=splined(time, sequence.position, clock, broken),
-        velocity=splined(time, sequence.velocity, clock, broken),
-        valid=known_at(time, clock, bridge, valid),
-        device_orientation=None if device is None else slerped(time, device, clock),
+        orientation=interpolate_attitudes(time, sequence.orientation, clock),
+        position=interpolate_splines(time, sequence.position, clock, broken),
+        velocity=interpolate_splines(time, sequence.velocity, clock, broken),
+        valid=covered_at(time, clock, bridge, valid),
+        device_orientation=None if device is None else interpolate_attitudes(time, device, clock),
         imu_valid=None if measured.all() else measured,
     )
 
@@ -106,31 +106,31 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
 # --- between samples
 
 
-def between(
+def bracket(
     time: Float[np.ndarray, " n"], clock: Float[np.ndarray, " m"]
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Left row, right row and relative position between them for each stamp of `clock`. Left and
-    right are the same if the stamp is that of a sample to 1 µs."""
-    right = np.clip(np.searchsorted(time, clock), 1, len(time) - 1)
-    left = np.where(time[right] - clock <= SAME_STAMP, right, right - 1)
-    right = np.where(clock - time[left] <= SAME_STAMP, left, right)
-    span = time[right] - time[left]
-    share = np.divide(clock - time[left], span, out=np.zeros_like(clock), where=span > 0)
-    return left, right, np.clip(share, 0.0, 1.0)
+    """The rows below and above each stamp of `clock`, and its relative position between them. Both
+    rows are the same if the stamp is that of a sample to 1 µs."""
+    upper = np.clip(np.searchsorted(time, clock), 1, len(time) - 1)
+    lower = np.where(time[upper] - clock <= SAME_STAMP, upper, upper - 1)
+    upper = np.where(clock - time[lower] <= SAME_STAMP, lower, upper)
+    span = time[upper] - time[lower]
+    share = np.divide(clock - time[lower], span, out=np.zeros_like(clock), where=span > 0)
+    return lower, upper, np.clip(share, 0.0, 1.0)
 
 
-def known_at(
+def covered_at(
     time: Float[np.ndarray, " n"],
     clock: Float[np.ndarray, " m"],
     longest: float,
-    known: Bool[np.ndarray, " n"] | bool = True,
+    present: Bool[np.ndarray, " n"] | bool = True,
 ) -> Bool[np.ndarray, " m"]:
-    """Where a clock is between two samples that are both `known` and at most `longest` (s)
+    """Where a clock is between two samples that are both `present` and at most `longest` (s)
     apart."""
-    left, right, _ = between(time, clock)
+    lower, upper, _ = bracket(time, clock)
     covered = (clock >= time[0] - SAME_STAMP) & (clock <= time[-1] + SAME_STAMP)
-    known = np.broadcast_to(known, time.shape)
-    return known[left] & known[right] & (time[right] - time[left] <= longest) & covered
+    present = np.broadcast_to(present, time.shape)
+    return present[lower] & present[upper] & (time[upper] - time[lower] <= longest) & covered
 
 
 def runs_within(
@@ -149,7 +149,7 @@ def runs_within(
                 yield run, slice(int(start), int(stop))
 
 
-def splined(
+def interpolate_splines(
     time: Float[np.ndarray, " n"],
     values: Float[np.ndarray, "n w"],
     clock: Float[np.ndarray, " m"],
@@ -162,28 +162,28 @@ def splined(
     """
     if len(clock) == len(time) and np.abs(clock - time).max() <= SAME_STAMP:
         return values
-    left, right, share = between(time, clock)
+    lower, upper, share = bracket(time, clock)
     share = share[:, None]
-    lines = (1.0 - share) * values[left] + share * values[right]
-    result = np.where(share > 0, lines, values[left])
-    for run, there in runs_within(time, broken, clock):
+    lines = (1.0 - share) * values[lower] + share * values[upper]
+    resampled = np.where(share > 0, lines, values[lower])
+    for run, rows in runs_within(time, broken, clock):
         # A spline starts at 0, because large stamps would cost its coefficients digits.
-        own = time[run] - time[run.start]
-        at = np.clip(clock[there] - time[run.start], 0.0, own[-1])
-        result[there] = CubicSpline(own, values[run], axis=0)(at)
-    return result
+        run_time = time[run] - time[run.start]
+        at = np.clip(clock[rows] - time[run.start], 0.0, run_time[-1])
+        resampled[rows] = CubicSpline(run_time, values[run], axis=0)(at)
+    return resampled
 
 
-def slerped(
+def interpolate_attitudes(
     time: Float[np.ndarray, " n"], wxyz: Float[np.ndarray, "n 4"], clock: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m 4"]:
     """Attitudes on the shorter arc between samples, for any signs of the quaternions; NaN next to a
     NaN, and the outermost attitudes beyond the ends."""
-    left, right, share = between(time, clock)
-    result = np.full((len(clock), 4), np.nan)
-    known = finite_rows(wxyz[left]) & finite_rows(wxyz[right])
-    if known.any():
-        start, end = rotations(wxyz[left[known]]), rotations(wxyz[right[known]])
-        turn = (start.inv() * end).as_rotvec() * share[known, None]
-        result[known] = quaternions(start * Rotation.from_rotvec(turn))
-    return result
+    lower, upper, share = bracket(time, clock)
+    attitudes = np.full((len(clock), 4), np.nan)
+    finite = finite_rows(wxyz[lower]) & finite_rows(wxyz[upper])
+    if finite.any():
+        start, end = rotations(wxyz[lower[finite]]), rotations(wxyz[upper[finite]])
+        turn = (start.inv() * end).as_rotvec() * share[finite, None]
+        attitudes[finite] = quaternions(start * Rotation.from_rotvec(turn))
+    return attitudes

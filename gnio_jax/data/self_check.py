@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.dataset import Dataset
 from gnio_jax.data.physics import implausible
 from gnio_jax.numerics import (
-    convolved,
+    convolve,
     integrate_gyro,
     last_true,
     midpoints,
@@ -89,16 +89,18 @@ def self_check(sequence: Sequence, pedestrian: bool = True, correlates: bool = T
     failures = []
     if not gravity_error <= MOST_GRAVITY_ERROR:
         mean = ", ".join(f"{value:.2f}" for value in check.gravity_mean)
-        off = f"off (0, 0, 9.81) by {gravity_error:.2f}"
+        deviation = f"off (0, 0, 9.81) by {gravity_error:.2f}"
         clipped = float(sequence.attributes.get("accel_clipped", 0.0))
         why = f" (its accelerometer clips in {clipped:.0%} of the samples)" if clipped else ""
-        failures.append(f"mean of R·accel is ({mean}) m/s², {off}{why}")
+        failures.append(f"mean of R·accel is ({mean}) m/s², {deviation}{why}")
     window = f"window of {WINDOW_SECONDS:g} s"
     if not has_windows and check.duration >= 2.0 * WINDOW_SECONDS:
         failures.append(f"no {window} has a valid reference at its ends")
     elif degrees > MOST_GYRO_DEGREES + MOST_GYRO_SCALE * turned:
-        off = f"off the reference orientation by {degrees:.1f}°"
-        failures.append(f"gyro is {off} in the median {window}, in which it turns {turned:.0f}°")
+        deviation = f"off the reference orientation by {degrees:.1f}°"
+        failures.append(
+            f"gyro is {deviation} in the median {window}, in which it turns {turned:.0f}°"
+        )
     if pedestrian and check.median_speed > FASTEST_MEDIAN:
         failures.append(f"median speed is {check.median_speed:.1f} m/s, too fast for a pedestrian")
     # The correlation is NaN if the positions do not move at all.
@@ -114,10 +116,10 @@ def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
     The attributes `check_pedestrian` and `check_correlation` of a converted recording have
     priority, because they are those of its original dataset.
     """
-    about = sequence.attributes
-    pedestrian = bool(about.get("check_pedestrian", dataset.pedestrian))
+    attributes = sequence.attributes
+    pedestrian = bool(attributes.get("check_pedestrian", dataset.pedestrian))
     check = self_check(
-        sequence, pedestrian, bool(about.get("check_correlation", dataset.correlates))
+        sequence, pedestrian, bool(attributes.get("check_correlation", dataset.correlates))
     )
     if dataset.needs_reference or sequence.valid.any():
         return check
@@ -134,14 +136,14 @@ def _with_reference(
     # The reference's mean acceleration, from the velocities at the ends of its valid stretches.
     first, stop = spans(valid).T
     seconds = float((stop - 1 - first).sum()) * step
-    gained = (velocity[stop - 1] - velocity[first]).sum(axis=0)
+    velocity_gain = (velocity[stop - 1] - velocity[first]).sum(axis=0)
     starts, gyro_errors = gyro_windows(sequence)
     # Windows that all overlap count as one window, and one bias can explain any single window.
-    apart = starts.size > 0 and float(np.ptp(starts)) > WINDOW_SECONDS - 0.5 * step
+    independent = starts.size > 0 and float(np.ptp(starts)) > WINDOW_SECONDS - 0.5 * step
     correlation, strength = _accel_correlation(sequence, force, step)
     check = check._replace(
-        gravity_mean=force[valid].mean(axis=0) - gained / max(seconds, step),
-        gyro_consistency_degrees=float(np.median(gyro_errors)) if apart else np.nan,
+        gravity_mean=force[valid].mean(axis=0) - velocity_gain / max(seconds, step),
+        gyro_consistency_degrees=float(np.median(gyro_errors)) if independent else np.nan,
         median_speed=float(np.median(np.linalg.norm(velocity[valid], axis=1))),
         accel_correlation_horizontal=correlation,
         share_valid=float(valid.mean()),
@@ -254,7 +256,7 @@ def _accel_correlation(sequence: Sequence, force: np.ndarray, step: float) -> tu
     position = sequence.position[:, :2]
     geometric = (position[2 * h :] - 2.0 * position[h:-h] + position[: -2 * h]) / (h * step) ** 2
     triangle = 1.0 - np.abs(np.arange(-h, h + 1)) / h
-    inertial = convolved(force[:, :2], triangle / triangle.sum())
+    inertial = convolve(force[:, :2], triangle / triangle.sum())
     broken = np.concatenate([[0], np.cumsum(~sequence.valid)])
     whole = broken[2 * h + 1 :] == broken[: -2 * h - 1]
     if whole.sum() < 2 * h:

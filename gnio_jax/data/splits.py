@@ -31,33 +31,33 @@ def find_folders(root: Path, is_recording: Callable[[Path], bool]) -> dict[str, 
     If several have the same name, the first in alphabetical order is used, with a warning about the
     others.
     """
-    found: dict[str, Path] = {}
-    seen, again = set(), []
-    for place, folders, _ in os.walk(root, followlinks=True):
-        real, folder = os.path.realpath(place), Path(place)
-        recording = is_recording(folder)
-        if real in seen or recording:
+    recordings: dict[str, Path] = {}
+    visited, duplicates = set(), []
+    for path, folders, _ in os.walk(root, followlinks=True):
+        real, folder = os.path.realpath(path), Path(path)
+        matches = is_recording(folder)
+        if real in visited or matches:
             folders.clear()
         folders.sort()
-        if recording and real not in seen and found.setdefault(folder.name, folder) != folder:
-            again.append(folder)
-        seen.add(real)
-    if again:
-        problem = f"{len(again)} recordings are there twice, e.g. {again[0]}"
-        warnings.warn(f"{root}: {problem}; {found[again[0].name]} is used", stacklevel=3)
-    return found
+        if matches and real not in visited and recordings.setdefault(folder.name, folder) != folder:
+            duplicates.append(folder)
+        visited.add(real)
+    if duplicates:
+        problem = f"{len(duplicates)} recordings are there twice, e.g. {duplicates[0]}"
+        warnings.warn(f"{root}: {problem}; {recordings[duplicates[0].name]} is used", stacklevel=3)
+    return recordings
 
 
 def find_list(root: Path, name: str) -> Path:
     """The list file `name` at `root`, in its folder `lists`, or else anywhere below; `root / name`
     if there is none."""
-    for place in (root / name, root / "lists" / name):
-        if place.is_file():
-            return place
+    for path in (root / name, root / "lists" / name):
+        if path.is_file():
+            return path
     return next(iter(sorted(root.rglob(name))), root / name)
 
 
-def held_out(people: Mapping[str, str], share: float = 0.1, most: float = 0.25) -> set[str]:
+def hold_out(people: Mapping[str, str], share: float = 0.1, most: float = 0.25) -> set[str]:
     """Names of the recordings for validation, from recording -> person: whole people, in an order
     drawn with a fixed seed.
 
@@ -70,21 +70,23 @@ def held_out(people: Mapping[str, str], share: float = 0.1, most: float = 0.25) 
         order = np.random.default_rng(SEED).permutation(sorted(counts)) if counts else []
         held: set[str] = set()
         for person in order:
-            taken = sum(counts[other] for other in held)
-            if taken < share * len(people) and taken + counts[str(person)] <= most * len(people):
+            chosen = sum(counts[other] for other in held)
+            if chosen < share * len(people) and chosen + counts[str(person)] <= most * len(people):
                 held.add(str(person))
         if held:
             return {name for name, person in owner.items() if person in held}
     return set()
 
 
-def drawn(seed: str, name: str) -> float:
+def draw_share(seed: str, name: str) -> float:
     """A number from 0 to 1 that depends only on a name, so that splits by it are the same in every
     copy of the data."""
     return int(hashlib.sha256(f"{seed} {name}".encode()).hexdigest()[:8], 16) / 2**32
 
 
-def listed(path: Path, find: Callable[[str], Path | None], root: Path, layout: str) -> list[Path]:
+def read_list(
+    path: Path, find: Callable[[str], Path | None], root: Path, layout: str
+) -> list[Path]:
     """The recordings that `find` gives for the entries of a list file, one per line: the place of a
     recording, or None if this copy lacks it.
 
@@ -98,20 +100,20 @@ def listed(path: Path, find: Callable[[str], Path | None], root: Path, layout: s
         reason = getattr(error, "strerror", None) or error
         raise InputError(path, f"the list cannot be read ({reason})", layout) from None
     named = (line.strip() for line in lines if line.strip() and not line.startswith("#"))
-    found: dict[str, Path | None] = {}
+    recordings: dict[str, Path | None] = {}
     for entry in named:
         try:
-            found[entry] = find(entry)
+            recordings[entry] = find(entry)
         except OSError:  # for example, the name is too long
-            found[entry] = None
-    absent = [shortened(entry) for entry, place in found.items() if place is None]
-    if len(absent) == len(found):
-        raise InputError(path, f"none of its {len(found)} sequences is below {root}", layout)
+            recordings[entry] = None
+    absent = [shortened(entry) for entry, recording in recordings.items() if recording is None]
+    if len(absent) == len(recordings):
+        raise InputError(path, f"none of its {len(recordings)} sequences is below {root}", layout)
     if absent:
-        some = ", ".join([*absent[:3], *(["..."] if len(absent) > 3 else [])])
-        problem = f"{len(absent)} of {len(found)} listed sequences are absent: {some}"
+        examples = ", ".join([*absent[:3], *(["..."] if len(absent) > 3 else [])])
+        problem = f"{len(absent)} of {len(recordings)} listed sequences are absent: {examples}"
         warnings.warn(f"{path}: {problem}", stacklevel=3)
-    return [place for place in found.values() if place is not None]
+    return [recording for recording in recordings.values() if recording is not None]
 
 
 # --- folds
@@ -124,20 +126,24 @@ class Fold(NamedTuple):
 
     split: str
     number: int
-    """From 0 to `count` − 1."""
+    """Number of the fold, from 0 to `count` − 1."""
     count: int
     left_out: bool
 
     def select(self, sequences: Iterable[Sequence]) -> list[Sequence]:
         """The split's sequences that belong to the fold. All sequences must be given, because a
         fold depends on the lengths of all. Raises `InputError` for a fold without a sequence."""
-        every = list(sequences)
-        fold_of = folds(every, self.count)
+        members = list(sequences)
+        fold_of = folds(members, self.count)
         if self.number not in fold_of.values():
             problem = f"has nothing in fold {self.number} of {self.count}"
             remedy = f"there are {len(fold_of)} people or sessions to share; take fewer folds"
             raise InputError(f"split '{self.split}'", problem, remedy)
-        return [e for e in every if (fold_of[group(e)] == self.number) != self.left_out]
+        return [
+            sequence
+            for sequence in members
+            if (fold_of[group(sequence)] == self.number) != self.left_out
+        ]
 
 
 def parse_fold(split: str) -> Fold | None:
@@ -145,10 +151,10 @@ def parse_fold(split: str) -> Fold | None:
 
     Raises `InputError` for a fold that does not exist.
     """
-    found = _NOTATION.fullmatch(split)
-    if found is None:
+    match = _NOTATION.fullmatch(split)
+    if match is None:
         return None
-    name, sign, number, count = found.groups()
+    name, sign, number, count = match.groups()
     if not int(number) < int(count):
         last = int(count) - 1
         raise InputError(f"split '{split}'", "has no such fold", f"they are numbered 0 to {last}")
@@ -169,8 +175,8 @@ def folds(sequences: Iterable[Sequence], count: int) -> dict[str, int]:
     for sequence in sequences:
         length = float(sequence.time[-1] - sequence.time[0])
         seconds[group(sequence)] = seconds.get(group(sequence), 0.0) + length
-    filled, found = [0.0] * count, {}
+    loads, fold_of = [0.0] * count, {}
     for name in sorted(seconds, key=lambda name: (-seconds[name], name)):
-        found[name] = min(range(count), key=lambda fold: filled[fold])
-        filled[found[name]] += seconds[name]
-    return found
+        fold_of[name] = min(range(count), key=lambda fold: loads[fold])
+        loads[fold_of[name]] += seconds[name]
+    return fold_of

@@ -49,8 +49,8 @@ def validate(sequence: Sequence, source: object) -> Sequence:
     orientation = check_unit_norm(sequence.orientation, sequence.valid, "orientation", source)
     device = sequence.device_orientation
     if device is not None:
-        known = np.asarray(np.isfinite(device).all(axis=1))
-        device = check_unit_norm(device, known, "device_orientation", source)
+        present = np.asarray(np.isfinite(device).all(axis=1))
+        device = check_unit_norm(device, present, "device_orientation", source)
     return sequence._replace(orientation=orientation, device_orientation=device)
 
 
@@ -89,8 +89,8 @@ def _check_shapes(sequence: Sequence, source: object) -> None:
     for field in ("valid", "imu_valid"):
         mask = getattr(sequence, field)
         if mask is not None and (mask.shape != (count,) or mask.dtype != np.bool_):
-            found = f"{mask.dtype} of shape {mask.shape}"
-            raise InputError(source, f"field '{field}' must be {count} booleans, found {found}")
+            actual = f"{mask.dtype} of shape {mask.shape}"
+            raise InputError(source, f"field '{field}' must be {count} booleans, found {actual}")
 
 
 def _check_motion(sequence: Sequence, source: object) -> None:
@@ -175,7 +175,8 @@ def check_gyro(
 def check_accel(
     accel: Float[np.ndarray, "n 3"], source: object, time: Float[np.ndarray, " n"] | None = None
 ) -> None:
-    """The same for an accelerometer, m/s², including gravity."""
+    """Raise `InputError` if the magnitudes show that an accelerometer is not in m/s², or that they
+    lack gravity. Messages name samples as those of `check_gyro` do."""
     force = float(np.median(np.linalg.norm(accel, axis=1)))
     problem, remedy = "", "give the specific force in m/s², gravity included"
     if 0.5 < force < 2.0:

@@ -52,7 +52,7 @@ SHORTEST_SECONDS = 1.0
 """Shortest continuous time of poses for which a walk is used, s."""
 
 
-class Walk(NamedTuple):
+class Reckoning(NamedTuple):
     """Dead reckoning by the phone alone, in a level frame of arbitrary yaw."""
 
     time: Float[np.ndarray, " n"]
@@ -90,8 +90,8 @@ def with_poses(sequence: Sequence) -> Sequence:
     waypoints = sequence.waypoints
     assert waypoints is not None
     time, step = sequence.time, float(np.median(np.diff(sequence.time)))
-    level = levelled(sequence.gyro, sequence.accel, step)
-    legs = legs_on(reckoned(level, sequence.accel, time), waypoints)
+    level = level_attitude(sequence.gyro, sequence.accel, step)
+    legs = match_legs(reckon(level, sequence.accel, time), waypoints)
     if legs.fits.sum() < FEWEST_LEGS:
         problem = f"somebody walked {legs.fits.sum()} of its {len(legs.fits)} legs with the phone"
         raise Refusal(sequence.name, f"{problem} ahead, at least {FEWEST_LEGS} are needed")
@@ -106,16 +106,16 @@ def with_poses(sequence: Sequence) -> Sequence:
     if (stops - starts).max(initial=0) * step < SHORTEST_SECONDS:
         raise Refusal(sequence.name, f"no {SHORTEST_SECONDS:g} s of it lie on a leg")
     course = PchipInterpolator(waypoints.time, waypoints.position, extrapolate=True)
-    place, velocity = (np.pad(course(time, order), ((0, 0), (0, 1))) for order in (0, 1))
+    position, velocity = (np.pad(course(time, order), ((0, 0), (0, 1))) for order in (0, 1))
     return sequence._replace(
         orientation=quaternions(about_z(np.full(len(time), legs.yaw)) * level),
-        position=place,
+        position=position,
         velocity=velocity,
         attributes=sequence.attributes | {"yaw_residual_degrees": legs.residual},
-    ).known_where(valid)
+    ).with_reference_where(valid)
 
 
-def levelled(
+def level_attitude(
     gyro: Float[np.ndarray, "n 3"], accel: Float[np.ndarray, "n 3"], step: float
 ) -> Rotation:
     """Attitudes body → a level world of arbitrary yaw: the integrated gyro without its slow tilt.
@@ -135,43 +135,47 @@ def levelled(
     return Rotation.from_rotvec(axis * scale[:, None]) * level * turned
 
 
-def reckoned(
+def reckon(
     level: Rotation, accel: Float[np.ndarray, "n 3"], time: Float[np.ndarray, " n"]
-) -> Walk:
-    """Dead reckoning by attitudes of `levelled` and the specific force `accel` (m/s²) at the
+) -> Reckoning:
+    """Dead reckoning by attitudes of `level_attitude` and the specific force `accel` (m/s²) at the
     uniform stamps `time` (s)."""
     step = float(np.median(np.diff(time)))
     ahead = _plane(level.apply([0.0, 1.0, 0.0]))
     ahead = ahead / np.maximum(np.abs(ahead), 1e-9)
     speed = _speed(level.apply(accel)[:, 2], step)
-    way, length = (cumulative_trapezoid(v, dx=step, initial=0) for v in (ahead * speed, speed))
-    return Walk(time, way, length)
+    way, length = (
+        cumulative_trapezoid(velocity, dx=step, initial=0) for velocity in (ahead * speed, speed)
+    )
+    return Reckoning(time, way, length)
 
 
-def legs_on(walk: Walk, waypoints: Waypoints) -> Legs:
+def match_legs(reckoning: Reckoning, waypoints: Waypoints) -> Legs:
     """The dead reckoning aligned with the waypoints.
 
     The yaw is that of the legs that were walked, weighted by their lengths, and with smaller
     weights for legs that differ more (Cauchy's weights about the weighted median).
     """
-    walked, far = (np.diff(walk.at(waypoints.time, each)) for each in (walk.way, walk.length))
+    reckoned, distance = (
+        np.diff(reckoning.at(waypoints.time, path)) for path in (reckoning.way, reckoning.length)
+    )
     chord = np.diff(_plane(waypoints.position))
-    on_foot = (np.abs(chord) >= SHORTEST_LEG) & (np.abs(walked) > LEAST_STRAIGHT * far)
-    on_foot &= (np.abs(chord) <= FASTEST_LEG * np.diff(waypoints.time)) & (np.abs(walked) > 1e-3)
-    ratio = np.divide(chord, walked, out=np.ones_like(chord), where=on_foot)
+    on_foot = (np.abs(chord) >= SHORTEST_LEG) & (np.abs(reckoned) > LEAST_STRAIGHT * distance)
+    on_foot &= (np.abs(chord) <= FASTEST_LEG * np.diff(waypoints.time)) & (np.abs(reckoned) > 1e-3)
+    ratio = np.divide(chord, reckoned, out=np.ones_like(chord), where=on_foot)
     if not on_foot.any():
         return Legs(on_foot, 0.0, np.inf)
     turn, weight = np.angle(ratio[on_foot]), np.abs(chord[on_foot])
     # The weighted median on a circle is one of the angles.
-    apart = np.abs(_wrapped(turn[:, None] - turn[None]))
-    yaw = float(turn[np.argmin((apart * weight[:, None]).sum(axis=0))])
+    separations = np.abs(_wrap_angle(turn[:, None] - turn[None]))
+    yaw = float(turn[np.argmin((separations * weight[:, None]).sum(axis=0))])
     for _ in range(10):
-        off = _wrapped(turn - yaw)
-        scale = max(float(np.median(np.abs(off))), np.radians(3.0))
-        share = weight / (1.0 + (off / scale) ** 2)
-        yaw += float((share * off).sum() / share.sum())
-    fits = on_foot & (np.abs(_wrapped(np.angle(ratio) - yaw)) <= MOST_TURN)
-    residual = float(np.degrees(np.median(np.abs(_wrapped(turn - yaw)))))
+        deviation = _wrap_angle(turn - yaw)
+        scale = max(float(np.median(np.abs(deviation))), np.radians(3.0))
+        share = weight / (1.0 + (deviation / scale) ** 2)
+        yaw += float((share * deviation).sum() / share.sum())
+    fits = on_foot & (np.abs(_wrap_angle(np.angle(ratio) - yaw)) <= MOST_TURN)
+    residual = float(np.degrees(np.median(np.abs(_wrap_angle(turn - yaw)))))
     return Legs(fits, yaw, residual)
 
 
@@ -191,6 +195,6 @@ def _plane(values: Float[np.ndarray, "n w"]) -> Complex[np.ndarray, " n"]:
     return values[:, 0] + 1j * values[:, 1]
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
+def _wrap_angle(angle: np.ndarray) -> np.ndarray:
     """Angles (rad) in [−π, π)."""
     return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi

@@ -41,8 +41,8 @@ class WindowSource(NamedTuple):
     start: Int[Array, "m"]
     """Row of `imu` at which each window begins, with its context."""
     rotation: Float[Array, "m 3 3"]
-    """From the frame of `imu` to the gravity-aligned frame in which the window's start, after the
-    context, has zero yaw."""
+    """Rotation from the frame of `imu` to the gravity-aligned frame in which the window's start,
+    after the context, has zero yaw."""
     displacement: Float[Array, "m 3"]
     """Target in that frame, m: from the stamp of the first sample after the context to one interval
     after the last (paper eq. 1)."""
@@ -69,26 +69,26 @@ def window_source(
     (biases zero). Differences of positions are taken in float64, before they are stored in float32.
     Raises `InputError` if no window fits.
     """
-    found: list[WindowSource] = []
+    parts: list[WindowSource] = []
     for sequence in sequences:
         if sequence.waypoints is not None and not sequence.valid.any():
             problem = "has waypoints, no poses"
             raise InputError(sequence.name, problem, "windows need a pose at every sample")
         part = _recording_windows(sequence, config, stride, 1 if shift else stride)
         if part.start.size:
-            found.append(part)
-    if not found:
+            parts.append(part)
+    if not parts:
         length = f"{config.context_seconds + config.window_seconds:g} s"
         raise InputError("data", f"no window of {length} with a valid reference in any sequence")
-    return joined(found)
+    return joined(parts)
 
 
 def joined(sources: list[WindowSource]) -> WindowSource:
     """The recordings of all sources, one source after the other, as host arrays."""
-    found: list[WindowSource] = []
+    parts: list[WindowSource] = []
     rows = windows = 0
     for source in sources:
-        found.append(
+        parts.append(
             source._replace(
                 start=source.start + np.int32(rows),
                 stretch=source.stretch + np.int32(rows),
@@ -97,7 +97,7 @@ def joined(sources: list[WindowSource]) -> WindowSource:
         )
         rows += len(source.imu)
         windows += len(source.start)
-    return WindowSource(*(np.concatenate(field) for field in zip(*found, strict=True)))
+    return WindowSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
 def _recording_windows(
@@ -136,40 +136,40 @@ def _recording_windows(
 
 
 def gather(
-    source: WindowSource, which: Int[jax.Array, "b"], length: int, margin: int = 0
+    source: WindowSource, indices: Int[jax.Array, "b"], length: int, margin: int = 0
 ) -> Windows:
-    """Windows number `which` of `source`, each `length` samples, in their own frames. Jittable.
+    """Windows number `indices` of `source`, each `length` samples, in their own frames. Jittable.
 
     `imu` has `margin` more samples on either side, for `low_pass`; where the valid samples end, the
     last one is repeated.
     """
-    start = source.start[which]
+    start = source.start[indices]
     rows = window_rows(start - margin, margin + length + margin)
-    first, last = source.stretch[which].T[:, :, None]
+    first, last = source.stretch[indices].T[:, :, None]
     imu = source.imu[jnp.clip(rows, first, last) if margin else rows]
-    cosine, sine = source.unyaw[which][:, :, None].swapaxes(0, 1)
+    cosine, sine = source.unyaw[indices][:, :, None].swapaxes(0, 1)
     # The compiler removes the steps if they are not used.
     x, y, z = jnp.moveaxis(source.step[window_rows(start, length)], -1, 0)
     return Windows(
-        imu=rotate_channels(source.rotation[which], imu),
-        displacement=source.displacement[which],
+        imu=rotate_channels(source.rotation[indices], imu),
+        displacement=source.displacement[indices],
         steps=jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1),
     )
 
 
 def shift_windows(
-    key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"], samples: int
+    key: PRNGKeyArray, source: WindowSource, indices: Int[jax.Array, "b"], samples: int
 ) -> Int[jax.Array, "b"]:
-    """Numbers of the windows up to `samples` later or earlier than `which`.
+    """Numbers of the windows up to `samples` later or earlier than `indices`.
 
     A window stays where the recording has none at the drawn distance.
     """
     if samples == 0:
-        return which
-    shift = jax.random.randint(key, which.shape, -samples, samples + 1, jnp.int32)
-    candidate = jnp.clip(which + shift, 0, source.start.shape[0] - 1)
-    in_recording = source.start[candidate] - source.start[which] == shift
-    return jnp.where(in_recording, candidate, which)
+        return indices
+    shift = jax.random.randint(key, indices.shape, -samples, samples + 1, jnp.int32)
+    candidate = jnp.clip(indices + shift, 0, source.start.shape[0] - 1)
+    in_recording = source.start[candidate] - source.start[indices] == shift
+    return jnp.where(in_recording, candidate, indices)
 
 
 def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: float) -> Windows:

@@ -142,9 +142,9 @@ def prepare(
         first = 0 if from_first else int(np.argmax(sequence.valid))
         strides = (len(sequence.time) - 1 - first) // windows.stride
         whole = _cut(sequence, slice(first, first + strides * windows.stride + 1))
-        measured = measured_rows(whole)
+        measured = whole.measured_rows
         if strides <= windows.seen // windows.stride or len(measured) < windows.seen:
-            seconds = len(measured_rows(_cut(sequence, slice(first, None)))) / windows.rate
+            seconds = len(_cut(sequence, slice(first, None)).measured_rows) / windows.rate
             problem = f"{seconds:.2f} s measured from its first trusted sample on"
             left_out[sequence.name] = f"{problem}, too short for a window and a stride"
             continue
@@ -185,12 +185,6 @@ def prepare(
             )
         )
     return recordings, left_out
-
-
-def measured_rows(sequence: Sequence) -> Int[np.ndarray, "m"]:
-    """Rows of the IMU that were measured, and not interpolated across a gap."""
-    mask = sequence.imu_valid
-    return np.arange(len(sequence.time)) if mask is None else np.flatnonzero(mask)
 
 
 def _check(

@@ -9,19 +9,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.tree_util import keystr, tree_map_with_path
+from jaxtyping import Int
 
 from gnio_jax.config import NoiseModel
 from gnio_jax.config.files import bounds, named
 from gnio_jax.config.schema import Bound
-from gnio_jax.filtering.settings import FilterConfig
+from gnio_jax.filtering.fix import THRESHOLDS, Fix, improper_covariances
+from gnio_jax.filtering.settings import FilterConfig, YawFrame
 from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_error
+from gnio_jax.numerics import finite_rows
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
 
 
@@ -82,8 +85,8 @@ def check_rows(
     if not isinstance(value, Tracer):
         rows = bad(np.asarray(value, np.float64))
         if rows.any():
-            found = f"{rows.sum()} of {len(rows)} rows {problem}"
-            raise ValueError(f"{name}: {found}, the first is row {rows.argmax()}")
+            count = f"{rows.sum()} of {len(rows)} rows {problem}"
+            raise ValueError(f"{name}: {count}, the first is row {rows.argmax()}")
 
 
 def check_rotation(name: str, value: jax.Array) -> None:
@@ -92,6 +95,31 @@ def check_rotation(name: str, value: jax.Array) -> None:
         matrix = np.asarray(value, np.float64)
         if not (np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-3 and np.linalg.det(matrix) > 0):
             raise ValueError(f"{name}: is not a rotation matrix")
+
+
+def check_covariance(name: str, value: jax.Array, kinds: Int[np.ndarray, " n"]) -> None:
+    """Refuse a matrix that is not symmetric and positive semi-definite, up to rounding. Entries of
+    one of the `kinds` are compared by the largest of them."""
+    if isinstance(value, Tracer):
+        return
+    matrix = np.asarray(value, np.float64)
+    variance = np.diag(matrix)
+    largest = np.zeros(kinds.max() + 1)
+    np.maximum.at(largest, kinds, np.sqrt(np.abs(variance)))
+    scale = largest[kinds] + 1e-150
+    scaled = matrix / np.outer(scale, scale)
+    tolerance = 1e-5 if value.dtype == jnp.float64 else 1e-4
+    if np.abs(scaled - scaled.T).max() > tolerance:
+        raise ValueError(f"{name}: is not symmetric")
+    if np.linalg.eigvalsh(scaled)[0] < -tolerance:
+        raise ValueError(f"{name}: is not positive definite")
+
+
+def check_frame(frame: Any) -> None:
+    """Refuse a name that is no `YawFrame`."""
+    if frame not in get_args(YawFrame):
+        names = " or ".join(map(repr, get_args(YawFrame)))
+        raise ValueError(f"frame: must be {names}, found {frame!r}")
 
 
 def check_number(name: str, value: Any, least: float, unit: str) -> None:
@@ -130,8 +158,8 @@ def checked_inputs(
     config: FilterConfig,
     noise: NoiseModel,
 ) -> Inputs:
-    """The arguments that every run takes, checked and in the state's precision. The values of the
-    caller's own measurements are not checked: NaN is no measurement."""
+    """The arguments that every run takes, checked and in the state's precision. Of the values of
+    measurements only those of a `Fix` are checked: NaN is no measurement."""
     state = checked_state(state, config, noise)
     dtype, n = state.offset.dtype, config.samples_per_clone
     samples = jnp.shape(gyro)[0] if jnp.ndim(gyro) else 0
@@ -149,9 +177,9 @@ def checked_inputs(
         where a sample is present."""
         value = checked_array(name, value, (samples, 3), config, finite=imu_valid is None)
         if not isinstance(imu_valid, Tracer):
-            there = True if imu_valid is None else np.asarray(imu_valid)
+            present = True if imu_valid is None else np.asarray(imu_valid)
             problem = f"are beyond {largest:g} {unit}"
-            check_rows(name, value, lambda rows: (np.abs(rows) > largest).any(1) & there, problem)
+            check_rows(name, value, lambda rows: (np.abs(rows) > largest).any(1) & present, problem)
         return value.astype(dtype)
 
     gyro = checked_signal("gyro", gyro, FASTEST_TURN, "rad/s")
@@ -162,8 +190,60 @@ def checked_inputs(
         value = checked_shape(f"measurements{keystr(path)}", value, shape)
         return value.astype(dtype) if jnp.issubdtype(value.dtype, jnp.floating) else value
 
-    measurements = tree_map_with_path(checked_rows, measurements)
+    check_measurements(measurements)
+    measurements = tree_map_with_path(checked_rows, tuple(measurements))
+    for number, measurement in enumerate(measurements):
+        if isinstance(measurement, Fix):
+            check_fix(f"measurements[{number}]", measurement)
     return Inputs(state, gyro, accel, imu_valid, measurements, checked_noise(noise, dtype))
+
+
+def check_measurements(measurements: Any) -> None:
+    """Refuse what is no tuple of objects with a method `update`; a `Fix` alone is a tuple of
+    arrays."""
+    alone = callable(getattr(measurements, "update", None))
+    if alone or not isinstance(measurements, tuple | list):
+        kind = type(measurements).__name__
+        remedy = "write (fix,) for one" if alone else "write () for none"
+        raise ValueError(f"measurements: must be a tuple of measurements, found {kind}; {remedy}")
+    for number, measurement in enumerate(measurements):
+        if not callable(getattr(measurement, "update", None)):
+            problem = f"{type(measurement).__name__} has no method update(state, step)"
+            raise ValueError(f"measurements[{number}]: {problem}")
+
+
+def check_fix(name: str, fix: Fix) -> None:
+    """Refuse fixes of other shapes, and those that cannot be: with a covariance that is not
+    symmetric and positive definite, or with another number that is NaN or out of bounds. Rows
+    without a component are not checked."""
+    count = len(fix.position)
+    axes = fix.position.shape[1] if fix.position.ndim == 2 else 0
+    if axes not in THRESHOLDS:
+        problem = f"the shape must be ({count}, 2) or ({count}, 3), found {fix.position.shape}"
+        raise ValueError(f"{name}.position: {problem}")
+    shapes = {"covariance": (count, axes, axes), "before_end": (count,)}
+    for field, shape in {**shapes, "time_std": (count,), "threshold": (count,)}.items():
+        if (value := getattr(fix, field)).shape != shape:
+            raise ValueError(f"{name}.{field}: the shape must be {shape}, found {value.shape}")
+    if isinstance(fix.position, Tracer):
+        return
+    present = np.isfinite(np.asarray(fix.position))
+    used = present.any(axis=1)
+    conditions = {
+        "covariance": (
+            lambda rows: improper_covariances(present, rows),
+            "are not finite, symmetric and positive definite",
+        ),
+        "before_end": (lambda rows: ~np.isfinite(rows), "are not finite"),
+        "time_std": (
+            lambda rows: ~((rows >= 0) & (rows < np.inf)),
+            "are not at least 0 and finite",
+        ),
+        "threshold": (lambda rows: ~(rows > 0), "are not above 0"),
+    }
+    for field, (bad, problem) in conditions.items():
+        value = getattr(fix, field)
+        check_rows(f"{name}.{field}", value, lambda rows, bad=bad: bad(rows) & used, problem)
 
 
 def checked_noise(noise: NoiseModel, dtype: Any) -> NoiseModel:
@@ -184,7 +264,7 @@ def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -
     elif len(state.correlated):
         problem = "the state has a correlated error, but noise.correlation is None"
         raise ValueError(f"state.correlated: {problem}")
-    wanted = state_shapes(config, noise, jnp.float32 if config.allow_float32 else jnp.float64)
+    shapes = state_shapes(config, noise, jnp.float32 if config.allow_float32 else jnp.float64)
 
     def checked_leaf(path: Any, value: Any, like: jax.ShapeDtypeStruct) -> jax.Array:
         name = f"state{keystr(path)}"
@@ -194,14 +274,12 @@ def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -
         finite = not name.startswith("state.imu")
         return checked_array(name, value, like.shape, config, finite).astype(state.offset.dtype)
 
-    state = tree_map_with_path(checked_leaf, state, wanted)
+    state = tree_map_with_path(checked_leaf, state, shapes)
     check_rotation("state.rotation", state.rotation)
-    if not isinstance(state.core_covariance, Tracer):
-        core = np.asarray(state.core_covariance, np.float64)
-        scale = np.sqrt(np.abs(np.diag(core))) + 1e-150
-        least = np.linalg.eigvalsh(core / np.outer(scale, scale))[0]
-        if least < -1e-5 or (np.diag(core) < 0).any():
-            raise ValueError("state.core_covariance: is not positive definite")
+    # A clone at which the anchor moved has an offset of 0, up to the rounding of the others.
+    core, clones = np.arange(len(state.core_covariance)), np.arange(len(state.clone_covariance))
+    check_covariance("state.core_covariance", state.core_covariance, core)
+    check_covariance("state.clone_covariance", state.clone_covariance, clones // 3 % 2)
     return state
 
 
@@ -213,11 +291,8 @@ def checked_displacements(
     dtype, count = inputs.gyro.dtype, len(inputs.gyro) // config.samples_per_clone
 
     def improper(matrices: np.ndarray) -> np.ndarray:
-        known = np.isfinite(matrices).all((1, 2), keepdims=True)
-        clean = np.where(known, matrices, np.eye(3))
-        skew = np.abs(clean - clean.transpose(0, 2, 1)).max((1, 2))
-        asymmetric = skew > 1e-6 * np.abs(clean).max((1, 2))
-        return asymmetric | (np.linalg.eigvalsh(clean)[:, 0] <= 0)
+        present = finite_rows(matrices.reshape(len(matrices), 9))
+        return improper_covariances(np.repeat(present[:, None], 3, axis=1), matrices)
 
     displacement = checked_array("displacement", displacement, (count, 3), config, finite=False)
     covariance = checked_array("covariance", covariance, (count, 3, 3), config, finite=False)

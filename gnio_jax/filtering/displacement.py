@@ -74,7 +74,7 @@ class Displacement:
         linear, defined = linearise_displacement(self, state, step)
         present = self.present & (state.step >= config.clones)
         linear = linear._replace(residual=jnp.where(present, linear.residual, jnp.nan))
-        outcome, correction = project(state, linear, step.oldest)
+        outcome, correction = project(state, linear, step)
         tested = outcome.present & defined
         gate, weight = innovation_gate(state.gate, config, state.step, outcome.nis, tested)
         accepted, factor = weight > 0, None
@@ -85,10 +85,12 @@ class Displacement:
             factor = 1 / jnp.clip(jnp.where(tested, weight, 1.0), LEAST_WEIGHT)
         if factor is not None:  # applied with a larger covariance
             weaker = linear._replace(covariance=linear.covariance + (factor - 1) * self.covariance)
-            _, correction = project(state, weaker, step.oldest)
+            _, correction = project(state, weaker, step)
             accepted = tested
+        # What is no covariance must spoil the state, which `healthy` reports.
+        accepted = accepted | (outcome.present & jnp.isnan(outcome.nis))
         outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
-        return correct(state._replace(gate=gate), outcome, correction, step.newest)
+        return correct(state._replace(gate=gate), outcome, correction, step)
 
 
 def scaled_displacement(
@@ -156,6 +158,8 @@ def linearise_displacement(
         (transposed,), _ = whiten(covariance, (covariance,))  # L⁻¹ Σ = Lᵀ
         jacobian["correlated"] = correlation.share * transposed.T
         predicted = geometry.matmul(jacobian["correlated"], state.correlated[:, None])[:, 0]
+        # NaN if Σ is no covariance, which is not the same as no measurement.
+        predicted = jnp.where(jnp.isnan(predicted), 0.0, predicted)
         residual, covariance = residual - predicted, (1 - correlation.share**2) * covariance
     return linearise(state, residual, covariance, **jacobian), defined
 

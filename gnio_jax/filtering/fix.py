@@ -9,58 +9,119 @@ velocity times a = t_end − t is subtracted from the position:
 where b is the error of the time of the fix, e.g. of a tap that comes early or late. At the nearest
 end |a| is at most half an interval, in which an acceleration changes the position by a few
 millimetres.
+
+A fix may lack components, e.g. the height. Those that it has are a measurement of fewer numbers.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jax.scipy.special import erfc, ndtri
+from jaxtyping import Bool, Float
 
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
-from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
+from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure, whiten
 from gnio_jax.types import Array
 
 THRESHOLDS = {2: 9.210, 3: 11.345}
 """99 % of χ² with 2 and with 3 degrees of freedom."""
+ASYMMETRY = 1e-6
+"""Largest difference of a covariance from its transpose, relative to its largest entry."""
 
 
 class Fix(NamedTuple):
     """A horizontal (m = 2) or a three-dimensional position (m = 3), or a row for each of K clone
-    intervals. It is an entry of `measurements` of `run_filter`, `run_odometry` and `smooth`."""
+    intervals. It is an entry of `measurements` of `run_filter`, `run_odometry` and `smooth`.
+
+    Outside `jit` these refuse a fix that cannot be, naming the field. Inside `jit`, where values
+    are not known, such a fix is none.
+    """
 
     position: Float[Array, "*k m"]
-    """World frame, m; NaN where there is none."""
+    """World frame, m; NaN where there is none. A component that is NaN is missing, and the others
+    are used."""
     covariance: Float[Array, "*k m m"]
-    """R, m²."""
+    """R, m². Rows and columns of missing components may be anything."""
     before_end: Float[Array, "*k"]
     """a, the time from the fix to the end of its clone interval, s; negative if the fix is after
-    the end. Finite even where there is no fix."""
+    the end."""
     time_std: Float[Array, "*k"]
-    """σ_t, s. Finite even where there is no fix."""
+    """σ_t, s."""
     threshold: Float[Array, "*k"]
-    """Largest rᵀ S⁻¹ r that passes; inf: every fix does."""
+    """Largest rᵀ S⁻¹ r of all m components that passes; inf: every fix does. A fix that lacks
+    components must pass the test of the same probability (`threshold_of`)."""
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """A fix is refused if it fails the χ² test against the filter's prediction. So a fix that
         jumps by a kilometre changes nothing. A good fix changes nothing either if the covariance of
-        the filter is much too small."""
-        axes = self.position.shape[0]
-        by_position = np.eye(3)[:axes]
+        the filter is much too small.
+
+        A missing component has no residual, no Jacobian and a variance of 1 that is correlated with
+        nothing: it adds nothing to the estimate, to rᵀ S⁻¹ r or to det S.
+        """
+        axes, dtype = self.position.shape[0], state.offset.dtype
+        fix = jax.tree.map(lambda part: jnp.asarray(part, dtype), self)
+        present = jnp.isfinite(fix.position) & ~improper(fix)
+        both, eye = present[:, None] & present[None], jnp.eye(axes, dtype=dtype)
+        # No NaN may enter the arithmetic, because otherwise the derivatives would be NaN too.
+        position = jnp.where(present, fix.position, 0.0)
+        before_end = jnp.where(present.any(), fix.before_end, 0.0)
+        time_std = jnp.where(present.any(), fix.time_std, 0.0)
+        by_position = jnp.where(present[:, None], np.eye(3, dtype=dtype)[:axes], 0.0)
+
         velocity = state.velocity[:axes]
-        expected = state.position[:axes] - self.before_end * velocity
-        late = self.time_std * velocity
+        expected = state.position[:axes] - before_end * velocity
+        late = jnp.where(present, time_std * velocity, 0.0)
+        residual = jnp.where(present, position - expected, 0.0)
         linear = linearise(
             state,
-            self.position - expected,
-            self.covariance + late[:, None] * late[None],
+            jnp.where(present.any(), residual, jnp.nan),
+            jnp.where(both, fix.covariance, eye) + late[:, None] * late[None],
             position=by_position,
-            velocity=-self.before_end * by_position,
+            velocity=-before_end * by_position,
         )
-        return measure(state, linear, step, self.threshold)
+        threshold = threshold_of(present, fix.threshold)
+        return measure(state, linear, step, threshold, frame="world")
+
+
+def improper(fix: Fix) -> Bool[Array, ""]:
+    """Whether one fix cannot be: its covariance is not symmetric and positive definite, or another
+    number is NaN or out of bounds."""
+    present = jnp.isfinite(fix.position)
+    both = present[:, None] & present[None]
+    covariance = jax.lax.stop_gradient(jnp.where(both, fix.covariance, jnp.eye(len(present))))
+    skew = jnp.abs(covariance - covariance.T).max()
+    _, volume = whiten(covariance, ())  # NaN where it is not positive definite
+    return ~(
+        (skew <= ASYMMETRY * jnp.abs(covariance).max())
+        & jnp.isfinite(volume)
+        & jnp.isfinite(fix.before_end)
+        & (fix.time_std >= 0)
+        & jnp.isfinite(fix.time_std)
+        & (fix.threshold > 0)
+    )
+
+
+def threshold_of(present: Bool[Array, "m"], threshold: Float[Array, ""]) -> Float[Array, ""]:
+    """The quantile of χ² with as many degrees of freedom as there are components, at the
+    probability at which `threshold` is that of χ² with all m = 2 or 3.
+
+    The tails are erfc(√(q/2)) with one degree, e^(−q/2) with two, and with three the first and
+    √(2 q/π) times the second.
+    """
+    half = 0.5 * jnp.where(jnp.isfinite(threshold), threshold, 1.0)
+    tail = jnp.exp(-half)
+    if len(present) == 3:
+        tail = erfc(jnp.sqrt(half)) + 2 * jnp.sqrt(half / np.pi) * tail
+    count = present.sum()
+    fewer = jnp.where(count == 1, ndtri(0.5 * tail) ** 2, -2 * jnp.log(tail))
+    return jnp.where((count < len(present)) & jnp.isfinite(threshold), fewer, threshold)
 
 
 def fixes_on_intervals(
@@ -77,50 +138,82 @@ def fixes_on_intervals(
 
     time (f,) s, on the clock on which `start` is the stamp of the first IMU sample; position (f, m)
     m in the world frame, m = 2 or 3; covariance (f, m, m) m²; intervals K; time_std s, one or (f,);
-    threshold of the χ² test, by default 99 %. A fix whose position has a NaN is ignored. Several
-    fixes in one row become their mean, weighted by the inverse traces of their covariances, with
-    the covariance of this mean. Raises `InputError` for another shape, for a covariance that is not
-    symmetric and positive definite, for a time_std below 0, and for a fix outside of the recording.
+    threshold of the χ² test, by default 99 %. A fix during the samples that follow the K intervals,
+    which are less than another one, is in the last row.
+
+    A component that is NaN is missing, with its rows and columns of the covariance; a fix without
+    any component is ignored. Several fixes in one row become their mean, component by component
+    over those that have it, with the covariance of this mean; their time is their mean time. The
+    weights are the inverses of their mean variances.
+
+    Raises `InputError` for another shape, for a covariance that is not symmetric and positive
+    definite, for a time_std below 0, and for a fix outside of the recording.
     """
     time, position, covariance = (np.asarray(x, np.float64) for x in (time, position, covariance))
     count, axes = position.shape if position.ndim == 2 else (-1, 0)
     if axes not in THRESHOLDS or time.shape != (count,) or covariance.shape != (count, axes, axes):
-        found = f"found {time.shape}, {position.shape} and {covariance.shape}"
+        shapes = f"found {time.shape}, {position.shape} and {covariance.shape}"
         problem = "time, position and covariance must be (f,), (f, m) and (f, m, m), m = 2 or 3"
-        raise InputError("fixes", f"{problem}, {found}")
-    there = np.isfinite(position).all(1)
+        raise InputError("fixes", f"{problem}, {shapes}")
     if np.shape(time_std) not in ((), time.shape):
         raise InputError("fixes", f"time_std must be one or (f,), found {np.shape(time_std)}")
-    late = np.broadcast_to(time_std, time.shape)[there]
-    time, position, covariance = time[there], position[there], covariance[there]
-    end = intervals * config.clone_seconds
-    after = time - start
-    if len(outside := time[~((after >= -1e-6) & (after <= end + 1e-6))]):
+    used = np.isfinite(position).any(axis=1)
+    time, position, covariance = time[used], position[used], covariance[used]
+    time_std = np.broadcast_to(np.asarray(time_std, np.float64), used.shape)[used]
+    after, end = time - start, intervals * config.clone_seconds
+    outside = time[~((after >= -1e-6) & (after < end + config.clone_seconds))]
+    if len(outside):
         problem = f"{len(outside)} of {count} are outside of the recording, one at {outside[0]:g} s"
         remedy = f"it lasts from {start:g} to {start + end:g} s: are both on one clock?"
         raise InputError("fixes", problem, remedy)
-    if not ((late >= 0) & (late < np.inf)).all():
+    if not ((time_std >= 0) & (time_std < np.inf)).all():
         raise InputError("fixes", "time_std must be at least 0 and finite")
     if threshold is not None and not threshold > 0:
         raise InputError("fixes", f"threshold must be above 0, found {threshold}")
-    symmetric = np.isclose(covariance, covariance.transpose(0, 2, 1), rtol=1e-6, atol=0).all((1, 2))
-    finite = np.isfinite(covariance).all()
-    if not finite or not symmetric.all() or (np.linalg.eigvalsh(covariance) <= 0).any():
+    present = np.isfinite(position)
+    if improper_covariances(present, covariance).any():
         raise InputError("fixes", "a covariance is not finite, symmetric and positive definite")
 
     row = np.clip(np.rint(after / config.clone_seconds).astype(int) - 1, 0, intervals - 1)
-    weight = 1 / np.trace(covariance, axis1=1, axis2=2)
-    weight = weight / np.bincount(row, weight, intervals)[row]
-    before_end = (row + 1) * config.clone_seconds - after
-    laid = Fix(
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    weight = present.sum(axis=1) / np.where(present, variance, 0.0).sum(axis=1)
+
+    def shares(weights: np.ndarray) -> np.ndarray:
+        """The weights, each divided by the sum of those of its row."""
+        sums = np.bincount(row, weights, intervals)[row]
+        return np.divide(weights, sums, out=np.zeros_like(weights), where=weights > 0)
+
+    share = shares(weight)
+    component_share = np.stack([shares(weight * column) for column in present.T], axis=1)
+    fix = Fix(
         position=np.zeros((intervals, axes)),
         covariance=np.zeros((intervals, axes, axes)),
-        before_end=np.bincount(row, weight * before_end, intervals),
-        time_std=np.sqrt(np.bincount(row, (weight * late) ** 2, intervals)),
+        before_end=np.bincount(row, share * ((row + 1) * config.clone_seconds - after), intervals),
+        time_std=np.sqrt(np.bincount(row, (share * time_std) ** 2, intervals)),
         threshold=np.full(intervals, THRESHOLDS[axes] if threshold is None else threshold),
     )
-    np.add.at(laid.position, row, weight[:, None] * position)
-    np.add.at(laid.covariance, row, (weight**2)[:, None, None] * covariance)
-    empty = np.bincount(row, minlength=intervals) == 0
-    laid.position[empty], laid.covariance[empty] = np.nan, np.eye(axes)
-    return laid
+    both = present[:, :, None] & present[:, None]
+    products = component_share[:, :, None] * component_share[:, None]
+    np.add.at(fix.position, row, component_share * np.where(present, position, 0.0))
+    np.add.at(fix.covariance, row, products * np.where(both, covariance, 0.0))
+    held = np.zeros((intervals, axes), bool)
+    np.logical_or.at(held, row, present)
+    fix.position[~held] = np.nan
+    fix.covariance[:] += np.eye(axes) * ~held[:, :, None]
+    return fix
+
+
+def improper_covariances(
+    present: Bool[np.ndarray, "f m"], covariance: Float[np.ndarray, "f m m"]
+) -> Bool[np.ndarray, "f"]:
+    """Which covariances are not finite, symmetric and positive definite, in the components that are
+    present."""
+    both = present[:, :, None] & present[:, None]
+    covariance = np.where(both, covariance, np.eye(present.shape[1]))
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    usable = np.reshape(finite, (-1, 1, 1))
+    covariance = np.where(usable, covariance, np.eye(present.shape[1]))
+    size, skew = np.abs(covariance), np.abs(covariance - covariance.transpose(0, 2, 1))
+    symmetric = (skew <= ASYMMETRY * size.max(axis=(1, 2), keepdims=True)).all(axis=(1, 2))
+    positive = np.linalg.eigvalsh(covariance).min(axis=1) > 0
+    return ~(finite & symmetric & positive)

@@ -42,6 +42,7 @@ from gnio_jax.filtering.state import (
     THETA,
     FilterState,
     Mean,
+    turned,
 )
 from gnio_jax.geometry import matmul
 from gnio_jax.types import GRAVITY, Array
@@ -149,6 +150,10 @@ class Transition(NamedTuple):
     """Factors of the temporally correlated errors (`correlation_decay`)."""
     anchored: Float[Array, ""]
     """1 where the anchor moved up to the position at the start of the interval, else 0."""
+    lever: Float[Array, "3"] | None
+    """The position at the end from the pivot, m, in the invariant form; else None."""
+    pivot_lever: Float[Array, "3"] | None
+    """The move of the pivot before the interval (`state.move_pivot`), m; None: it cannot move."""
 
     def __call__(self, rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
         """The product of F and `rows`. Where the anchor moves, a' = a + o and s' = o."""
@@ -158,15 +163,27 @@ class Transition(NamedTuple):
         motion = self.motion @ rows[LOCAL]
         return jnp.concatenate([motion, rows[BIASES], anchor, move, correlated])
 
+    def pose(self, rows: Float[Array, "n m"]) -> Float[Array, "6 m"]:
+        """The error of the new clone, from rows of the core's error after the propagation."""
+        theta, offset = rows[THETA], rows[OFFSET]
+        if self.lever is not None:
+            offset = offset + turned(theta, self.lever)
+        return jnp.concatenate([theta, offset])
+
 
 def core_transition(
-    interval: Interval, decay: Float[Array, "e"], anchored: Float[Array, ""]
+    interval: Interval,
+    decay: Float[Array, "e"],
+    anchored: Float[Array, ""],
+    lever: Float[Array, "3"] | None = None,
+    pivot_lever: Float[Array, "3"] | None = None,
 ) -> Transition:
     """F over an interval that starts from the anchor, with o = 0, where the anchor has just
     moved."""
     of_offset = np.isin(np.arange(LOCAL.stop), np.r_[OFFSET]).astype(interval.transition.dtype)
     kept = 1 - anchored * of_offset
-    return Transition(interval.transition * kept[None], decay, anchored)
+    motion = interval.transition * kept[None]
+    return Transition(motion, decay, anchored, lever, pivot_lever)
 
 
 def correlation_decay(
@@ -192,9 +209,7 @@ def propagate(
     # The variance of the position grows, and with it the rounding difference between both
     # triangles.
     core = 0.5 * (core + core.T)
-    pose = jnp.concatenate([core[:, THETA], core[:, OFFSET]], axis=1)
-    cross = put(transition(state.cross_covariance), pose, 0, CLONE * slot)
-    rows = jnp.concatenate([cross[THETA], cross[OFFSET]])
+    cross = put(transition(state.cross_covariance), transition.pose(core).T, 0, CLONE * slot)
     return state._replace(
         rotation=interval.rotation,
         velocity=interval.velocity,
@@ -204,7 +219,9 @@ def propagate(
         clone_offset=put(state.clone_offset, interval.position[None], slot, 0),
         core_covariance=core,
         cross_covariance=cross,
-        clone_covariance=_replace_clone(state.clone_covariance, rows, CLONE * slot),
+        clone_covariance=_replace_clone(
+            state.clone_covariance, transition.pose(cross), CLONE * slot
+        ),
         step=state.step + 1,
     )
 

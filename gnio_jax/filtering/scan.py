@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
+from gnio_jax.filtering.checks import Inputs, check_frame, checked_displacements, checked_inputs
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory, StepRecord, finished_history
@@ -25,7 +25,14 @@ from gnio_jax.filtering.propagation import (
     propagate,
 )
 from gnio_jax.filtering.settings import FilterConfig, YawFrame
-from gnio_jax.filtering.state import FilterState, core_covariance, move_anchor, unroll_clones
+from gnio_jax.filtering.state import (
+    FilterState,
+    core_covariance,
+    invariant_clones,
+    move_anchor,
+    move_pivot,
+    unroll_clones,
+)
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
 from gnio_jax.types import Array
@@ -68,6 +75,7 @@ def run_filter(
     not positive definite. Inside `jit` values are not known; `FilterHistory.healthy` reports bad
     ones.
     """
+    check_frame(frame)
     inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
     measured = checked_displacements(displacement, covariance, inputs, config)
     return _run_filter(inputs, *measured, config, frame)
@@ -139,7 +147,7 @@ def _run(
     )
     history = finished_history(records, age, inputs.state.healthy, config)
     state = state._replace(healthy=history.healthy[-1] > 0)
-    return unroll_clones(state, len(age) % config.clones), history
+    return unroll_clones(state, len(age) % config.clones, config), history
 
 
 def as_given(_: Array, __: Imu, given: Displacement, *___: Any) -> tuple[Displacement, dict]:
@@ -177,9 +185,8 @@ def clone_steps(
         return taken[0], keep(slot, *taken)
 
     rows = jnp.arange(len(age)), by_interval, given, inputs.measurements
-    state, kept = blocked_scan(
-        step, inputs.state, rows, config.checkpoint_every, config.truncate_every
-    )
+    start = invariant_clones(inputs.state, config)
+    state, kept = blocked_scan(step, start, rows, config.checkpoint_every, config.truncate_every)
     return state._replace(imu=memory._replace(quiet=state.imu.quiet)), kept, age
 
 
@@ -217,7 +224,12 @@ def clone_step(
     state = move_anchor(state, anchored)
     interval = _integrate(state.mean._replace(position=state.offset), imu, noise, config.dt)
     decay = correlation_decay(noise.correlation, config.clone_seconds, dtype)
-    transition = core_transition(interval, decay, anchored)
+    lever = pivot_lever = None
+    if config.invariant:
+        if dtype == jnp.float32:
+            state, pivot_lever = move_pivot(state, anchored)
+        lever = state.anchor + interval.position - state.pivot
+    transition = core_transition(interval, decay, anchored, lever, pivot_lever)
     state = _propagate(state, interval, transition, slot)
 
     displacement, diagnostics = measure(state, oldest)
@@ -234,7 +246,7 @@ def clone_step(
         state, outcome, correction = update(measurement, state)
         outcomes, corrections = (*outcomes, outcome), (*corrections, correction)
 
-    covariance = core_covariance(state.core_covariance)
+    covariance = core_covariance(state.core_covariance, config)
     if config.history == "diagonal":
         covariance = jnp.diagonal(covariance)
     record = StepRecord(state.mean, covariance, displacement, outcomes, diagnostics)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -15,16 +16,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import keystr, tree_leaves_with_path
 
-from gnio_jax.config import ConsideredStd, DataConfig, FilterSettings, InitialStd, NoiseModel
+from gnio_jax.config import (
+    ConsideredStd,
+    DataConfig,
+    FilterOptions,
+    FilterSettings,
+    InitialStd,
+    NoiseModel,
+)
 from gnio_jax.config.files import checked_value
-from gnio_jax.config.schema import Count, Finite, NonNegative, NonNegativeCount, Place, Positive
+from gnio_jax.config.schema import Count, NonNegative, NonNegativeCount, Place, Positive
 from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
-jax.tree_util.register_dataclass(
-    FilterSettings,
-    data_fields=["noise", "start", "considered"],
-    meta_fields=["raw_gyro_bias", "mahalanobis_fail_scale", "window_rotation"],
-)
+_NUMBERS = ("noise", "start", "considered")
+_OPTIONS = tuple(field.name for field in dataclasses.fields(FilterOptions))
+_OTHERS = [field.name for field in dataclasses.fields(FilterSettings) if field.name not in _NUMBERS]
+jax.tree_util.register_dataclass(FilterSettings, list(_NUMBERS), _OTHERS)
 
 YawFrame = Literal["own", "given"]
 """The yaw frame in which a displacement is expressed: that of the filter's own attitude of the
@@ -33,8 +40,9 @@ oldest clone, with which the network's window was cut, or that of another attitu
 
 @no_type_check  # The tests' run-time checker would refuse what __post_init__ converts or names.
 @dataclass(frozen=True)
-class FilterConfig:
-    """Static settings of the filter. The defaults are TLIO's.
+class FilterConfig(FilterOptions):
+    """Static settings of the filter: the options of an experiment, the grid of its windows, and how
+    it is computed (`FIXED`). The defaults are TLIO's.
 
     Numbers may come as 0-d arrays, as NumPy files give them. Raises `InputError`, a `ValueError`,
     naming a field that makes no sense.
@@ -48,64 +56,30 @@ class FilterConfig:
     """Clone intervals W in one measurement; W + 1 poses are cloned."""
     context_samples: NonNegativeCount = dataclasses.field(default=0, kw_only=True)
     """IMU samples C before a measurement's window that the network sees too (ours)."""
-    mahalanobis_fail_scale: NonNegative = 0.0
-    """0 skips a rejected measurement; above 0 it is applied with its covariance multiplied by
-    this."""
     history: Literal["diagonal", "core"] = "diagonal"
     """Keep the diagonal of the core covariance at every interval, or the whole 15×15 block too."""
-    log_std_min: Finite = -4.0
-    """The network's log standard deviation is raised to at least this (`run_odometry` only)."""
-    gate_threshold: Positive = 11.345
-    """Largest rᵀ S⁻¹ r that passes, of a displacement and of a velocity at rest: 99 % of χ² with
-    three degrees of freedom."""
-    convergence_seconds: NonNegative = 10.0
-    """The gate remains open until the oldest clone is more than this after initialisation, s."""
-    success_seconds: NonNegative = 0.5
-    """When the last success is older than this, the gate pauses: everything passes, s."""
-    pause_seconds: NonNegative = 1.0
-    """Length of such a pause, s."""
+    window_rotation: Literal["per_sample", "single", "tlio"] = "per_sample"
+    """Rotate each sample of the network's window with its own attitude, or all with that of the
+    start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
+    earlier, and without subtracting the biases."""
     gate_softness: NonNegative = 0.0
     """0 accepts or rejects; above 0 the gate has a slope, for training: a measurement's information
     is weighted by the logistic function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
-    zero_velocity_std: NonNegative = 0.0
-    """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
-    quiet; 0 for no such update. If a displacement is tested in the same interval and its gate is
-    active, a rest that fails the χ² test is refused, independently of `mahalanobis_fail_scale` and
-    `gate_softness`."""
-    rest_gyro: NonNegative = 0.05
-    """Bound of |gyro − b_g| in every sample of a quiet IMU, rad/s."""
-    rest_accel: NonNegative = 0.3
-    """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
-    rest_seconds: NonNegative = 0.5
-    """How long the IMU is quiet before its velocity is measured as zero, s."""
-    bridge_seconds: NonNegative = 0.1
-    """For this long, s, the last IMU sample stands in for missing ones; then the filter coasts with
-    constant attitude and velocity, and windows are no measurements."""
-    gap_gyro_std: NonNegative = 1.0
-    """Standard deviation of the rate that a gap may hide, rad/s. That of a held sample grows with
-    its age and reaches this value at `bridge_seconds`."""
-    gap_accel_std: NonNegative = 3.0
-    """Standard deviation of the acceleration that a gap may hide, m/s²."""
     checkpoint_every: NonNegativeCount = 0
     """Clone intervals between the states kept for the backward pass, which computes everything else
     again: less memory, more time. 0 keeps everything."""
     truncate_every: NonNegativeCount = 0
     """Number of clone intervals after which the state continues without gradient, for training on
     long recordings. Values do not change. The final state then has no gradient. 0: never."""
-    window_rotation: Literal["per_sample", "single", "tlio"] = "per_sample"
-    """Rotate each sample of the network's window with its own attitude, or all with that of the
-    start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
-    earlier, and without subtracting the biases."""
-    speed_limit: Positive = 100.0
-    """Largest plausible speed, m/s: an estimate that exceeds it has diverged, and is not `healthy`
-    from then on (ours)."""
     allow_float32: bool = False
     """Run in float32 if the state is float32: every standard deviation keeps about four digits over
     an hour. Without this setting float32 is refused. Smoothing and derivatives need float64 in any
     case."""
 
     def __post_init__(self) -> None:
-        for name, hint in inspect.get_annotations(type(self), eval_str=True).items():
+        classes = reversed(type(self).__mro__[:-1])
+        hints = [inspect.get_annotations(kind, eval_str=True) for kind in classes]
+        for name, hint in itertools.chain(*(of_class.items() for of_class in hints)):
             value = getattr(self, name)
             if isinstance(value, np.ndarray | np.generic) and value.ndim == 0:
                 value = value.item()
@@ -159,6 +133,11 @@ class FilterConfig:
         """
         return "given" if self.window_rotation == "tlio" else "own"
 
+    @property
+    def invariant(self) -> bool:
+        """Whether the error of the state is the invariant one (`error`)."""
+        return self.error == "invariant" or (self.error is None and self.window_rotation != "tlio")
+
     def whole_samples(self, seconds: float) -> int:
         """t·dt > seconds ⇔ t > this number, independently of the rounding of seconds / dt."""
         return int(np.floor(seconds / self.dt + 1e-6))
@@ -195,10 +174,25 @@ def filter_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig
         samples_per_clone=windows.stride,
         clones_per_window=windows.window // windows.stride,
         context_samples=windows.context,
-        mahalanobis_fail_scale=settings.mahalanobis_fail_scale,
         history="core",
         window_rotation=settings.window_rotation or windows.window_rotation,
+        **{name: getattr(settings, name) for name in _OPTIONS},
     )
+
+
+FIXED = {
+    "dt": "data.rate",
+    "samples_per_clone": "data.stride_seconds",
+    "clones_per_window": "data.window_seconds",
+    "context_samples": "data.context_seconds",
+    "history": "core: reports and calibration read whole covariances",
+    "gate_softness": "training through the filter has a slope of its own; other runs have none",
+    "checkpoint_every": "training and calibration bound their memory; other runs have no gradient",
+    "truncate_every": "training cuts the gradient; consider covariance needs the whole one",
+    "allow_float32": "False: commands run the filter in float64",
+}
+"""The fields of `FilterConfig` that are no options of an experiment, each with the setting from
+which it follows, or with its value and the reason."""
 
 
 SHARE = "noise.correlation.share"

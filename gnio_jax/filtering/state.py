@@ -6,6 +6,10 @@ those of b, then 6 for each clone. Rotation errors are in the world frame and on
 R ← exp(δθ) R; everything else adds. b is the temporally correlated part of the displacements'
 errors (see `update`): no entries, or 3.
 
+In the invariant form (`FilterConfig.error`) the error of a clone inside a run is not δo_i but
+ξ_i = δo_i + hat(p_i − c) θ_i with a fixed point c, the pivot. A turn of the world does not change
+it, so an update need not express it at the new estimate (`invariant_clones`).
+
 Positions are held as offsets o = p − a from an anchor a, a past position that moves up to the
 present once in a window; s is its last move. The offset of a clone refers to the anchor at the time
 of cloning: the present one, or the one before. The variance of a position grows without bound,
@@ -27,6 +31,7 @@ from jaxtyping import Bool, Float, Int
 
 from gnio_jax.config import InitialStd, NoiseModel
 from gnio_jax.filtering.settings import FilterConfig
+from gnio_jax.geometry import hat, matmul
 from gnio_jax.types import Array
 
 CORE, CLONE = 21, 6
@@ -118,6 +123,9 @@ class FilterState(NamedTuple):
     """Clone intervals since initialisation."""
     gate: GateState
     imu: ImuMemory
+    pivot: Float[Array, "3"]
+    """c, a fixed point in the world frame, m, to which the clones' errors of a run in the invariant
+    form refer. Between runs it has no meaning."""
     healthy: Bool[Array, ""]
     """Once False, it remains False: see `FilterHistory.healthy`."""
 
@@ -181,6 +189,7 @@ def without_clones(
         step=jnp.int32(0),
         gate=GateState(jnp.bool_(False), last_success=jnp.int32(-1), pause_end=jnp.int32(0)),
         imu=ImuMemory(unknown, unknown, missing=jnp.int32(0), quiet=jnp.int32(0)),
+        pivot=pose.position,
         healthy=jnp.bool_(True),
     )
 
@@ -214,13 +223,72 @@ def with_position(rows: Float[Array, "n k"]) -> Float[Array, "15 k"]:
     return jnp.concatenate([rows[: OFFSET.start], position, rows[BIASES]])
 
 
-def core_covariance(covariance: Float[Array, "n n"]) -> Float[Array, "15 15"]:
-    """Covariance of θ, v, p, b_g, b_a from that of the core's error."""
-    return with_position(with_position(covariance).T).T
+def core_covariance(covariance: Float[Array, "n n"], config: FilterConfig) -> Float[Array, "15 15"]:
+    """Covariance of θ, v, p, b_g, b_a from that of the core's error; in the invariant form with the
+    part of second order (`arc_covariance`)."""
+    plain = with_position(with_position(covariance).T).T
+    return plain + arc_covariance(plain) if config.invariant else plain
+
+
+def arc_covariance(covariance: Float[Array, "15 15"]) -> Float[Array, "15 15"]:
+    """The second order (ours) of an error ψ of the yaw in the covariance of θ, v, p, b_g, b_a.
+
+    Velocity and position lie on an arc: an error ψ moves them by ψ e_z × l − ½ ψ² l, where l is
+    their horizontal lever. With the variance σ² of ψ, E[ψ⁴] = 3 σ⁴, the second moment of the last
+    term is ¾ σ⁴ l lᵀ, and σ² e_z × l is their covariance with ψ.
+    """
+    yaw = covariance[:, THETA.stop - 1]
+    zero = jnp.zeros_like(yaw[:1])
+    lever = jnp.concatenate(
+        [zero, zero, zero, yaw[4:5], -yaw[3:4], zero, yaw[7:8], -yaw[6:7], jnp.zeros_like(yaw[8:])]
+    )
+    return 0.75 * lever[:, None] * lever[None]
 
 
 # The ring of clones and its anchor
 # ------------------------------------------------------------------------------------------------
+
+
+def turned(theta: Float[Array, "3 k"], lever: Float[Array, "3"]) -> Float[Array, "3 k"]:
+    """hat(lever) θ for every column θ."""
+    return matmul(hat(lever), theta)
+
+
+def invariant_clones(state: FilterState, config: FilterConfig) -> FilterState:
+    """The state at the start of a run: the clones' errors in the form of `config`, the invariant
+    one about a pivot at the anchor. `unroll_clones` is the way back."""
+    if not config.invariant:
+        return state
+    state = state._replace(pivot=state.anchor)
+    return turned_clones(state, state.clone_offset)
+
+
+def turned_clones(state: FilterState, lever: Float[Array, "c 3"]) -> FilterState:
+    """The state with o_i + hat(lever_i) θ_i in the place of the error o_i of each clone."""
+    clones = turned_rows(turned_rows(state.clone_covariance, lever).T, lever)
+    return state._replace(
+        cross_covariance=turned_rows(state.cross_covariance.T, lever).T,
+        clone_covariance=0.5 * (clones + clones.T),
+    )
+
+
+def turned_rows(rows: Float[Array, "m k"], lever: Float[Array, "c 3"]) -> Float[Array, "m k"]:
+    """Rows of the clones' θ_i, o_i with o_i + hat(lever_i) θ_i in the place of o_i."""
+    theta, offset = jnp.split(rows.reshape(-1, CLONE, rows.shape[1]), 2, axis=1)
+    offset = offset + jax.vmap(turned)(theta, lever)
+    return jnp.concatenate([theta, offset], axis=1).reshape(rows.shape)
+
+
+def move_pivot(state: FilterState, anchored: Float[Array, ""]) -> tuple[FilterState, Array]:
+    """The state with the pivot moved up to the anchor if `anchored` is 1, and the lever c − c' of
+    this move.
+
+    In float32 a pivot that is far away would cost digits. In float64 it may stay where it is.
+    """
+    lever = anchored * (state.pivot - state.anchor)
+    levers = jnp.broadcast_to(lever[None], state.clone_offset.shape)
+    state = jax.lax.cond(anchored > 0, turned_clones, lambda state, _: state, state, levers)
+    return state._replace(pivot=state.pivot - lever), lever
 
 
 def move_anchor(state: FilterState, anchored: Float[Array, ""]) -> FilterState:
@@ -234,8 +302,9 @@ def move_anchor(state: FilterState, anchored: Float[Array, ""]) -> FilterState:
     )
 
 
-def unroll_clones(state: FilterState, oldest: int) -> FilterState:
-    """The state between runs: oldest clone first, and all clones at the present anchor.
+def unroll_clones(state: FilterState, oldest: int, config: FilterConfig) -> FilterState:
+    """The state between runs: oldest clone first, all clones at the present anchor, and all errors
+    additive.
 
     `oldest` is the slot of the oldest clone. The slots before it, written since the anchor's last
     move, are at the present anchor already.
@@ -252,9 +321,13 @@ def unroll_clones(state: FilterState, oldest: int) -> FilterState:
     cross_covariance = state.cross_covariance - state.core_covariance[:, MOVE] @ loss.T
     offset = state.clone_offset - at_anchor_before * state.move[None]
     entries = CLONE * oldest
-    return state._replace(
+    state = state._replace(
         clone_rotation=jnp.roll(state.clone_rotation, -oldest, 0),
         clone_offset=jnp.roll(offset, -oldest, 0),
+        core_covariance=0.5 * (state.core_covariance + state.core_covariance.T),
         cross_covariance=jnp.roll(cross_covariance, -entries, 1),
         clone_covariance=jnp.roll(clone_covariance, (-entries, -entries), (0, 1)),
     )
+    if config.invariant:
+        state = turned_clones(state, (state.pivot - state.anchor)[None] - state.clone_offset)
+    return state

@@ -45,6 +45,7 @@ from gnio_jax.filtering.state import (
     ImuMemory,
     Mean,
     core_covariance,
+    invariant_clones,
     unroll_clones,
 )
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
@@ -201,7 +202,7 @@ class Tracker:
         if self._core is None:
             return None
         oldest = int(self._core.intervals) % self._config.clones
-        return unroll_clones(_copied(self._core.filter), oldest)
+        return unroll_clones(_copied(self._core.filter), oldest, self._config)
 
     @property
     def delay(self) -> float:
@@ -231,12 +232,13 @@ class Tracker:
         state = checked_state(state, self._config, self._noise)
         window = jnp.zeros((self._config.reach, 7), state.offset.dtype)
         tangents = None if self._considered is None else start_tangents(state)
+        state = invariant_clones(state, self._config)
         # Copies, because the compiled step takes the memory of its argument, which no other array,
         # nor two of its fields, may share.
         core = _copied(Core(state, window, jnp.int32(0), tangents))
         flags = jnp.stack([jnp.nan, jnp.nan, state.healthy]).astype(window.dtype)
         self._core: Core | None = core
-        estimate = estimated(state, flags, tangents, self._considered)
+        estimate = estimated(state, flags, tangents, self._considered, self._config)
         self._ahead: tuple[int, Estimate, ImuMemory] = 0, estimate, core.filter.imu
         """Number of known samples that `pose` has integrated, and the result."""
         return core
@@ -300,7 +302,7 @@ def advance(
         state, history, tangents = step_with_tangents(step, core.filter, core.tangents, measure)
     state = state._replace(imu=memory._replace(quiet=state.imu.quiet))
     flags = jnp.stack([history.accepted[0], history.nis[0], history.healthy[0]])
-    estimate = estimated(state, flags, tangents, considered)
+    estimate = estimated(state, flags, tangents, considered, config)
     return Core(state, window, core.intervals + 1, tangents), estimate
 
 
@@ -345,9 +347,10 @@ def estimated(
     flags: Float[Array, "3"],
     tangents: Tangents | None,
     considered: ConsideredStd | None,
+    config: FilterConfig,
 ) -> Estimate:
     """The state's estimate; the consider covariance is added to its own."""
-    covariance = core_covariance(state.core_covariance)
+    covariance = core_covariance(state.core_covariance, config)
     if tangents is not None and considered is not None:
         sensitivity = core_sensitivity(state.mean, tangents)
         covariance = covariance + considered_covariance(sensitivity[None], considered)[0]

@@ -9,6 +9,18 @@ of the error (`PARTS`), so H P needs few rows of P. With S = H P Hᵀ + R = L L�
 gain is Yᵀ L⁻¹, the correction of the error is Yᵀ L⁻¹ r, and P ← P − Yᵀ Y is symmetric to the last
 bit.
 
+The error of a velocity or a position is additive, while that of the attitude turns the world. After
+an update that moves the mean from x⁻ to x⁺, P therefore still describes a turn of the old estimate.
+The next displacement would take the difference for a measurement of the yaw. So P is expressed at
+the new estimate,
+
+    P ← G P Gᵀ,   G[x, θ] = −hat(x⁺ − x⁻) for v, p and each p_i with its θ_i, else the identity,
+
+and the mean moves on the group, x⁺ = x⁻ + J_l(θ) δx. This is the right-invariant EKF on SE_2(3)
+(Barrau and Bonnabel 2017) in additive variables; `FilterConfig.error` switches it off. The clones
+need no G, because their errors are held in the invariant form (see `state`). docs/filter.md has the
+derivation.
+
 A measurement is an object with a method
 
     update(state, step) -> (state, Outcome, Correction),
@@ -22,7 +34,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import chex
 import jax
@@ -47,6 +59,7 @@ from gnio_jax.filtering.state import (
     THETA,
     VELOCITY,
     FilterState,
+    turned,
 )
 from gnio_jax.geometry import contract_left, contract_right, matmul
 from gnio_jax.types import Array
@@ -105,6 +118,33 @@ class Correction(NamedTuple):
     """… and against the clones."""
     jacobian: dict[str, Float[Array, "m 3"]]
     """The blocks of L⁻¹ H."""
+    before: Shift | None
+    """Shift by which the error turned before this change, for a measurement in the world's frame;
+    else None."""
+    after: Shift | None
+    """Shift by which it turned after this change, for one in the carrier's frame; else None."""
+
+
+class Shift(NamedTuple):
+    """The movement x⁺ − x⁻ of the mean by an update, in the world frame; zero where none was
+    made."""
+
+    velocity: Float[Array, "3"]
+    """m/s"""
+    position: Float[Array, "3"]
+    """m"""
+
+    def __call__(self, rows: Float[Array, "n k"]) -> Float[Array, "n k"]:
+        """The product of G and `rows` of the core. The anchor's error stays, and that of the offset
+        turns with the position."""
+        change = jnp.concatenate([turned(rows[THETA], lever) for lever in self])
+        head, moved, tail = jnp.split(rows, (VELOCITY.start, OFFSET.stop))
+        return jnp.concatenate([head, moved - change, tail])
+
+
+MeasuredFrame = Literal["carrier", "world"]
+"""Whether a measured quantity turns with the carrier, as a displacement or a speed in the body
+does, or is fixed to the world, as a position on a map."""
 
 
 class Step(NamedTuple):
@@ -192,27 +232,36 @@ def since_oldest(state: FilterState, oldest: Array | int) -> Float[Array, "3"]:
 
 
 def measure(
-    state: FilterState, linear: Linearised, step: Step, threshold: Array | float = math.inf
+    state: FilterState,
+    linear: Linearised,
+    step: Step,
+    threshold: Array | float = math.inf,
+    frame: MeasuredFrame = "carrier",
 ) -> tuple[FilterState, Outcome, Correction]:
     """One EKF update. A residual or covariance with a NaN means that there is no measurement. A
     measurement whose rᵀ S⁻¹ r is above a finite `threshold` is refused (e.g. a quantile of χ² with
-    m degrees of freedom)."""
-    outcome, correction = project(state, linear, step.oldest)
+    m degrees of freedom). `frame` is that of the measured quantity: a position in the world that is
+    measured with "carrier" would show a yaw that nobody measured."""
+    outcome, correction = project(state, linear, step)
     tested = outcome.present & jnp.isfinite(threshold)
     accepted = outcome.present & (outcome.nis <= threshold)
     weight = accepted.astype(outcome.nis.dtype)
     outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
-    return correct(state, outcome, correction, step.newest)
+    return correct(state, outcome, correction, step, linear if frame == "world" else None)
 
 
-def project(
-    state: FilterState, linear: Linearised, oldest: Array | int
-) -> tuple[Outcome, Correction]:
+def project(state: FilterState, linear: Linearised, step: Step) -> tuple[Outcome, Correction]:
     """The outcome of a measurement that is accepted if it exists. If there is none, r is zero and S
     the identity, so that no NaN enters the arithmetic or the derivatives."""
     present = jnp.isfinite(linear.residual).all() & jnp.isfinite(linear.covariance).all()
-    jacobian = jnp.concatenate(list(linear.jacobian.values()), axis=1)
-    touched = functools.partial(measurable_errors, linear.jacobian, oldest=oldest)
+    by_part = dict(linear.jacobian)
+    if step.config.invariant and "since_oldest" in by_part:
+        # δo_i = ξ_i − hat(p_i − c) θ_i
+        lever = state.position - since_oldest(state, step.oldest) - state.pivot
+        of_turn = matmul(by_part["since_oldest"], geometry.hat(lever))
+        by_part["oldest_rotation"] = by_part.get("oldest_rotation", 0.0) + of_turn
+    jacobian = jnp.concatenate(list(by_part.values()), axis=1)
+    touched = functools.partial(measurable_errors, by_part, oldest=step.oldest)
     core = matmul(jacobian, touched(state.core_covariance, state.cross_covariance.T))
     clones = matmul(jacobian, touched(state.cross_covariance, state.clone_covariance))
     spread = matmul(jacobian, touched(core.T, clones.T)) + linear.covariance
@@ -221,45 +270,99 @@ def project(
     (white, core, clones, jacobian), volume = whiten(
         spread, (residual[:, None], core, clones, jacobian)
     )
-    blocks = jnp.split(jacobian, len(linear.jacobian), axis=1)
-    by_name = dict(zip(linear.jacobian, blocks, strict=True))
+    blocks = jnp.split(jacobian, len(by_part), axis=1)
+    by_part = dict(zip(by_part, blocks, strict=True))
     weight = present.astype(volume.dtype)
     outcome = Outcome(present, present, residual, jnp.sum(white**2), volume, weight, present)
-    return outcome, Correction(white[:, 0], core, clones, by_name)
+    return outcome, Correction(white[:, 0], core, clones, by_part, None, None)
 
 
 def correct(
-    state: FilterState, outcome: Outcome, correction: Correction, newest: Array | int
+    state: FilterState,
+    outcome: Outcome,
+    correction: Correction,
+    step: Step,
+    in_world: Linearised | None = None,
 ) -> tuple[FilterState, Outcome, Correction]:
     """Mean and covariance after an update, and its correction, which is zero if the measurement was
-    not accepted. `newest` is the slot of the newest clone."""
+    not accepted.
+
+    A measurement of a quantity that is fixed to the world is given as `in_world`. Its update does
+    not know less of that quantity at another estimate, so P is first expressed at the new estimate
+    and then reduced.
+    """
     correction = jax.tree.map(lambda rows: jnp.where(outcome.accepted, rows, 0.0), correction)
+    moved = moved_mean(state, correction, step)
+    if not step.config.invariant:
+        return reduced(moved, correction), outcome, correction
+    shift = Shift(moved.velocity - state.velocity, moved.position - state.position)
+    if in_world is None:
+        # G (P − Yᵀ Y) Gᵀ, which the compiler joins to one pass in this form.
+        moved = expressed_at_new_estimate(moved, shift)
+        at_new = correction._replace(core=shift(correction.core.T).T)
+        return reduced(moved, at_new), outcome, correction._replace(after=shift)
+    moved = expressed_at_new_estimate(moved, shift)
+    _, correction = project(moved, in_world, step)
+    correction = jax.tree.map(lambda rows: jnp.where(outcome.accepted, rows, 0.0), correction)
+    return reduced(moved, correction), outcome, correction._replace(before=shift)
+
+
+def expressed_at_new_estimate(state: FilterState, shift: Shift) -> FilterState:
+    """The state with G P Gᵀ, after its mean moved by `shift`. Both triangles agree to rounding; the
+    next propagation makes them equal."""
+    return state._replace(
+        core_covariance=shift(shift(state.core_covariance).T),
+        cross_covariance=shift(state.cross_covariance),
+    )
+
+
+def reduced(state: FilterState, correction: Correction) -> FilterState:
+    """The state with P − Yᵀ Y."""
+    cross = matmul(correction.core.T, correction.clones)
+    return state._replace(
+        core_covariance=downdate(state.core_covariance, correction.core),
+        cross_covariance=state.cross_covariance - cross,
+        clone_covariance=downdate(state.clone_covariance, correction.clones),
+    )
+
+
+def moved_mean(state: FilterState, correction: Correction, step: Step) -> FilterState:
+    """The state with the mean after a correction."""
     # A reduction is used on purpose: its result is kept, but a sum that is written out would be
     # computed again for every entry that the correction of the mean reads.
     core, clones = (
         jnp.sum(correction.residual[:, None] * rows, axis=0)
         for rows in (correction.core, correction.clones)
     )
-    corrected = retract(state, core, clones.reshape(-1, CLONE), newest)._replace(
-        core_covariance=downdate(state.core_covariance, correction.core),
-        cross_covariance=state.cross_covariance - matmul(correction.core.T, correction.clones),
-        clone_covariance=downdate(state.clone_covariance, correction.clones),
-    )
-    return corrected, outcome, correction
+    return retract(state, core, clones.reshape(-1, CLONE), step)
 
 
 def retract(
-    state: FilterState, core: Float[Array, "n"], clones: Float[Array, "c 6"], newest: Array | int
+    state: FilterState, core: Float[Array, "n"], clones: Float[Array, "c 6"], step: Step
 ) -> FilterState:
-    """Add an error to the mean: R ← exp(δθ) R, and all other parts are added. The newest clone has
-    the core's pose."""
+    """Move the mean by an error. The newest clone has the core's pose.
+
+    R ← exp(δθ) R, and all other parts are added. In the invariant form v and all positions move on
+    the group with their own δθ, x ← x + J_l(δθ) δx, for a clone p_i ← c + exp(θ_i) (p_i − c) +
+    J_l(θ_i) (ξ_i + δa), with the pivot c and the anchor a of the clone.
+    """
     turns = jax.vmap(geometry.exp)(clones[:, CLONE_THETA])
     rotations = jax.vmap(matmul)(turns, state.clone_rotation)
-    offsets = state.clone_offset + clones[:, CLONE_OFFSET]
+    steps, velocity_step = clones[:, CLONE_OFFSET], core[VELOCITY]
+    if step.config.invariant:
+        before = (jnp.arange(len(clones)) > step.newest).astype(core.dtype)[:, None]
+        anchor_step = core[ANCHOR][None] - before * core[MOVE][None]
+        lever = (state.anchor - state.pivot)[None] - before * state.move[None] + state.clone_offset
+        thetas = jnp.concatenate([clones[:, CLONE_THETA], core[THETA][None]])
+        added = jnp.concatenate([steps + anchor_step, velocity_step[None]])
+        added = jax.vmap(geometry.left_jacobian_product)(thetas, added)
+        turned_lever = jax.vmap(matmul)(turns, lever[:, :, None])[:, :, 0]
+        steps, velocity_step = turned_lever - lever + added[:-1] - anchor_step, added[-1]
+    offsets = state.clone_offset + steps
     return state._replace(
-        rotation=rotations[newest],
-        velocity=state.velocity + core[VELOCITY],
-        offset=offsets[newest],
+        rotation=rotations[step.newest],
+        velocity=state.velocity + velocity_step,
+        offset=offsets[step.newest],
         gyro_bias=state.gyro_bias + core[GYRO_BIAS],
         accel_bias=state.accel_bias + core[ACCEL_BIAS],
         anchor=state.anchor + core[ANCHOR],

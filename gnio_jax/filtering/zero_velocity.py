@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gnio_jax import geometry
 from gnio_jax.filtering.displacement import gate_activity
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.settings import FilterConfig
@@ -34,8 +35,11 @@ class ZeroVelocity(NamedTuple):
         config = step.config
         state, quiet = detect_rest(state, step.imu, config)
         eye = np.eye(3, dtype=state.velocity.dtype)
-        residual = jnp.where(quiet, -state.velocity, jnp.nan)
-        linear = linearise(state, residual, config.zero_velocity_std**2 * eye, velocity=eye)
+        # In the body, where an error of the attitude has no part in a velocity of zero.
+        to_body = state.rotation.T
+        residual = jnp.where(quiet, -(to_body @ state.velocity), jnp.nan)
+        jacobian = {"velocity": to_body, "rotation": to_body @ geometry.hat(state.velocity)}
+        linear = linearise(state, residual, config.zero_velocity_std**2 * eye, **jacobian)
         active, _ = gate_activity(state.gate, config, state.step * config.samples_per_clone)
         tested = active & step.before[0].tested
         return measure(state, linear, step, jnp.where(tested, config.gate_threshold, jnp.inf))

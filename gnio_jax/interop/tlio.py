@@ -23,7 +23,7 @@ from gnio_jax.errors import InputError, require_packages
 from gnio_jax.files import replacing_folder
 
 _CHANNELS = np.array([3, 4, 5, 0, 1, 2])
-"""Where our channels, [accel, gyro], are among TLIO's, [gyro, accel]."""
+"""Index of each of our channels, [accel, gyro], among TLIO's, [gyro, accel]."""
 _STEM = "input_block.0.weight"
 _FLATTENED = "output_block1.fc1.weight"
 _PREP_CHANNELS = 128
@@ -59,58 +59,69 @@ def load_tlio_state_dict(mapping_or_path: Mapping[str, Any] | str | Path) -> Any
     [accel, gyro]. Raises `InputError` naming the file and the key that is missing, unexpected, of
     another shape or not finite.
     """
-    where, given = _opened(mapping_or_path)
-    given = given.get("model_state_dict", given)
-    if not isinstance(given, Mapping):
+    where, weights = _open(mapping_or_path)
+    weights = weights.get("model_state_dict", weights)
+    if not isinstance(weights, Mapping):
         raise InputError(where, "its model_state_dict is not a mapping of arrays", _REMEDY)
-    given = {str(key).removeprefix("module."): value for key, value in given.items()}
-    given = {key: value for key, value in given.items() if not key.endswith("num_batches_tracked")}
-    template = _template(where, given)
-    wanted = {
+    weights = {str(key).removeprefix("module."): value for key, value in weights.items()}
+    weights = {
+        key: value for key, value in weights.items() if not key.endswith("num_batches_tracked")
+    }
+    template = _template(where, weights)
+    expected = {
         "".join(_PARTS.get(step.key, f"{step.key}.") for step in path[1:]): leaf
         for path, leaf in jax.tree_util.tree_leaves_with_path(template)
     }
-    odd = {"missing": wanted.keys() - given.keys(), "unexpected": given.keys() - wanted.keys()}
+    odd = {
+        "missing": expected.keys() - weights.keys(),
+        "unexpected": weights.keys() - expected.keys(),
+    }
     for problem, keys in odd.items():
         if keys:
             more = f" (and {len(keys) - 1} more)" if len(keys) > 1 else ""
             raise InputError(where, f"'{min(keys)}' is {problem}{more}", _REMEDY)
-    arrays = {key: _turned(where, key, given[key], each.shape) for key, each in wanted.items()}
+    arrays = {
+        key: _transpose(where, key, weights[key], leaf.shape) for key, leaf in expected.items()
+    }
     arrays[_STEM] = arrays[_STEM][:, _CHANNELS]
-    leaves = [jnp.asarray(arrays[key], jnp.float32) for key in wanted]
+    leaves = [jnp.asarray(arrays[key], jnp.float32) for key in expected]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-def _template(where: str, given: Mapping[str, Any]) -> Any:
+def _template(where: str, weights: Mapping[str, Any]) -> Any:
     """Shapes of the variables for the window's length that the weights have."""
-    if _FLATTENED not in given:
+    if _FLATTENED not in weights:
         raise InputError(where, f"'{_FLATTENED}' is missing", _REMEDY)
-    shape = np.shape(given[_FLATTENED])
+    shape = np.shape(weights[_FLATTENED])
     if len(shape) != 2 or shape[1] % _PREP_CHANNELS or not shape[1]:
-        wanted = f"(512, {_PREP_CHANNELS}·⌈N/32⌉) for windows of N samples"
-        raise InputError(where, f"'{_FLATTENED}' must have shape {wanted}, found {shape}", _REMEDY)
+        expected = f"(512, {_PREP_CHANNELS}·⌈N/32⌉) for windows of N samples"
+        raise InputError(
+            where, f"'{_FLATTENED}' must have shape {expected}, found {shape}", _REMEDY
+        )
     return models.variable_shapes(models.create("tlio"), 32 * (shape[1] // _PREP_CHANNELS))
 
 
-def _turned(where: str, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _transpose(where: str, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """The array with PyTorch's (out, in, size) turned to our `shape`, (size, in, out)."""
     array = np.asarray(value.detach().cpu().float() if hasattr(value, "detach") else value)
-    if array.shape != (theirs := shape[::-1]):
-        raise InputError(where, f"'{key}' must have shape {theirs}, found {array.shape}", _REMEDY)
+    if array.shape != (torch_shape := shape[::-1]):
+        raise InputError(
+            where, f"'{key}' must have shape {torch_shape}, found {array.shape}", _REMEDY
+        )
     if not np.issubdtype(array.dtype, np.floating) or not np.isfinite(array).all():
         problem = f"'{key}' holds values that are not finite numbers"
         raise InputError(where, problem, "the weights are damaged")
     return array.T
 
 
-def _opened(given: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, Any]]:
-    """What to call it in messages, and what it holds."""
-    if isinstance(given, Mapping):
-        return "state dict", given
-    path = Path(given)
+def _open(source: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, Any]]:
+    """The name of the weights in messages, and their content."""
+    if isinstance(source, Mapping):
+        return "state dict", source
+    path = Path(source)
     if not path.is_file():
-        known = "a checkpoint of TLIO's training, a TorchScript archive or an .npz"
-        raise InputError(path, "no such file", f"give {known} of the state dict")
+        kinds = "a checkpoint of TLIO's training, a TorchScript archive or an .npz"
+        raise InputError(path, "no such file", f"give {kinds} of the state dict")
     if path.suffix != ".npz":
         require_packages(path, "torch", "torch")
     try:
@@ -121,8 +132,8 @@ def _opened(given: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, An
             content = _torch(path)
     except Exception as error:  # torch and zipfile raise half a dozen types for damaged files
         problem = f"cannot be read ({str(error).partition(chr(10))[0][:160]})"
-        known = "an .npz of arrays, or a file of PyTorch that holds tensors and plain values only"
-        raise InputError(path, problem, f"it must be {known}") from None
+        kinds = "an .npz of arrays, or a file of PyTorch that holds tensors and plain values only"
+        raise InputError(path, problem, f"it must be {kinds}") from None
     if not isinstance(content, Mapping):
         raise InputError(path, f"holds no mapping of arrays but {type(content).__name__}", _REMEDY)
     return str(path), content

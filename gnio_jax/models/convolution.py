@@ -194,18 +194,18 @@ def _three_forward(x: Array, kernel: Array) -> tuple[Array, tuple]:
     batch, length, channels = x.shape
     tiles = -(-length // TILE)
     # Row t of `tiled` has the first four inputs of tile t; the other two are those of tile t + 1.
-    after = TILE * (tiles + 1) - length - 1
-    tiled = jnp.pad(x, ((0, 0), (1, after), (0, 0))).reshape(batch, tiles + 1, TILE, channels)
+    trailing = TILE * (tiles + 1) - length - 1
+    tiled = jnp.pad(x, ((0, 0), (1, trailing), (0, 0))).reshape(batch, tiles + 1, TILE, channels)
     rows = batch * tiles
     inputs = [tiled[:, :-1, j].reshape(rows, channels) for j in range(TILE)]
     inputs += [tiled[:, 1:, j].reshape(rows, channels) for j in range(POINTS - TILE)]
-    inputs = [_combined(row, inputs) for row in _INPUT]
-    kernels = [_combined(row, list(kernel)) for row in _KERNEL]
+    inputs = [_combine(row, inputs) for row in _INPUT]
+    kernels = [_combine(row, list(kernel)) for row in _KERNEL]
     products = [a @ b for a, b in zip(inputs, kernels, strict=True)]
     features = kernel.shape[-1]
-    outputs = [_combined(row, products).reshape(batch, tiles, features) for row in _OUTPUT]
-    found = jnp.stack(outputs, axis=2).reshape(batch, tiles * TILE, features)[:, :length]
-    return found, (inputs, kernels)
+    outputs = [_combine(row, products).reshape(batch, tiles, features) for row in _OUTPUT]
+    output = jnp.stack(outputs, axis=2).reshape(batch, tiles * TILE, features)[:, :length]
+    return output, (inputs, kernels)
 
 
 def _three_backward(saved: tuple, cotangent: Array) -> tuple[Array, Array]:
@@ -216,11 +216,11 @@ def _three_backward(saved: tuple, cotangent: Array) -> tuple[Array, Array]:
     padded = jnp.pad(cotangent, ((0, 0), (0, TILE * tiles - length), (0, 0)))
     tiled = padded.reshape(batch, tiles, TILE, features)
     outputs = [tiled[:, :, j].reshape(batch * tiles, features) for j in range(TILE)]
-    products = [_combined(column, outputs) for column in _OUTPUT.T]
+    products = [_combine(column, outputs) for column in _OUTPUT.T]
     to_kernels = [a.T @ product for a, product in zip(inputs, products, strict=True)]
-    to_kernel = jnp.stack([_combined(column, to_kernels) for column in _KERNEL.T])
+    to_kernel = jnp.stack([_combine(column, to_kernels) for column in _KERNEL.T])
     to_inputs = [product @ b.T for product, b in zip(products, kernels, strict=True)]
-    parts = [_combined(column, to_inputs) for column in _INPUT.T]
+    parts = [_combine(column, to_inputs) for column in _INPUT.T]
     parts = [part.reshape(batch, tiles, channels) for part in parts]
     ends = [jnp.pad(part, ((0, 0), (0, 1), (0, 0))) for part in parts[:TILE]]
     for j, part in enumerate(parts[TILE:]):
@@ -232,7 +232,7 @@ def _three_backward(saved: tuple, cotangent: Array) -> tuple[Array, Array]:
 convolve_three.defvjp(_three_forward, _three_backward)
 
 
-def _combined(factors: Sequence[float] | np.ndarray, parts: Sequence[Array]) -> Array:
+def _combine(factors: Sequence[float] | np.ndarray, parts: Sequence[Array]) -> Array:
     """The sum of the parts, each times its factor."""
     terms = [
         part if factor == 1 else part.dtype.type(factor) * part

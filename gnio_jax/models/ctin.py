@@ -90,7 +90,7 @@ class CTIN(nn.Module):
         x = TemporalEmbedding(self.width, name="temporal_embedding")(windows)
         sizes = self.heads, self.ffn, self.decoder_dropout
         for layer in range(self.decoder_layers):
-            x = DecoderLayer(*sizes, name=f"decoder_{layer + 1}")(x, memory, train)
+            x = CausalDecoderLayer(*sizes, name=f"decoder_{layer + 1}")(x, memory, train)
         # The uncertainty starts at σ = 1 (ours), as in `heads.UncertaintyHead` and for the same
         # reason.
         starts = {"velocity": nn.initializers.lecun_normal(), "log_std": nn.initializers.zeros}
@@ -157,12 +157,12 @@ class LocalAttention(nn.Module):
         weights = nn.softmax(scores.reshape(batch, samples, SPAN, channels), axis=2)
         context = jnp.sum(weights * neighbours(value, SPAN), axis=2)
 
-        both = jnp.stack([context, key], axis=1)
+        contexts = jnp.stack([context, key], axis=1)
         squeeze = linear(channels // SQUEEZE, "squeeze", use_bias=False)
-        pooled = nn.relu(squeeze(both.sum(axis=1).mean(axis=1)))
+        pooled = nn.relu(squeeze(contexts.sum(axis=1).mean(axis=1)))
         excited = linear(2 * channels, "excite")(pooled)
         shares = nn.softmax(excited.reshape(batch, 2, 1, channels), axis=1)
-        return jnp.sum(shares * both, axis=1)
+        return jnp.sum(shares * contexts, axis=1)
 
 
 class TemporalEmbedding(nn.Module):
@@ -182,7 +182,7 @@ class TemporalEmbedding(nn.Module):
         return jnp.add(nn.Bidirectional(forward, backward)(windows), positions[None])
 
 
-class DecoderLayer(nn.Module):
+class CausalDecoderLayer(nn.Module):
     """Causal self-attention, attention to the encoder, feed-forward; each added to its input, then
     normalised."""
 

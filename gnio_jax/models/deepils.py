@@ -25,9 +25,8 @@ class DeepILS(DisplacementRegressor):
     for windows of 200 samples. Ours: the displacement over the window, which is that velocity in a
     window of 1 s, along three axes (2,290,739) unless two are asked for; then the vertical one is
     0. Also ours: the shortcut where the shape changes is an ordinary 1×1 convolution with
-       normalisation (the number of parameters allows no other), and the linear layers start as in
-       TLIO's head. Widths
-    other than 64 scale every layer, for machines without an accelerator.
+    normalisation (the number of parameters allows no other), and the linear layers start as in
+    TLIO's head. Widths other than 64 scale every layer, for machines without an accelerator.
     """
 
     def features(self, windows: Float[Array, "b n 6"], train: bool) -> Array:

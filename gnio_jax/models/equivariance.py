@@ -59,22 +59,22 @@ class FourHeadings(Equivariant):
             return self.network(windows, train, **constants)
         batch, turns = windows.shape[0], len(QUARTER_TURNS)
         heading = jnp.repeat(jnp.asarray(QUARTER_TURNS), batch, axis=0)
-        every = turn_windows(jnp.tile(checked_windows(windows), (turns, 1, 1)), heading)
-        prediction = self.network(every, train, **constants)
-        back = turn_prediction(prediction, opposite(heading))
+        turned_windows = turn_windows(jnp.tile(checked_windows(windows), (turns, 1, 1)), heading)
+        prediction = self.network(turned_windows, train, **constants)
+        turned_back = turn_prediction(prediction, opposite(heading))
 
         def by_heading(axes: Array) -> Array:
             return jnp.moveaxis(axes.reshape(turns, batch, *axes.shape[1:]), 0, -2)
 
         diagnostics = {name: value[:batch] for name, value in prediction.diagnostics.items()}
         if "velocity" in diagnostics:  # CTIN's loss learns from these
-            velocities = by_heading(back.diagnostics["velocity"])
-            log_stds = by_heading(back.diagnostics["velocity_log_std"])
+            velocities = by_heading(turned_back.diagnostics["velocity"])
+            log_stds = by_heading(turned_back.diagnostics["velocity_log_std"])
             diagnostics["velocity"] = velocities.mean(axis=-2)
             diagnostics["velocity_log_std"] = jax.vmap(root_mean_square)(log_stds)
         return Prediction(
-            by_heading(back.displacement).mean(axis=-2),
-            root_mean_square(by_heading(back.log_std)),
+            by_heading(turned_back.displacement).mean(axis=-2),
+            root_mean_square(by_heading(turned_back.log_std)),
             diagnostics,
         )
 

@@ -54,9 +54,9 @@ class GNIO(nn.Module):
         if self.bank_size:
             context, diagnostics["attention"] = self._bank(name="bank")(h, memory)
             h = h + context
-        displacement, seen = self.displacement_head()(h)
+        displacement, head_diagnostics = self.displacement_head()(h)
         log_std = self.uncertainty_head()(h, train)
-        return Prediction(displacement, log_std, diagnostics | seen)
+        return Prediction(displacement, log_std, diagnostics | head_diagnostics)
 
     @nn.nowrap
     def displacement_head(self) -> nn.Module:

@@ -86,9 +86,9 @@ class IMoT(nn.Module):
         locate = Perceptron((samples, samples), name="particle_positions")
         refine = Perceptron((samples, self.output_dim), name="refinement")
         for layer in range(self.decoder_layers):
-            where = locate(sinusoids_of(particles, samples))
-            decoder = DecoderLayer(heads, ffn, self.dropout, name=f"decoder_{layer + 1}")
-            content = decoder(content, where, tokens, positions, train)
+            coordinates = locate(sinusoids_of(particles, samples))
+            decoder = ParticleDecoderLayer(heads, ffn, self.dropout, name=f"decoder_{layer + 1}")
+            content = decoder(content, coordinates, tokens, positions, train)
             particles = particles + refine(content)
         weights = AttentionScores(name="scores")(content)
         velocity = jnp.einsum("bp,bpk->bk", weights, particles)
@@ -125,8 +125,8 @@ class EncoderLayer(nn.Module):
         drop = nn.Dropout(self.dropout, deterministic=not train)
         x = decouple(channels)
         samples = x.shape[-1]
-        places = sinusoids(jnp.arange(x.shape[1], dtype=jnp.float32), samples)
-        e = Perceptron((samples, samples), name="positions")(x) * places[None]
+        sinusoid_positions = sinusoids(jnp.arange(x.shape[1], dtype=jnp.float32), samples)
+        e = Perceptron((samples, samples), name="positions")(x) * sinusoid_positions[None]
         y = attention(self.heads, "attention")(x + e, x + e, x)
         spatial = SpatialBlock(name="attention_spatial")(x)
         x = layer_norm("attention_norm")(spatial + drop(y))
@@ -155,7 +155,7 @@ class SpatialBlock(nn.Module):
         return jnp.concatenate(jnp.split(y, MODALITIES, axis=2), axis=1)
 
 
-class DecoderLayer(nn.Module):
+class ParticleDecoderLayer(nn.Module):
     """Content of the particles: attention to one another, to acceleration's tokens and to angular
     rate's, both fused, feed-forward.
 
@@ -172,23 +172,23 @@ class DecoderLayer(nn.Module):
     def __call__(
         self,
         content: Float[Array, "b p n"],
-        where: Float[Array, "b p n"],
+        coordinates: Float[Array, "b p n"],
         tokens: Float[Array, "b k n"],
         positions: Float[Array, "b k n"],
         train: bool,
     ) -> Float[Array, "b p n"]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
         samples = content.shape[-1]
-        own = ParticleAttention(self.heads, name="self")(content, where)
-        x = layer_norm("self_norm")(content + drop(own))
-        found = []
-        halves = (jnp.split(both, MODALITIES, axis=1) for both in (tokens, positions))
+        attended = ParticleAttention(self.heads, name="self")(content, coordinates)
+        x = layer_norm("self_norm")(content + drop(attended))
+        contexts = []
+        halves = (jnp.split(pair, MODALITIES, axis=1) for pair in (tokens, positions))
         for name, token, position in zip(("accel", "gyro"), *halves, strict=True):
-            query = jnp.concatenate([x, where], axis=-1)
+            query = jnp.concatenate([x, coordinates], axis=-1)
             key = jnp.concatenate([token, position], axis=-1)
             y = attention(self.heads, name, samples)(query, key, token)
-            found.append(layer_norm(f"{name}_norm")(x + drop(y)))
-        x = Perceptron((samples, samples), name="fusion")(jnp.concatenate(found, axis=-1))
+            contexts.append(layer_norm(f"{name}_norm")(x + drop(y)))
+        x = Perceptron((samples, samples), name="fusion")(jnp.concatenate(contexts, axis=-1))
         y = Perceptron((self.ffn, samples), name="ffn")(x)
         return layer_norm("ffn_norm")(x + drop(y))
 
@@ -201,19 +201,19 @@ class ParticleAttention(nn.Module):
 
     @nn.compact
     def __call__(
-        self, content: Float[Array, "b p n"], where: Float[Array, "b p n"]
+        self, content: Float[Array, "b p n"], coordinates: Float[Array, "b p n"]
     ) -> Float[Array, "b p n"]:
         features = content.shape[-1]
         project = partial(linear, features)
         query, key = (
-            project(f"{name}_content")(content) + project(f"{name}_position")(where)
+            project(f"{name}_content")(content) + project(f"{name}_position")(coordinates)
             for name in ("query", "key")
         )
         query, key, value = (
             x.reshape(*x.shape[:2], self.heads, -1) for x in (query, key, project("value")(content))
         )
-        found = attend(query, key, value)
-        return project("output")(found.reshape(content.shape))
+        context = attend(query, key, value)
+        return project("output")(context.reshape(content.shape))
 
 
 class AttentionScores(nn.Module):
@@ -265,15 +265,15 @@ def sinusoids(x: Float[Array, "*b"], features: int) -> Float[Array, "*b d"]:
     half = features // 2
     frequencies = jnp.exp(-jnp.log(jnp.float32(1e4)) * jnp.arange(half, dtype=jnp.float32) / half)
     angles = jnp.einsum("...,i->...i", x, frequencies)
-    return _padded(jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], axis=-1), features)
+    return _pad_features(jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], axis=-1), features)
 
 
 def sinusoids_of(points: Float[Array, "b p k"], features: int) -> Float[Array, "b p d"]:
     """The sinusoids of 2π times every coordinate, side by side; features that do not divide evenly
     are 0."""
-    each = 2 * (features // (2 * points.shape[-1]))
-    values = sinusoids(2 * jnp.pi * points, each)
-    return _padded(values.reshape(*points.shape[:2], -1), features)
+    axis_features = 2 * (features // (2 * points.shape[-1]))
+    values = sinusoids(2 * jnp.pi * points, axis_features)
+    return _pad_features(values.reshape(*points.shape[:2], -1), features)
 
 
 def head_count(features: int, most: int) -> int:
@@ -281,5 +281,5 @@ def head_count(features: int, most: int) -> int:
     return max(heads for heads in range(1, most + 1) if features % heads == 0)
 
 
-def _padded(x: Float[Array, "*b k"], features: int) -> Float[Array, "*b d"]:
+def _pad_features(x: Float[Array, "*b k"], features: int) -> Float[Array, "*b d"]:
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, features - x.shape[-1])])

@@ -58,12 +58,12 @@ class Network(NamedTuple):
 def inference_variables(model: nn.Module, variables: Any) -> InferenceVariables:
     """Variables with every batch normalisation folded into its convolution, and the result of
     `model.constants`, if the model has it."""
-    folded = {**variables, **_folded(variables["params"], variables.get("batch_stats", {}))}
+    folded = {**variables, **_fold(variables["params"], variables.get("batch_stats", {}))}
     constants = getattr(model, "constants", None)
     return InferenceVariables(folded, constants(folded) if constants else {})
 
 
-def _folded(params: Any, statistics: Any) -> dict[str, Any]:
+def _fold(params: Any, statistics: Any) -> dict[str, Any]:
     """Fold each normalisation into the convolution before it.
 
     (x − μ)/√(σ² + ε)·γ + β = a x + (β − a μ) with a = γ/√(σ² + ε): the kernel becomes w·a, and the
@@ -71,21 +71,21 @@ def _folded(params: Any, statistics: Any) -> dict[str, Any]:
     bias) of the same module; one without such a convolution stays as it is.
     """
     params, statistics = dict(params), dict(statistics)
-    for name, found in list(statistics.items()):
+    for name, moments in list(statistics.items()):
         if name not in params:
             continue  # a constant uncertainty, not a normalisation
-        convolves = name.replace("bn", "conv")
-        if "mean" not in found:
-            inner = _folded(params[name], found)
+        convolution_name = name.replace("bn", "conv")
+        if "mean" not in moments:
+            inner = _fold(params[name], moments)
             params[name], statistics[name] = inner["params"], inner["batch_stats"]
-        elif convolves != name and convolves in params:
-            norm, convolution = params[name], dict(params[convolves])
-            factor = norm["scale"] / jnp.sqrt(found["var"] + EPSILON)
+        elif convolution_name != name and convolution_name in params:
+            norm, convolution = params[name], dict(params[convolution_name])
+            factor = norm["scale"] / jnp.sqrt(moments["var"] + EPSILON)
             convolution["kernel"] = convolution["kernel"] * factor[None, None]
-            params[convolves] = convolution
+            params[convolution_name] = convolution
             params[name] = {
                 "scale": jnp.ones_like(factor),
-                "bias": norm["bias"] - factor * found["mean"],
+                "bias": norm["bias"] - factor * moments["mean"],
             }
             statistics[name] = {
                 "mean": jnp.zeros_like(factor),

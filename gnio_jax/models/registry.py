@@ -67,11 +67,11 @@ def options(name: str) -> dict[str, Any]:
     """The options of the network `name` and their types. Raises `InputError` for an unknown
     name."""
     more = "; the program that registers one of your own knows that one, too"
-    network = _MODELS[_known(name, names(), f"model '{name}'", "unknown", "models", more)]
+    network = _MODELS[_check_word(name, names(), f"model '{name}'", "unknown", "models", more)]
     types = get_type_hints(network, include_extras=True)
-    own = {field.name: types[field.name] for field in dataclasses.fields(network)}
-    own |= {"equivariance": Literal["none", *_EQUIVARIANT]}
-    return {option: kind for option, kind in own.items() if option not in ("parent", "name")}
+    kinds = {field.name: types[field.name] for field in dataclasses.fields(network)}
+    kinds |= {"equivariance": Literal["none", *_EQUIVARIANT]}
+    return {option: kind for option, kind in kinds.items() if option not in ("parent", "name")}
 
 
 def from_config(config: ModelConfig) -> nn.Module:
@@ -80,7 +80,7 @@ def from_config(config: ModelConfig) -> nn.Module:
     return create(**{option: value for option, value in vars(config).items() if value is not None})
 
 
-def create(name: str, **given: Any) -> nn.Module:
+def create(name: str, **values: Any) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a
     `Prediction`.
 
@@ -90,29 +90,29 @@ def create(name: str, **given: Any) -> nn.Module:
     name or option, naming the known ones, a value that is not one of an option's choices or beyond
     its bounds, or options that do not fit together.
     """
-    place, known = f"model '{name}'", options(name)
-    for option, value in given.items():
-        kind = known[_known(option, known, place, f"unknown option '{option}'", "options")]
+    subject, kinds = f"model '{name}'", options(name)
+    for option, value in values.items():
+        kind = kinds[_check_word(option, kinds, subject, f"unknown option '{option}'", "options")]
         if get_origin(kind) in (Literal, Annotated):
-            given[option] = checked_value(kind, value, Place(place, option))
-    if "winograd" in known:
-        given.setdefault("winograd", winograd_pays())
-    equivariance = given.pop("equivariance", "none")
+            values[option] = checked_value(kind, value, Place(subject, option))
+    if "winograd" in kinds:
+        values.setdefault("winograd", winograd_pays())
+    equivariance = values.pop("equivariance", "none")
     try:
-        network = _MODELS[name](**given)
+        network = _MODELS[name](**values)
     except ValueError as error:
-        raise InputError(place, str(error)) from None
+        raise InputError(subject, str(error)) from None
     return network if equivariance == "none" else _EQUIVARIANT[equivariance](network)
 
 
-def _known(
-    word: str, known: Iterable[str], place: str, problem: str, title: str, more: str = ""
+def _check_word(
+    word: str, words: Iterable[str], where: str, problem: str, title: str, more: str = ""
 ) -> str:
-    """The word, if it is known. Raises `InputError` that names the known words, the closest
+    """Return `word` if it is among `words`. Else raise `InputError` that names these, the closest
     first."""
-    if word not in known:
-        remedy = f"{did_you_mean(word, known)}known {title}: {', '.join(known)}{more}"
-        raise InputError(place, problem, remedy)
+    if word not in words:
+        remedy = f"{did_you_mean(word, words)}known {title}: {', '.join(words)}{more}"
+        raise InputError(where, problem, remedy)
     return word
 
 
@@ -127,11 +127,11 @@ def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
 
 def variable_shapes(model: nn.Module, window: int = 200) -> Any:
     """The shapes and types of what `initialise` gives; nothing is computed."""
-    return _initialised.eval_shape(model, jax.random.key(0), _windows(window))
+    return _init.eval_shape(model, jax.random.key(0), _windows(window))
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _initialised(model: nn.Module, key: PRNGKeyArray, windows: Any) -> Any:
+def _init(model: nn.Module, key: PRNGKeyArray, windows: Any) -> Any:
     """`model.init`, whose traces JAX keeps, because a run is loaded many times in one process."""
     return model.init(key, windows)
 

@@ -57,9 +57,9 @@ class BasicBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b n c"], train: bool) -> Float[Array, "b m d"]:
-        how = {"winograd": self.winograd}
-        y = nn.relu(conv_norm(x, self.features, 3, self.stride, train, "conv1", **how))
-        y = conv_norm(y, self.features, 3, 1, train, "conv2", **how)
+        options = {"winograd": self.winograd}
+        y = nn.relu(conv_norm(x, self.features, 3, self.stride, train, "conv1", **options))
+        y = conv_norm(y, self.features, 3, 1, train, "conv2", **options)
         return nn.relu(shortcut(x, self.features, self.stride, train) + y)
 
 

@@ -48,18 +48,18 @@ def predict_split(workdir: Path, split: str) -> PredictedWindows:
     network = Network.of(run.model, run.variables)
     predicted = evaluation.infer(network, recordings, config, diagnostics=DIAGNOSTICS)
     # There is a row for each stride; rows before the end of the first window have neither.
-    given = [evaluation.given_displacements(each, 0.0) for each in recordings]
+    references = [evaluation.given_displacements(recording, 0.0) for recording in recordings]
     truth, displacement = (
-        np.concatenate([each.value for each in rows]) for rows in (given, predicted)
+        np.concatenate([rows.value for rows in parts]) for parts in (references, predicted)
     )
-    std = np.concatenate([each.std for each in predicted])
+    std = np.concatenate([rows.std for rows in predicted])
     trusted = np.isfinite(truth).all(1) & np.isfinite(displacement).all(1)
     return PredictedWindows(
         truth[trusted],
         displacement[trusted],
         std[trusted] * run.config.filter.noise.std_factor,
         {
-            name: np.concatenate([each.diagnostics[name] for each in predicted])[trusted]
+            name: np.concatenate([rows.diagnostics[name] for rows in predicted])[trusted]
             for name in predicted[0].diagnostics
         },
         activity(truth[trusted], config.window_seconds),
@@ -106,10 +106,10 @@ def by_activity(windows: PredictedWindows) -> dict[str, dict[str, float]]:
 
 def mean_over_seeds(seeds: list[PredictedWindows]) -> dict[str, dict[str, float]]:
     """The figures of each activity, as means over the seeds."""
-    figures = [by_activity(seed) for seed in seeds]
+    figures = [by_activity(windows) for windows in seeds]
     return {
-        name: {key: float(np.mean([of[name][key] for of in figures])) for key in own}
-        for name, own in figures[0].items()
+        name: {key: float(np.mean([seed[name][key] for seed in figures])) for key in keys}
+        for name, keys in figures[0].items()
     }
 
 
@@ -123,9 +123,14 @@ def render(by_method: dict[str, dict[str, dict[str, float]]]) -> str:
         "scale": "median scale",
     }
     table = [
-        [method, name, f"{own['windows']:.0f}", *(tabulate.number(own.get(x), 3) for x in columns)]
+        [
+            method,
+            name,
+            f"{values['windows']:.0f}",
+            *(tabulate.number(values.get(key), 3) for key in columns),
+        ]
         for method, figures in by_method.items()
-        for name, own in figures.items()
+        for name, values in figures.items()
     ]
     return tabulate.markdown(["network", "windows of", "n", *columns.values()], table)
 

@@ -46,13 +46,13 @@ PUBLISHED_GATES = {
     ("tanh", "pos_elu"): 1.85,
     ("tanh", "softplus"): 1.84,
 }
-"""The same for gate and scale, RMSE on TLIO's set, m."""
+"""Published RMSE on TLIO's set, m (paper), by the functions of gate and scale."""
 
 PUBLISHED_BANKS = {0: None, 16: 2.07, 32: None, 64: 1.98, 128: 2.07}
-"""The same for prototypes in the bank."""
+"""Published RMSE on TLIO's set, m (paper), by the number of prototypes in the bank."""
 
 
-class Row(NamedTuple):
+class TableRow(NamedTuple):
     """One row of a table before it is run."""
 
     name: str
@@ -69,7 +69,7 @@ class Experiment(NamedTuple):
     title: str
     source: str
     """Place of the published figures, and their data."""
-    rows: list[Row]
+    rows: list[TableRow]
 
 
 # --- one row
@@ -94,8 +94,8 @@ def loss(network: str, base: TrainConfig) -> LossConfig:
         case "gnio":
             return base.loss
         case "tlio":
-            held = {"log_std_from_epoch": held_epochs(base.optim), "log_std_floor": -6.907755}
-            return LossConfig(mse_weight=0.0, nll_weight=1.0, outlier_sigmas=bound, **held)
+            fixed = {"log_std_from_epoch": held_epochs(base.optim), "log_std_floor": -6.907755}
+            return LossConfig(mse_weight=0.0, nll_weight=1.0, outlier_sigmas=bound, **fixed)
         case "deepils":
             return LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0)
         case "ctin":
@@ -128,7 +128,7 @@ def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHOD
     source = "no published figure for this split"
     if published:
         source = f"paper, table II: ATE on {base.datasets[0]} {split}"
-    rows = [Row(name, name, method(name, base), published.get(name)) for name in networks]
+    rows = [TableRow(name, name, method(name, base), published.get(name)) for name in networks]
     return Experiment("Networks", source, rows)
 
 
@@ -141,11 +141,11 @@ def components(base: TrainConfig) -> Experiment:
         "Components",
         "paper, component ablation: RMSE on TLIO's set",
         [
-            Row("tlio", "baseline (TLIO)", method("tlio", base), 2.40),
-            Row("gnio_bank-0_linear", "encoder + linear head", plain),
-            Row("gnio_linear", "+ bank", bank, 1.98),
-            Row("gnio_bank-0", "+ gated head", gated, 1.84),
-            Row("gnio", "+ bank + gated head", method("gnio", base), 1.66),
+            TableRow("tlio", "baseline (TLIO)", method("tlio", base), 2.40),
+            TableRow("gnio_bank-0_linear", "encoder + linear head", plain),
+            TableRow("gnio_linear", "+ bank", bank, 1.98),
+            TableRow("gnio_bank-0", "+ gated head", gated, 1.84),
+            TableRow("gnio", "+ bank + gated head", method("gnio", base), 1.66),
         ],
     )
 
@@ -160,7 +160,7 @@ def gates(base: TrainConfig) -> Experiment:
         if (gate, scale) == ("tanh", "softplus"):  # the defaults: the row of `components`
             name, options = "gnio_bank-0", {}
         config = variant(base, bank_size=0, **options)
-        rows.append(Row(name, f"{gate} × {scale}", config, published))
+        rows.append(TableRow(name, f"{gate} × {scale}", config, published))
     source = "paper, gate and scale functions: RMSE on TLIO's set, without the bank"
     return Experiment("Gate and scale", source, rows)
 
@@ -173,6 +173,6 @@ def bank_sizes(base: TrainConfig) -> Experiment:
         if size == 64:  # the default: the row of `components`
             name, options = "gnio_linear", {}
         config = variant(base, head="linear", **options)
-        rows.append(Row(name, f"m = {size}" if size else "no bank", config, published))
+        rows.append(TableRow(name, f"m = {size}" if size else "no bank", config, published))
     source = "paper, size of the bank: RMSE on TLIO's set, with the linear head"
     return Experiment("Bank size", source, rows)

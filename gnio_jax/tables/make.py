@@ -26,7 +26,7 @@ from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments
 from gnio_jax.tables.experiments import Experiment
-from gnio_jax.tables.runs import Result, run_row
+from gnio_jax.tables.runs import RowResult, run_row
 
 METRICS = (
     *("ate", "ate_2d", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
@@ -127,21 +127,25 @@ def hardware() -> str:
 
 
 def make_table(
-    path: Path, options: TablesConfig, experiment: Experiment, results: list[Result], remarks: str
+    path: Path,
+    options: TablesConfig,
+    experiment: Experiment,
+    results: list[RowResult],
+    remarks: str,
 ) -> str:
     """comparison, components, gates, bank-size: the files, and the text to show."""
     from gnio_jax.tables import plots  # Matplotlib takes a second to import
 
     figures = figures_of(results)
     if options.table == "gates":
-        norms = [np.array([scale_gradients(run) for run in each.runs]) for each in results]
+        norms = [np.array([scale_gradients(run) for run in result.runs]) for result in results]
         plots.save(path.with_name(f"{path.name}_gradients.png"), plots.gradients(results, norms))
-        figures |= _over_seeds("gradient of the scale, mean", [own.mean(1) for own in norms])
-        figures |= _over_seeds("gradient of the scale, largest", [own.max(1) for own in norms])
+        figures |= _over_seeds("gradient of the scale, mean", [norm.mean(1) for norm in norms])
+        figures |= _over_seeds("gradient of the scale, largest", [norm.max(1) for norm in norms])
     if options.table == "bank-size":
-        entropies = [_entropies(each, options.split) for each in results]
-        figures |= _over_seeds("entropy of a window", [own[:, 0] for own in entropies])
-        figures |= _over_seeds("entropy of their mean", [own[:, 1] for own in entropies])
+        entropies = [_entropies(result, options.split) for result in results]
+        figures |= _over_seeds("entropy of a window", [entropy[:, 0] for entropy in entropies])
+        figures |= _over_seeds("entropy of their mean", [entropy[:, 1] for entropy in entropies])
     plots.save(with_ending(path, ".png"), plots.table(experiment, results, figures["ate"]))
     text = f"## {experiment.title}\n\n{remarks}\n\n{render(experiment, figures)}"
     heads = [
@@ -158,31 +162,31 @@ def scale_gradients(run: Path) -> list[float]:
     return [json.loads(line)["gradient_norm/head/scale"] for line in lines]
 
 
-def _entropies(result: Result, split: str) -> Float[np.ndarray, "seeds 2"]:
+def _entropies(result: RowResult, split: str) -> Float[np.ndarray, "seeds 2"]:
     """Entropies of the attention of each run; none for a network without a bank."""
     runs = result.runs if result.row.config.model.bank_size != 0 else []
-    windows = [activities.predict_split(run, split) for run in runs]
-    found = [activities.entropy(each.diagnostics["attention"]) for each in windows]
-    return np.array(found).reshape(-1, 2)
+    predictions = [activities.predict_split(run, split) for run in runs]
+    entropies = [activities.entropy(windows.diagnostics["attention"]) for windows in predictions]
+    return np.array(entropies).reshape(-1, 2)
 
 
 def _over_seeds(name: str, rows: list[Float[np.ndarray, "_"]]) -> dict[str, list[Cell]]:
     """A figure of this table alone, for each row with its seeds."""
-    means = [float(np.mean(own)) if len(own) else None for own in rows]
-    found = [
-        Summary(mean, own.tolist(), None, None, 0, 0, 0, len(own))
-        for mean, own in zip(means, rows, strict=True)
+    means = [float(np.mean(values)) if len(values) else None for values in rows]
+    summaries = [
+        Summary(mean, values.tolist(), None, None, 0, 0, 0, len(values))
+        for mean, values in zip(means, rows, strict=True)
     ]
-    return {name: [Cell(each, None) for each in found]}
+    return {name: [Cell(summary, None) for summary in summaries]}
 
 
-def figures_of(results: list[Result]) -> dict[str, list[Cell]]:
+def figures_of(results: list[RowResult]) -> dict[str, list[Cell]]:
     """Metric → the figures of every row, compared with the first, if a row has any."""
-    found = tabulate.cells([result.reports for result in results], METRICS)
+    cells = tabulate.cells([result.reports for result in results], METRICS)
     return {
-        metric: own
-        for metric, own in found.items()
-        if metric == "ate" or any(figure.mean.seeds for figure in own)
+        metric: row_cells
+        for metric, row_cells in cells.items()
+        if metric == "ate" or any(figure.mean.seeds for figure in row_cells)
     }
 
 
@@ -192,14 +196,16 @@ def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
     header = ["", *(column.title for column in columns.values()), "median ATE (m)", "gain"]
     header += ["difference of ATE, m (95 %)", "published (m)", "its gain"]
     table, first = [], experiment.rows[0].published
-    for place, row in enumerate(experiment.rows):
-        mean, difference = figures["ate"][place]
-        means = [tabulate.mean(figures[x][place].mean, own.digits) for x, own in columns.items()]
-        gain = arrow(difference and difference.gain) if place else ""
-        theirs = 100 * (1 - row.published / first) if row.published and first else None
-        ours = [tabulate.number(mean.median, 2), gain, tabulate.difference(difference, 2)]
-        printed = [tabulate.number(row.published, 2), arrow(theirs) if place else ""]
-        table.append([row.label, *means, *ours, *printed])
+    for index, row in enumerate(experiment.rows):
+        mean, difference = figures["ate"][index]
+        means = [
+            tabulate.mean(figures[x][index].mean, column.digits) for x, column in columns.items()
+        ]
+        gain = arrow(difference and difference.gain) if index else ""
+        published_gain = 100 * (1 - row.published / first) if row.published and first else None
+        measured = [tabulate.number(mean.median, 2), gain, tabulate.difference(difference, 2)]
+        printed = [tabulate.number(row.published, 2), arrow(published_gain) if index else ""]
+        table.append([row.label, *means, *measured, *printed])
     marks = "".join(f"\n{line}\n" for line in tabulate.marks(figures["ate"]))
     return tabulate.markdown(header, table) + marks
 
@@ -217,29 +223,35 @@ def arrow(gain: float | None) -> str:
 # --- all methods over the reference, and windows by the walker's activity
 
 
-def make_trajectories(path: Path, options: TablesConfig, results: list[Result]) -> str:
+def make_trajectories(path: Path, options: TablesConfig, results: list[RowResult]) -> str:
     """All methods over the reference in one picture and one page, with the first seed of each."""
     # Bokeh and Matplotlib take seconds to import.
     from gnio_jax.evaluation import page
     from gnio_jax.tables import plots
 
-    runs = [page.of_folder(each.folders[0], each.reports[0], each.row.label) for each in results]
-    known = [seen.name for seen in runs[0].views if seen.known]
-    wanted = _words(options.sequences) if options.sequences else known[:8]
-    for name in wanted:
-        if name not in known:
+    runs = [
+        page.of_folder(result.folders[0], result.reports[0], result.row.label) for result in results
+    ]
+    available = [view.name for view in runs[0].views if view.known]
+    names = _words(options.sequences) if options.sequences else available[:8]
+    for name in names:
+        if name not in available:
             problem = f"no sequence '{name}' in split '{options.split}'"
-            raise InputError("--sequences", problem, f"there are: {', '.join(known)}")
-    drawn = plots.trajectories(wanted, {run.name: run.views for run in runs})
-    plots.save(with_ending(path, ".png"), drawn)
-    made = results[0].reports[0].settings
-    title = f"{made['dataset']} {options.split}: {options.estimator} of all methods"
+            raise InputError("--sequences", problem, f"there are: {', '.join(available)}")
+    figure = plots.trajectories(names, {run.name: run.views for run in runs})
+    plots.save(with_ending(path, ".png"), figure)
+    settings = results[0].reports[0].settings
+    title = f"{settings['dataset']} {options.split}: {options.estimator} of all methods"
     page.write(with_ending(path, ".html"), title, runs)
     return f"picture: {path}.png\npage: {path}.html"
 
 
 def make_standing(
-    path: Path, options: TablesConfig, experiment: Experiment, results: list[Result], remarks: str
+    path: Path,
+    options: TablesConfig,
+    experiment: Experiment,
+    results: list[RowResult],
+    remarks: str,
 ) -> str:
     """Errors at rest and in slow walking, gate and attention, which test the claim about the
     gate."""
@@ -249,16 +261,16 @@ def make_standing(
     for result in results:
         seeds = [activities.predict_split(run, options.split) for run in result.runs]
         by_method[result.row.name] = activities.mean_over_seeds(seeds)
-        beside = f"{path.name}_{result.row.name}"
+        stem = f"{path.name}_{result.row.name}"
         if "gate" in seeds[0].diagnostics:
-            plots.save(path.with_name(f"{beside}_gate.png"), plots.gate(seeds[0]))
+            plots.save(path.with_name(f"{stem}_gate.png"), plots.gate(seeds[0]))
         if "attention" in seeds[0].diagnostics:
             bits, chance = np.mean([activities.information(seed) for seed in seeds], axis=0)
             words = f"the most attended prototype carries {bits:.2f} bits about the activity, "
             words += f"by chance it would be {chance:.2f}"
             lines.append(f"{result.row.label}: {words}.\n\n")
             picture = plots.attention(*activities.attention_by_activity(seeds[0]), words)
-            plots.save(path.with_name(f"{beside}_attention.png"), picture)
+            plots.save(path.with_name(f"{stem}_attention.png"), picture)
     plots.save(with_ending(path, ".png"), plots.standing(by_method))
     table = render(experiment, figures_of(results))
     head = f"## {experiment.title}\n\n{remarks}\n\n{''.join(lines)}"
@@ -298,10 +310,10 @@ def make_complexity(out: Path, reporter: Reporter) -> str:
     table = []
     for network in NETWORKS:
         reporter.line(f"timing {network}")
-        found = measure(network)
+        cost = measure(network)
         millions, gflops = PAPERS_COST.get(network, (None, None))
-        measured = [f"{found.parameters:,}", tabulate.number(found.gflops, 3)]
-        measured += [tabulate.number(each, 2) for each in found.latency]
+        measured = [f"{cost.parameters:,}", tabulate.number(cost.gflops, 3)]
+        measured += [tabulate.number(milliseconds, 2) for milliseconds in cost.latency]
         printed = "–" if millions is None else f"{millions:.2f} M"
         table.append([network, *measured, printed, tabulate.number(gflops, 2)])
     header = ["", "parameters", "GFLOP / window"]
@@ -329,17 +341,17 @@ def measure(
     frozen, inference = models.inference_variables(model, variables), models.Inference(model)
     latency, operations = [], math.nan
     for batch in batches:
-        drawn = np.random.default_rng(0).standard_normal((batch, SAMPLES, 6))
-        windows = jnp.asarray(drawn, jnp.float32)
+        samples = np.random.default_rng(0).standard_normal((batch, SAMPLES, 6))
+        windows = jnp.asarray(samples, jnp.float32)
         compiled = jax.jit(inference).lower(frozen, windows).compile()
         if batch == batches[0]:
             operations = (compiled.cost_analysis() or {}).get("flops", math.nan) / batch
         jax.block_until_ready(compiled(frozen, windows))
         times: list[float] = []
         while sum(times) < seconds and len(times) < 500:
-            began = time.perf_counter()
+            start = time.perf_counter()
             jax.block_until_ready(compiled(frozen, windows))
-            times.append(time.perf_counter() - began)
+            times.append(time.perf_counter() - start)
         latency.append(1e3 * float(np.median(times)) / batch)
     parameters = sum(leaf.size for leaf in jax.tree.leaves(variables["params"]))
     return Complexity(parameters, operations / 1e9, latency)

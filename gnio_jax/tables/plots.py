@@ -13,7 +13,7 @@ from gnio_jax.evaluation.plots import View, finish, save
 from gnio_jax.evaluation.statistics import Cell
 from gnio_jax.tables.activities import ACTIVITIES, HORIZONTAL, PredictedWindows
 from gnio_jax.tables.experiments import Experiment
-from gnio_jax.tables.runs import Result
+from gnio_jax.tables.runs import RowResult
 
 __all__ = ["attention", "gate", "gradients", "save", "standing", "table", "trajectories"]
 
@@ -29,56 +29,58 @@ METHODS = {
 """TLIO blue and GNIO green, as in the paper's figure."""
 
 
-def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Figure:
+def table(experiment: Experiment, results: list[RowResult], ates: list[Cell]) -> Figure:
     """`ate` of each row: a dot for every seed, a bar for their mean, and sequences behind it;
     beside it the paper's figure. An estimate that diverged has no dot; the row's label has their
     number."""
     published = [row.published for row in experiment.rows]
-    beside = any(value is not None for value in published)
-    size = (9.0 if beside else 6.4, 1.4 + 0.45 * len(results))
+    has_published = any(value is not None for value in published)
+    size = (9.0 if has_published else 6.4, 1.4 + 0.45 * len(results))
     figure = Figure(figsize=size, layout="constrained")
-    ratios = (2, 1) if beside else (1,)
+    ratios = (2, 1) if has_published else (1,)
     panels = np.atleast_1d(figure.subplots(1, len(ratios), sharey=True, width_ratios=ratios))
-    ours, names = panels[0], []
-    for place, (result, (mean, _)) in enumerate(zip(results, ates, strict=True)):
+    measured_axes, names = panels[0], []
+    for index, (result, (mean, _)) in enumerate(zip(results, ates, strict=True)):
         lost = statistics.lost(result.seeds)
-        found = statistics.values(result.seeds, "ate")
-        sequences = [own.mean() for name, own in found.items() if name not in lost]
-        labels = ("sequence", "seed, mean over sequences") if place == 0 else (None, None)
-        ours.barh(place, mean.mean or 0.0, color=colours.GREEN, alpha=0.35, height=0.6)
-        above = np.full(len(sequences), place) + 0.2
-        ours.plot(sequences, above, "|", color=colours.GREY, ms=7, label=labels[0])
-        seeds = np.full(len(mean.seeds), place)
-        ours.plot(mean.seeds, seeds, "o", color="black", ms=4, label=labels[1])
+        values_of = statistics.values(result.seeds, "ate")
+        sequences = [values.mean() for name, values in values_of.items() if name not in lost]
+        labels = ("sequence", "seed, mean over sequences") if index == 0 else (None, None)
+        measured_axes.barh(index, mean.mean or 0.0, color=colours.GREEN, alpha=0.35, height=0.6)
+        above = np.full(len(sequences), index) + 0.2
+        measured_axes.plot(sequences, above, "|", color=colours.GREY, ms=7, label=labels[0])
+        seeds = np.full(len(mean.seeds), index)
+        measured_axes.plot(mean.seeds, seeds, "o", color="black", ms=4, label=labels[1])
         diverged = f"\n({mean.diverged} of {mean.estimates} diverged)" if mean.diverged else ""
         names.append(result.row.label + diverged)
-    ours.set_yticks(range(len(results)), names)
-    ours.invert_yaxis()
-    ours.set(xlabel="ATE, here (m)", title=experiment.title)
-    ours.set_xlim(left=0)
-    for place, value in enumerate(published):
+    measured_axes.set_yticks(range(len(results)), names)
+    measured_axes.invert_yaxis()
+    measured_axes.set(xlabel="ATE, here (m)", title=experiment.title)
+    measured_axes.set_xlim(left=0)
+    for index, value in enumerate(published):
         if value is not None:
-            panels[1].barh(place, value, color=colours.BLUE, alpha=0.35, height=0.6)
-            panels[1].text(value, place, f" {value:.2f}", va="center", fontsize=8)
-    if beside:
+            panels[1].barh(index, value, color=colours.BLUE, alpha=0.35, height=0.6)
+            panels[1].text(value, index, f" {value:.2f}", va="center", fontsize=8)
+    if has_published:
         panels[1].set(xlabel="published (m), on other data", title="paper")
         panels[1].margins(x=0.2)
     form = {"fontsize": 8, "frameon": False, "loc": "outside lower center", "ncols": 2}
-    figure.legend(*ours.get_legend_handles_labels(), **form)
+    figure.legend(*measured_axes.get_legend_handles_labels(), **form)
     for axes in panels:
         finish(axes)
     return figure
 
 
-def gradients(results: list[Result], norms: Sequence[Float[np.ndarray, "seeds epochs"]]) -> Figure:
+def gradients(
+    results: list[RowResult], norms: Sequence[Float[np.ndarray, "seeds epochs"]]
+) -> Figure:
     """Norm of the gradient of the scale's layer over training, one line per row: the mean over
     seeds, with their range shaded."""
     figure = Figure(figsize=(6.8, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    for result, own, colour in zip(results, norms, colours.COLOURS, strict=False):
-        epochs = np.arange(1, own.shape[1] + 1)
-        axes.semilogy(epochs, own.mean(0), color=colour, label=result.row.label)
-        axes.fill_between(epochs, own.min(0), own.max(0), color=colour, alpha=0.15, lw=0)
+    for result, norm, colour in zip(results, norms, colours.COLOURS, strict=False):
+        epochs = np.arange(1, norm.shape[1] + 1)
+        axes.semilogy(epochs, norm.mean(0), color=colour, label=result.row.label)
+        axes.fill_between(epochs, norm.min(0), norm.max(0), color=colour, alpha=0.15, lw=0)
     axes.set(xlabel="epoch", ylabel="norm of the gradient of the scale's layer")
     axes.set_title("How steadily the scale learns")
     axes.yaxis.set_major_formatter("{x:g}")
@@ -98,12 +100,17 @@ def trajectories(
     panels = np.atleast_1d(figure.subplots(lines, columns)).ravel()
     handles = {}
     for axes, name in zip(panels, names, strict=False):
-        views = {x: seen for x, own in methods.items() for seen in own if seen.name == name}
+        views = {
+            method: view
+            for method, method_views in methods.items()
+            for view in method_views
+            if view.name == name
+        }
         reference = next(iter(views.values())).reference[:, :2]
         (handles["reference"],) = axes.plot(*reference.T, color=colours.REFERENCE, lw=1.8)
-        for number, (method, seen) in enumerate(views.items()):
+        for number, (method, view) in enumerate(views.items()):
             colour = METHODS.get(method, colours.COLOURS[number % len(colours.COLOURS)])
-            (handles[method],) = axes.plot(*seen.position[:, :2].T, color=colour, lw=1.1)
+            (handles[method],) = axes.plot(*view.position[:, :2].T, color=colour, lw=1.1)
         first = reference[np.isfinite(reference).all(1)][0]
         axes.plot(*first, color=colours.REFERENCE, zorder=4, **plots.START)
         axes.set_aspect("equal", adjustable="datalim")
@@ -138,10 +145,10 @@ def gate(windows: PredictedWindows) -> Figure:
         horizontal = values[:, HORIZONTAL]
         largest = 1.0 if name == "|gate|" else max(np.percentile(horizontal, 99), 1e-3)
         edges = np.linspace(0, largest, 41)
-        for label, (chosen, colour) in rows.items():
-            if chosen.any():
-                share = np.histogram(horizontal[chosen], edges)[0] / (2 * chosen.sum())
-                count = f"{label} ({chosen.sum():,})"
+        for label, (mask, colour) in rows.items():
+            if mask.any():
+                share = np.histogram(horizontal[mask], edges)[0] / (2 * mask.sum())
+                count = f"{label} ({mask.sum():,})"
                 axes.stairs(share, edges, color=colour, lw=1.6, label=count)
         axes.set(xlabel=name, ylabel="share of windows and axes")
         finish(axes)
@@ -156,8 +163,8 @@ def attention(names: list[str], lifts: Float[np.ndarray, "a p"], words: str) -> 
     figure = Figure(figsize=(9.0, 1.6 + 0.4 * len(names)), layout="constrained")
     axes = figure.add_subplot()
     limit = max(abs(np.log2(np.clip(lifts, 0.25, 4))).max(), 1e-3)
-    shown, colour = np.log2(np.maximum(lifts[:, order], 1e-6)), {"vmin": -limit, "vmax": limit}
-    image = axes.imshow(shown, aspect="auto", cmap="RdBu_r", **colour)
+    log_ratios, colour = np.log2(np.maximum(lifts[:, order], 1e-6)), {"vmin": -limit, "vmax": limit}
+    image = axes.imshow(log_ratios, aspect="auto", cmap="RdBu_r", **colour)
     axes.set_yticks(range(len(names)), names)
     axes.set(xlabel="prototype, sorted by the activity it favours", title=words)
     axes.title.set_fontsize(9)

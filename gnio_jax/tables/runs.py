@@ -17,7 +17,7 @@ from gnio_jax.evaluation import kept
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Scores
 from gnio_jax.reporting import Reporter
-from gnio_jax.tables.experiments import Row
+from gnio_jax.tables.experiments import TableRow
 from gnio_jax.training import loop, run_folder
 
 
@@ -26,10 +26,10 @@ class Interrupted(Exception):
     same command continues it."""
 
 
-class Result(NamedTuple):
+class RowResult(NamedTuple):
     """A row after all its seeds."""
 
-    row: Row
+    row: TableRow
     reports: list[Report]
     runs: list[Path]
     """Work folders of the seeds."""
@@ -41,7 +41,9 @@ class Result(NamedTuple):
         return [report.scores for report in self.reports]
 
 
-def run_row(row: Row, options: TablesConfig, reporter: Reporter, workers: int = 1) -> Result:
+def run_row(
+    row: TableRow, options: TablesConfig, reporter: Reporter, workers: int = 1
+) -> RowResult:
     """Train, calibrate if the options ask for it, and evaluate a row with seeds 0 … seeds−1 below
     OUT/runs.
 
@@ -53,22 +55,24 @@ def run_row(row: Row, options: TablesConfig, reporter: Reporter, workers: int = 
     workdir = Path(options.out) / "runs" / row.name
     config, seeds = dataclasses.replace(row.config, workdir=str(workdir)), range(options.seeds)
     train(config, seeds, reporter, workers)
-    runs = [Path(each.workdir or "") for each in configuration.with_seeds(config, seeds)]
+    runs = [
+        Path(seed_config.workdir or "") for seed_config in configuration.with_seeds(config, seeds)
+    ]
     if options.calibrate:
-        runs = [calibrated(run, reporter, workers) for run in runs]
-    how = {"split": options.split, "estimator": options.estimator, "plots": False}
-    asked = [EvaluateConfig(str(run), data_root=config.data_root, **how) for run in runs]
-    looked = [kept.look(each) for each in asked]
-    reports = [kept.made(each, reporter, workers) for each in looked]
-    return Result(row, reports, runs, [each.folder for each in looked])
+        runs = [calibrate_run(run, reporter, workers) for run in runs]
+    settings = {"split": options.split, "estimator": options.estimator, "plots": False}
+    requests = [EvaluateConfig(str(run), data_root=config.data_root, **settings) for run in runs]
+    evaluations = [kept.look(request) for request in requests]
+    reports = [kept.made(evaluation, reporter, workers) for evaluation in evaluations]
+    return RowResult(row, reports, runs, [evaluation.folder for evaluation in evaluations])
 
 
 def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers: int = 1) -> None:
     """Train the runs of `config` with these seeds to their end, unless they are finished
     already."""
     states: dict[str, list[int]] = {"begun": [], "new": [], "finished": []}
-    for each in configuration.with_seeds(config, seeds):
-        states[_state(each)].append(each.seed)
+    for seed_config in configuration.with_seeds(config, seeds):
+        states[_state(seed_config)].append(seed_config.seed)
     for state in ("begun", "new"):
         if not states[state]:
             continue
@@ -90,17 +94,19 @@ def _state(config: TrainConfig) -> str:
     run_folder.refuse_other_run(config, resume=True)
     (dataset,) = config.datasets
     if data.get(dataset).needs_root:
-        theirs = Path(configuration.load(file).data_root or data.find_root(dataset))
-        ours = data.find_root(dataset, config.data_root)
-        if theirs.is_dir() and theirs.resolve() != ours.resolve():  # otherwise the folder has moved
-            problem = f"was trained on the recordings of {theirs}, not of {ours}"
+        trained_root = Path(configuration.load(file).data_root or data.find_root(dataset))
+        root = data.find_root(dataset, config.data_root)
+        if (
+            trained_root.is_dir() and trained_root.resolve() != root.resolve()
+        ):  # otherwise the folder has moved
+            problem = f"was trained on the recordings of {trained_root}, not of {root}"
             raise InputError(file, problem, "give another --out")
     log = workdir / "metrics.jsonl"
     rows = log.read_text(encoding="utf-8").count("\n") if log.exists() else 0
     return "finished" if rows >= config.optim.epochs else "begun"
 
 
-def calibrated(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
+def calibrate_run(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
     """The run's best checkpoint with its filter fitted to its validation split: the existing
     calibrated run if it is of that checkpoint, else a new one."""
 
@@ -112,5 +118,7 @@ def calibrated(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
         return folder
     reporter.line(f"calibrating {workdir.name}")
     shutil.rmtree(folder, ignore_errors=True)
-    calibration.calibrate(CalibrateConfig(str(workdir), out=str(folder)), workers=workers)
+    result = calibration.calibrate(CalibrateConfig(str(workdir), out=str(folder)), workers=workers)
+    for warning in result.warnings:
+        reporter.line(f"warning: {folder.name}: {warning}")
     return folder

@@ -215,7 +215,7 @@ def smoothed_poses(walk: Sequence, by: PosesBy) -> Reading:
             poses = filtering.waypoint_poses(resampled, predict, setup).sequence
         except InputError as error:
             return Reading([], refusals=(str(error),))
-    return Reading([poses.known_where(legs.valid & poses.valid)])
+    return Reading([poses.with_reference_where(legs.valid & poses.valid)])
 
 
 @functools.cache

@@ -259,7 +259,7 @@ def train_steps(
             figures["skipped"] = jnp.where(sound, 0.0, 1.0)
         sums = jax.tree.map(jnp.add, progress.sums, figures)
         new = new._replace(step=jnp.add(state.step, 1))
-        return parallel.replicated(new), Progress(sums, failed_step)
+        return parallel.replicate(new), Progress(sums, failed_step)
 
     names = [*task.figures, *gradient_norms(task.trainable(state.variables))]
     names += [] if task.skip_above is None else ["skipped"]

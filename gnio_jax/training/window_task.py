@@ -61,7 +61,7 @@ class WindowTask(Task):
         count = optax.tree.size(state.variables["params"])
         yield (
             f"{self.config.model.name}: {count:,} parameters on "
-            f"{parallel.described()}, {steps} steps of {optim.batch_size} windows an epoch, "
+            f"{parallel.describe()}, {steps} steps of {optim.batch_size} windows an epoch, "
             f"{optim.epochs} epochs → {workdir}"
         )
         total = optim.epochs * steps
@@ -223,7 +223,7 @@ def estimate_statistics(
         return total / (batches * (1 - MOMENTUM)) if path[-1].key in ("mean", "var") else before
 
     estimated = jax.tree_util.tree_map_with_path(statistic, total, before)
-    return parallel.replicated(
+    return parallel.replicate(
         state._replace(variables=state.variables | {"batch_stats": estimated})
     )
 

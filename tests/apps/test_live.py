@@ -13,7 +13,7 @@ import pytest
 
 from gnio_jax.apps import live, packages, rerun
 from gnio_jax.commands import app, console
-from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import read_tum
 from gnio_jax.filtering import ConsideredStd, Pose, Tracker
@@ -22,7 +22,11 @@ from tests.support import known_walk, tiny_run
 from tests.support.filter_settings import changed
 from tests.support.rerun_files import columns_of
 
-CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
+CONFIG = TrainConfig(
+    data=DataConfig(rate=50.0),
+    model=ModelConfig(name="tiny"),
+    filter=FilterSettings(zero_velocity_std=0.02),
+)
 RATE = 50.0
 PATIENCE = 120
 """s, after which a test waits for what never comes."""

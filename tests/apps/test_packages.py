@@ -239,10 +239,10 @@ def test_the_default_is_shipped_or_the_newest_run(published, run, monkeypatch, t
         packages.find()
     own = shutil.copytree(run, tmp_path / "runs" / "walk")
     assert packages.find().name == "walk"
-    assert packages.choose(published / "walk").about == f"simulated walks, whose {MEASURED}"
-    assert packages.choose(own).about == f"dataset synthetic, split train, whose {MEASURED}"
+    assert packages.choose(published / "walk").trained_on == f"simulated walks, whose {MEASURED}"
+    assert packages.choose(own).trained_on == f"dataset synthetic, split train, whose {MEASURED}"
     (own / "eval" / "synthetic_test_ekf" / "metrics.json").write_text("{")
-    assert packages.choose(own).about == "dataset synthetic, split train"  # and it tracks
+    assert packages.choose(own).trained_on == "dataset synthetic, split train"  # and it tracks
 
 
 def test_the_command(run, tmp_path, gnio, mistake):
@@ -250,7 +250,7 @@ def test_the_command(run, tmp_path, gnio, mistake):
     given = ["publish", run, "--out", out, "--data", "walks \x1b[2J", "--license", "CC0"]
     told = gnio(*given, "--fails", "Running.", "Cars.")
     assert f"{out}: mine, network tiny" in told and "gnio track RECORDING --weights" in told
-    assert packages.read_about(out).license == "CC0"
+    assert packages.read_manifest(out).license == "CC0"
     assert "\x1b" not in gnio("weights", out)  # of a stranger's card nothing reaches the terminal
     gnio(*given)  # in the place of the first
     (tmp_path / "other").mkdir()

@@ -30,8 +30,9 @@ def runs(tmp_path_factory):
     """`walker` says something of each window, `mute` nothing: zero, give or take a metre."""
     folder = tmp_path_factory.mktemp("home") / "runs"
     with tiny_run.known():
-        of_raw_gyros = changed(considered={"raw_gyro_bias": 0.02})
-        tiny_run.save(folder / "mute", dataclasses.replace(CONFIG, filter=of_raw_gyros), size=0.0)
+        settings = changed(considered={"raw_gyro_bias": 0.02})
+        settings = dataclasses.replace(settings, zero_velocity_std=0.02)
+        tiny_run.save(folder / "mute", dataclasses.replace(CONFIG, filter=settings), size=0.0)
         tiny_run.save(folder / "walker", CONFIG)
         yield folder
 

@@ -1,25 +1,24 @@
 """What the filter believes where samples are missing: nothing but what a walker may do.
 
-All filters here have the tracker's own settings; the network says nothing.
+All filters here have the settings of the network that comes with the package, which predicts
+nothing.
 """
 
 import numpy as np
 import pytest
-from flax import linen as nn
 
-from gnio_jax.apps.track import tracking_filter
-from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation import estimate, no_displacements, prepare
 from gnio_jax.filtering import InitialStd
-from gnio_jax.training.checkpoint import Run
+from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.types import Sequence
 from tests.support import known_walk
 
 RATE, SECONDS = 50.0, 5.0
 WINDOWS = DataConfig(rate=RATE)
-CONFIG = TrainConfig(data=WINDOWS, model=ModelConfig(name="tiny"))
-FILTER = tracking_filter(Run(CONFIG, nn.Dense(1), {}, epoch=0, step=0))._replace(
+SETTINGS = FilterSettings(zero_velocity_std=0.02, gap_gyro_std=0.8, gap_accel_std=0.8)
+FILTER = filter_setup(WINDOWS, SETTINGS)._replace(
     initial_std=InitialStd(
         1e-3, 1e-3, velocity=0.01, position=0.01, gyro_bias=1e-5, accel_bias=1e-3
     )

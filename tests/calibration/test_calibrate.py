@@ -16,6 +16,7 @@ import jax
 import numpy as np
 import pytest
 from scipy.optimize import OptimizeResult
+from scipy.spatial.transform import Rotation
 
 from gnio_jax import calibration, data, filtering, models
 from gnio_jax.calibration import evidence
@@ -35,7 +36,7 @@ from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Displacements, Estimate, Trajectory
 from gnio_jax.evaluation.estimate import Inputs
-from gnio_jax.evaluation.prepare import Start
+from gnio_jax.evaluation.prepare import Start, prepare
 from gnio_jax.filtering.settings import free_parameters
 from gnio_jax.filtering.state import GYRO_BIAS
 from gnio_jax.training import checkpoint
@@ -72,11 +73,15 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     run, splits_read, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(calibrating, "MOST_STEPS", 2)  # what the search finds is told below
-    out = tmp_path / "calibrated"
+    run, out = shutil.copytree(run, tmp_path / "run"), tmp_path / "calibrated"
+    for name in ("splits.yaml", "metrics.jsonl"):
+        (run / name).write_text(f"{name} of the run")
     words = ["calibrate", "--workdir", str(run), "--out", str(out), "--average-headings"]
     app.main([*words, "--fit", "measurement", "noise", "window"])
     told, warned = capsys.readouterr()
     assert "warning: the fit stopped after 2 steps" in warned
+    assert f"warning: only {WALKS} recordings without a raw gyro: fewer than 5" in warned
+    assert f"recordings: 0 with a raw gyro, {WALKS} without" in told
     assert "noise.std_factor" in told and f"gnio evaluate --workdir {out}" in told
     assert splits_read == ["val"]
     before, after = (checkpoint.load_run(folder) for folder in (run, out))
@@ -84,6 +89,8 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     same = {name: getattr(before.config, name) for name in ("workdir", "filter", "model")}
     assert dataclasses.replace(after.config, **same) == before.config
     jax.tree.map(np.testing.assert_array_equal, after.variables, before.variables)
+    for name in ("splits.yaml", "metrics.jsonl"):
+        assert (out / name).read_text() == f"{name} of the run"
     found = after.config.filter
     assert found.start == TRAINED.filter.start
     assert found.noise.correlation.share > 0 and found.noise.std_factor[0] != 1
@@ -94,6 +101,11 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(
     nees = about["position_nees_per_axis"]
     assert abs(np.log(nees["after"])) < abs(np.log(nees["before"]))
     assert about["split"] == "val" and about["filter"] == plain(found)
+    assert about["recordings"] == WALKS and about["recordings_with_raw_gyro"] == 0
+    assert [f"warning: {line}" for line in about["warnings"]] == warned.splitlines()
+    change = about["trajectories"]["ate"]
+    assert f"ATE (m) │ {change['before']:.2f} │ {change['after']:.2f}" in re.sub(" +", " ", told)
+    assert change["before"] != change["after"] and "diverged" not in told
 
 
 def test_a_network_is_averaged_over_four_headings_or_told_that_it_cannot_be(run):
@@ -180,6 +192,69 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(
         of_fold = checkpoint.load_run(fold_runs[fold_of[recording.group]])
         network = models.Network.of(of_fold.model, of_fold.variables)
         assert recording.name == name and tiny_run.same(variables, network.variables)
+
+
+def test_the_network_of_every_fold_is_averaged_over_headings(run, fold_runs):
+    config = CalibrateConfig(str(run), out_of_fold=tuple(fold_runs), average_headings=True)
+    _, networks = evidence.sources(evidence.load_run(run, config), config)
+    for source in networks:
+        assert source.run.config.model.equivariance == "four_headings"
+
+
+def test_walks_without_a_reference_are_left_out_and_raw_gyros_start_wide(run, monkeypatch):
+    """A raw one is not sure of its level biases, as in an evaluation."""
+    walks = [simulated.pedestrian(seed, seed, "handheld", 5.0, 50.0) for seed in (1, 2, 3)]
+    walks[0] = walks[0]._replace(valid=np.zeros(len(walks[0].time), bool))
+    raw = {**walks[1].attributes, "imu_compensated": "no"}
+    walks[1] = walks[1]._replace(attributes=raw)
+    monkeypatch.setattr(data, "load", lambda *_: walks)
+    monkeypatch.setattr(evidence, "estimate", lambda prepared, *_, **__: prepared)
+    loaded, config = checkpoint.load_run(run), CalibrateConfig(str(run))
+    settings = dataclasses.replace(loaded.config.filter, raw_gyro_bias=0.05)
+    split, networks = evidence.sources(loaded, config)
+    recordings, _ = evidence.gather(split, networks, config, settings, lambda *_: None, 1)
+    assert [recording.name for recording in recordings] == [walk.name for walk in walks[1:]]
+    stds = [recording.start.level_gyro_bias for recording in recordings]
+    assert stds == [0.05, settings.start.gyro_bias]
+
+
+def test_displacements_and_truth_are_those_of_their_times(run, splits_read, tmp_path, monkeypatch):
+    """Of true displacements with errors of a centimetre: each is in the interval at whose end its
+    window ends. The filter then errs by a few centimetres, and a walk moves by 0.13 m in a stride.
+    """
+    recordings, _ = prepare(data.load("synthetic", None, "val"), DATA)
+    random, estimates, inputs, positions = np.random.default_rng(0), [], [], []
+    for recording in recordings:
+        path = recording.reference
+        attitude = Rotation.from_quat(np.roll(path.orientation, -1, axis=1)).as_matrix()
+        value = np.full(path.position.shape, np.nan)
+        for row in range(CLONES + 1, len(value)):  # row k is at the end of stride k
+            oldest = row - CLONES
+            yaw = np.arctan2(attitude[oldest, 1, 0], attitude[oldest, 0, 0])
+            step = path.position[row] - path.position[oldest]
+            value[row] = Rotation.from_euler("z", -yaw).apply(step)
+        value += 0.01 * random.standard_normal(value.shape)
+        rows = Displacements(value, np.tile(1e-4 * np.eye(3), (len(value), 1, 1)))
+        estimates.append(Estimate(recording.name, path, path, rows))
+
+    def unfitted(walks, windows, settings, *_):
+        inputs.append(walks)
+        return fitting.Fit(settings, 0.0, 0.0, 1)
+
+    def filtered_positions(*arguments):
+        positions.append(fitting.filtered_positions(*arguments))
+        return positions[0]
+
+    pairs = evidence.Evidence(recordings, estimates)
+    monkeypatch.setattr(calibrating, "gather", lambda *_: pairs)
+    monkeypatch.setattr(calibrating, "fit_innovations", unfitted)
+    monkeypatch.setattr(calibrating, "filtered_positions", filtered_positions)
+    calibration.calibrate(CalibrateConfig(str(run), out=str(tmp_path / "calibrated")))
+    for value, walk in zip(inputs[0].given.value, estimates, strict=True):
+        for interval in (CLONES, 100, STRIDES - 1):
+            assert (value[interval] == walk.displacements.value[interval + 1]).all()
+    assert len(positions[0].error) == WALKS * STRIDES
+    assert np.sqrt(np.mean(positions[0].error ** 2, axis=0)).max() < 0.07
 
 
 def test_folds_that_do_not_make_a_whole_are_refused(run, splits_read, fold_runs):
@@ -269,7 +344,8 @@ def test_noises_are_fitted_with_the_whole_bias_of_a_raw_gyro_uncertain(raw, expe
     walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
     walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
     config = fitting.innovation_config(DATA, settings)
-    states = (each(walk, settings).state(config) for each in (fitting._wide_start, fitting._start))
+    starts = fitting._wide_start(walk, settings), fitting.evaluated_start(walk.start, settings)
+    states = (start.state(config) for start in starts)
     spreads = (
         np.sqrt(np.linalg.eigvalsh(state.core_covariance[GYRO_BIAS, GYRO_BIAS])) for state in states
     )

@@ -14,7 +14,7 @@ from gnio_jax import data
 from gnio_jax.apps.importing import read_imported
 from gnio_jax.commands import app
 from gnio_jax.data import loading
-from gnio_jax.data.dataset import Recording
+from gnio_jax.data.dataset import RecordingSource
 from gnio_jax.data.readers import DATASETS, tlio
 from gnio_jax.data.readers import csv_files as csv
 from gnio_jax.errors import InputError
@@ -238,11 +238,11 @@ def test_a_piece_never_takes_the_file_of_another_recording(tmp_path):
         return partial(list, [circle(seconds=30.0)._replace(name=name) for name in names])
 
     found = [
-        Recording("walk_piece1", pieces("walk_piece1")),
-        Recording("walk", pieces("walk_piece1", "walk_piece2")),
+        RecordingSource("walk_piece1", pieces("walk_piece1")),
+        RecordingSource("walk", pieces("walk_piece1", "walk_piece2")),
     ]
     # Nor one recording that of another.
-    two = [Recording(name, pieces(name)) for name in ("a b", "a_b")]
+    two = [RecordingSource(name, pieces(name)) for name in ("a b", "a_b")]
     for given, of, file in (
         (found, "walk", "walk_piece1"),
         (found[::-1], "walk", "walk_piece1"),

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data import hdf5
-from gnio_jax.data.dataset import Recording, Refusal
+from gnio_jax.data import hdf5, registry
+from gnio_jax.data.dataset import RecordingSource, Refusal
 from gnio_jax.data.loading import (
     check_recording,
     find_recordings,
@@ -55,7 +55,7 @@ def alone(read, *arguments, **options):
 
 def single(name, read, *arguments, **options):
     """The recording that is one sequence."""
-    return Recording(name, partial(alone, read, *arguments, **options))
+    return RecordingSource(name, partial(alone, read, *arguments, **options))
 
 
 def upside_down(name):
@@ -134,7 +134,7 @@ def test_a_sequence_says_whose_it_is_unless_it_was_converted(tmp_path):
         return [circle(seconds=4.0)._replace(name=name, attributes=attributes)]
 
     converted = partial(read, dataset="oxiod", licence="theirs")
-    about = dataset(Recording("own", read), Recording("other", converted))
+    about = dataset(RecordingSource("own", read), RecordingSource("other", converted))
     recordings = about.recordings(None, "")
     for sequences in (
         list(read_split(about, tmp_path, "test")),
@@ -153,7 +153,7 @@ def test_recordings_that_are_left_out_for_one_reason_are_one_line(tmp_path):
         "holds 2 waypoints; leave it out",
         "e: left out: e.csv: its clock is ruined; leave it out",
     ]
-    nothing = dataset(slow(tmp_path, "f", refusal="ruined"), Recording("none", list))
+    nothing = dataset(slow(tmp_path, "f", refusal="ruined"), RecordingSource("none", list))
     names, notes, error = outcome(nothing, 1)
     assert names == [] and notes == ["f: left out: f.csv: ruined; leave it out"]
     assert error.startswith("root: none of the 2 recordings of split 'test' can be used")
@@ -168,7 +168,7 @@ def die_in_a_child(name):
 def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):
     """A function without a name elsewhere cannot be sent to a process: it was read here. So is what
     a dead process left."""
-    local = Recording("local", lambda: [walk("local")])
+    local = RecordingSource("local", lambda: [walk("local")])
     slowly = [slow(tmp_path, name, die_in_a_child) for name in "ab"]
     assert outcome(dataset(local, *slowly), 2) == (["local", "a", "b"], [], "")
     kept = [each._replace(read=lambda: pytest.fail("built")) for each in slowly]
@@ -176,7 +176,7 @@ def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):
 
 
 def test_a_check_tells_what_is_wrong_and_raises_nothing(tmp_path):
-    recordings = [*six(tmp_path), Recording("none", list)]
+    recordings = [*six(tmp_path), RecordingSource("none", list)]
     recordings.append(slow(tmp_path, "g", damage="field 'gyro' is NaN"))
     checked = {each.name: check_recording(each, dataset()) for each in recordings}
     reason = {name: row.reason for name, ((row,), _) in checked.items()}
@@ -335,7 +335,7 @@ def source(cache):
 
 def call(reader, *files, name="walk"):
     """Which call of `reader` made what reading gives."""
-    (sequence,) = read_recording(Recording(name, reader, files, slow=True)).sequences
+    (sequence,) = read_recording(RecordingSource(name, reader, files, slow=True)).sequences
     return round(float(sequence.position[0, 0] - circle(seconds=1.0).position[0, 0]))
 
 
@@ -366,7 +366,7 @@ def test_a_changed_file_or_package_is_read_again(source, tmp_path, monkeypatch):
 
 
 def test_a_new_entry_takes_the_place_of_those_of_the_same_recording(source, cache, monkeypatch):
-    form = Recording("walk", Reader(), (source,), slow=True, form="syn")
+    form = RecordingSource("walk", Reader(), (source,), slow=True, form="syn")
 
     def read_all():
         for name in ("walk", "other"):
@@ -415,7 +415,7 @@ def test_an_entry_that_is_damaged_or_cannot_be_written_is_made_anew(source, cach
 
 def test_a_refusal_is_remembered_and_damage_is_not(source, cache):
     reader = Reader(Refusal(source, "field 'time' is ruined", "leave it out"))
-    recording = Recording("walk", reader, (source,), slow=True)
+    recording = RecordingSource("walk", reader, (source,), slow=True)
     for _ in range(2):
         reading = read_recording(recording)
         assert reading.refusals == (f"{source}: field 'time' is ruined; leave it out",)
@@ -425,13 +425,13 @@ def test_a_refusal_is_remembered_and_damage_is_not(source, cache):
     assert read_recording(recording).refusals and reader.calls == 2
     broken = Reader(InputError(source, "field 'gyro' is NaN"))
     for calls in (1, 2):
-        reading = read_recording(Recording("other", broken, (source,), slow=True))
+        reading = read_recording(RecordingSource("other", broken, (source,), slow=True))
         assert str(reading.damage).endswith("field 'gyro' is NaN") and broken.calls == calls
 
 
 def test_what_the_reader_warned_of_is_kept_with_every_segment(source):
     reader = Reader(warning="imu.csv: a gap was cut off", names=("b", "a", "c"))
-    recording = Recording("walk", reader, (source,), slow=True)
+    recording = RecordingSource("walk", reader, (source,), slow=True)
     for _ in range(2):
         reading = read_recording(recording)
         assert reading.notes == ("imu.csv: a gap was cut off",) and reader.calls == 1
@@ -458,6 +458,19 @@ def test_the_root_is_the_argument_then_the_environment_then_the_working_folder(
     assert data.find_root("tlio", str(here)) == here
     with pytest.raises(InputError, match=r"nowhere: no folder of dataset 'tlio'"):
         data.find_root("tlio", tmp_path / "nowhere")
+
+
+def test_a_dataset_of_ones_own_is_loaded_by_its_name(monkeypatch, tmp_path):
+    monkeypatch.setattr(registry, "DATASETS", dict(DATASETS))
+    monday = dataset(single("monday", walk, "monday"))
+    mine = dataclasses.replace(monday, name="mine", licence="as I like")
+    for _ in range(2):  # a cell of a notebook that runs again
+        data.register(mine)
+    assert "mine" in data.names() and data.get("mine") is mine
+    [sequence] = data.load("mine", tmp_path)
+    assert (sequence.name, sequence.attributes["licence"]) == ("monday", "as I like")
+    with pytest.raises(InputError, match="dataset 'tlio': is a dataset of gnio-jax"):
+        data.register(dataset())
 
 
 def test_a_split_without_a_sequence_or_with_two_of_one_name_is_an_error(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data.dataset import Recording
+from gnio_jax.data.dataset import RecordingSource
 from gnio_jax.data.loading import read_split
 from gnio_jax.data.self_check import check_sequence, gyro_windows, self_check
 from gnio_jax.errors import InputError
@@ -17,7 +17,7 @@ from tests.support.circle import changed, circle
 
 def keep_plausible(sequences, dataset):
     """What loading keeps of a dataset that is these sequences."""
-    recordings = [Recording(each.name, lambda each=each: [each]) for each in sequences]
+    recordings = [RecordingSource(each.name, lambda each=each: [each]) for each in sequences]
     dataset = dataclasses.replace(dataset, recordings=lambda root, split: recordings)
     return list(read_split(dataset, Path("."), "test"))
 

@@ -8,7 +8,7 @@ import pytest
 from gnio_jax import data
 from gnio_jax.config import DataConfig, TrainConfig
 from gnio_jax.data import loading
-from gnio_jax.data.splits import find_list, listed
+from gnio_jax.data.splits import find_list, read_list
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines
 from gnio_jax.training.recordings import read_split
@@ -36,13 +36,13 @@ def test_lists_may_lack_recordings_and_their_last_newline_but_not_everything(tmp
     path.write_text("\ufeff# mine\na\n b \n\nb\nc\nd\ne")
     assert find_list(tmp_path, "train.txt") == path
     with pytest.warns(UserWarning, match=r"train\.txt: 4 of 5 .* absent: a, c, d, \.\.\.$"):
-        assert listed(path, find, tmp_path, "any") == [tmp_path / "b"]
+        assert read_list(path, find, tmp_path, "any") == [tmp_path / "b"]
     path.write_text("a\n" + 5000 * "x")  # too long for a name
     with pytest.raises(InputError, match=r"none of its 2 sequences is below .*expected layout"):
-        listed(path, find, tmp_path, "any")
+        read_list(path, find, tmp_path, "any")
     path.unlink()
     with pytest.raises(InputError, match=r"train\.txt: the list cannot be read"):
-        listed(path, find, tmp_path, "any")
+        read_list(path, find, tmp_path, "any")
 
 
 # Groups of 50, 40, 30, 20 and 20 s.

@@ -6,7 +6,7 @@ import pytest
 from gnio_jax.config import DataConfig, TrainConfig
 from gnio_jax.data import loading
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.data.waypoints import levelled, with_poses
+from gnio_jax.data.waypoints import level_attitude, with_poses
 from gnio_jax.data.windows import window_source
 from gnio_jax.numerics import rotations
 from gnio_jax.reporting import Lines
@@ -63,7 +63,7 @@ def test_waypoints_that_nobody_walks_between_are_not_valid():
 def test_gravity_levels_a_gyro_that_drifts():
     truth = survey(5).truth
     biased = truth.gyro + np.array([0.01, -0.008, 0.0])  # 20° over the walk
-    attitude = levelled(biased, truth.accel, 1 / RATE)
+    attitude = level_attitude(biased, truth.accel, 1 / RATE)
     up, known = (r.inv().apply([0.0, 0.0, 1.0]) for r in (attitude, rotations(truth.orientation)))
     tilt = np.degrees(np.arccos(np.clip((up * known).sum(axis=1), -1.0, 1.0)))
     assert np.median(tilt) < 1.5 and tilt.max() < 5.0

@@ -9,7 +9,8 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.filtering.checks import checked_inputs
-from gnio_jax.filtering.state import with_correlated_error
+from gnio_jax.filtering.state import CLONE, with_correlated_error
+from tests.support.checks import unchecked
 from tests.support.random_walk import random_walk
 
 N, CLONES, DT, INTERVALS = 5, 4, 0.02, 60
@@ -60,6 +61,33 @@ def wrong():
     yield r"state.clone_rotation: the shape must be \(5, 3, 3\)", {"state": other}
     less = state.core_covariance - jnp.eye(21)
     yield "state.core_covariance", {"state": state._replace(core_covariance=less)}
+    for entry in ((2, 5), (5, 2)):
+        lopsided = put(state.core_covariance, entry, 1e-3)
+        yield (
+            "state.core_covariance: is not symmetric",
+            {"state": state._replace(core_covariance=lopsided)},
+        )
+    clones = CLONE * CONFIG.clones
+    for problem, covariance in (
+        ("positive definite", -np.eye(clones)),
+        ("positive definite", np.eye(clones) + 1.1 * (np.eye(clones, k=6) + np.eye(clones, k=-6))),
+        ("symmetric", np.eye(clones) + 0.1 * np.eye(clones, k=1)),
+        ("symmetric", np.eye(clones) + 0.1 * np.eye(clones, k=-1)),
+    ):
+        wrong_state = state._replace(clone_covariance=covariance)
+        yield f"state.clone_covariance: is not {problem}", {"state": wrong_state}
+    yield "frame: must be 'own' or 'given', found 'onw'", {"frame": "onw"}
+    yield "frame: must be 'own' or 'given', found None", {"frame": None}
+    position = np.zeros((INTERVALS, 2))
+    covariance = np.tile(np.eye(2), (INTERVALS, 1, 1))
+    fix = filtering.Fix(position, covariance, *np.ones((3, INTERVALS)))
+    for measurements, problem in (
+        (fix, r": must be a tuple of measurements, found Fix; write \(fix,\) for one$"),
+        (position, ": must be a tuple of measurements, found ndarray"),
+        (None, ": must be a tuple of measurements, found NoneType"),
+        ((fix, position), r"\[1\]: ndarray has no method update"),
+    ):
+        yield f"measurements{problem}", {"measurements": measurements}
     yield "state.rotation", {"state": state._replace(rotation=2 * jnp.eye(3))}
     lost = with_correlated_error(state)._replace(correlated=np.array([0.0, NAN, 0.0]))
     yield "state.correlated", {"state": lost, "noise": correlated}
@@ -79,13 +107,21 @@ def arguments(**others):
 
 def test_arguments_that_cannot_be_are_refused_by_name():
     for words, spoilt in wrong():
-        with pytest.raises(ValueError, match=f"^{words}"):
+        with unchecked(), pytest.raises(ValueError, match=f"^{words}"):
             filtering.run_filter(**arguments(**spoilt))
     missing = np.arange(SAMPLES) != 7
     checked_inputs(start(), put(GYRO, (7, 1), -101.0), ACCEL, missing, (), CONFIG, NOISE)
-    for too in ("covariance: 1 of", "noise.accel_density", "imu_valid: must"):
-        spoilt = next(each for words, each in wrong() if words.startswith(too))
-        with pytest.raises(ValueError, match=f"^{too}"):
+    for beginning in (
+        *(
+            "covariance: 1 of",
+            "noise.accel_density",
+            "imu_valid: must",
+            "frame: must",
+            "measurements",
+        ),
+    ):
+        spoilt = next(changes for words, changes in wrong() if words.startswith(beginning))
+        with unchecked(), pytest.raises(ValueError, match=f"^{beginning}"):
             filtering.smooth(**arguments(**spoilt))
 
 
@@ -142,9 +178,33 @@ def test_the_precision_is_asked_for():
     assert all(leaf.dtype == jnp.float32 for leaf in floating)
 
 
-def test_inside_jit_the_history_reports_it():
-    run = jax.jit(lambda given: filtering.run_filter(config=CONFIG, **given)[1])
+@pytest.mark.parametrize("correlation", [None, filtering.CorrelatedError()])
+def test_inside_jit_the_history_reports_it(correlation):
+    """Also where the χ² gate tests the displacement: row 10 is its sixth."""
+    config = dataclasses.replace(CONFIG, convergence_seconds=0.0)
+    noise = NOISE._replace(correlation=correlation)
+    run = jax.jit(
+        lambda arguments: filtering.run_filter(config=config, noise=noise, **arguments)[1]
+    )
     for name, bad in (("gyro", 1), ("covariance", 10)):
-        spoilt = next(each for words, each in wrong() if words.startswith(f"{name}: 1 of"))
-        given = {k: v for k, v in arguments(**spoilt).items() if k != "config"}
-        np.testing.assert_array_equal(run(given).healthy, np.arange(INTERVALS) < bad)
+        spoilt = next(changes for words, changes in wrong() if words.startswith(f"{name}: 1 of"))
+        values = arguments(**spoilt)
+        history = run({k: v for k, v in values.items() if k not in ("config", "noise")})
+        np.testing.assert_array_equal(history.healthy, np.arange(INTERVALS) < bad)
+
+
+def test_what_a_run_in_float32_leaves_is_a_state():
+    """Its covariances are those of a start, up to rounding, and a later run takes it."""
+    config = dataclasses.replace(CONFIG, allow_float32=True)
+    values = arguments(state=filtering.initial_state(config, *POSE), config=config)
+    single = {
+        name: np.asarray(values[name], np.float32)
+        for name in ("gyro", "accel", "displacement", "covariance")
+    }
+    state = jax.tree.map(
+        lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf,
+        values["state"],
+    )
+    for _ in range(3):
+        state, history = filtering.run_filter(**{**values, **single, "state": state})
+    assert history.healthy.all() and state.clone_covariance.dtype == np.float32

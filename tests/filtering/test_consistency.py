@@ -87,8 +87,8 @@ def test_certainty_agrees_with_the_errors():
         found = nees_of(error, spread, index)[20:]
         low, high = bounds(len(index) * RUNS)
         assert low < found.mean() < high, (name, found.mean())
-        # of single times one in twenty is outside
-        assert np.mean((found > low) & (found < high)) > 0.75, name
+        # Of single times one in twenty is outside, and their errors are those of times nearby.
+        assert np.mean((found > low) & (found < high)) > 0.6, name
     low, high = bounds(3 * RUNS)
     by_time = nis[:, CLONES:].mean(0) / 3
     assert np.mean((by_time > low) & (by_time < high)) > 0.92
@@ -125,7 +125,7 @@ def test_it_is_as_certain_as_it_may_be_with_correlated_errors():
         assert 0.7 < nees_of(error, spread, index)[100:].mean() < 1.4, name
     white, too_small, _, _ = monte_carlo(runs, CORRELATED_SIGMA)
     assert nees_of(white, too_small, position)[100:].mean() > 4
-    squares = [np.mean(e[:, -1, position] ** 2) for e in (error, white)]
+    squares = [np.mean(e[:, 100:, position] ** 2) for e in (error, white)]
     assert squares[0] < squares[1]
 
 

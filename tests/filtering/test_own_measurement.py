@@ -15,7 +15,7 @@ from tests.support.random_walk import random_walk
 from tests.support.whole_covariance import covariance
 
 N, CLONES, INTERVALS, DT = 5, 4, 30, 0.02
-CONFIG = filtering.FilterConfig(DT, N, CLONES, history="core")
+CONFIG = filtering.FilterConfig(DT, N, CLONES, history="core", error="additive")
 NOISE = filtering.NoiseModel(2e-3, 2e-2, measurement_scale=1.0)
 START, GYRO, ACCEL, DISPLACEMENT, SPREAD = random_walk(
     5, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, nan_rows=[9, 17]

@@ -93,6 +93,6 @@ def test_update_has_finite_derivatives_everywhere(frame, pitch, apart, accepted)
     given = state, np.array([apart + 0.1, 0, 0]), 0.01 * np.eye(3)
     gradients, (new, outcome) = update_gradient(*given, frame)
     floats = [leaf for leaf in jax.tree.leaves(gradients) if leaf.dtype == jnp.float64]
-    assert len(floats) == 17 and all(np.isfinite(leaf).all() for leaf in floats)
+    assert len(floats) == 18 and all(np.isfinite(leaf).all() for leaf in floats)
     assert bool(outcome.accepted) == accepted and outcome.present
     assert (new.clone_offset != state.clone_offset).any() == accepted

@@ -16,7 +16,9 @@ from tests.support import scekf_numpy
 from tests.support.odometry import DT, INTERVALS, PARAMETERS, N, recording, start
 
 CLONES = 4
-CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, context_samples=6)
+CONFIG = filtering.FilterConfig(
+    DT, N, CLONES, convergence_seconds=0.6, context_samples=6, error="additive"
+)
 FIRST = 5
 """Interval that ends with a measurement: the first with its context."""
 NOISE = filtering.NoiseModel(measurement_scale=2.0, std_factor=(1.5, 0.5, 2.0))

@@ -29,8 +29,9 @@ def assert_close(found, wanted, absolute, relative=0.0):
 
 def replay(name):
     run = dict(np.load(RECORDED / f"{name}.npz"))
-    lengths = ("dt", "samples_per_clone", "clones_per_window", "mahalanobis_fail_scale")
-    config = filtering.FilterConfig(*(run[key] for key in lengths), history="core")
+    names = ("dt", "samples_per_clone", "clones_per_window", "mahalanobis_fail_scale")
+    settings = {name: run[name] for name in names}
+    config = filtering.FilterConfig(**settings, history="core", error="additive")
     state = filtering.initial_state(config, run["rotation0"], run["velocity0"], run["position0"])
     covariance = run["displacement_std"][:, :, None] ** 2 * np.eye(3)
     given = run["gyro"], run["accel"], run["displacement"], covariance
@@ -81,6 +82,7 @@ GATED = functools.partial(
     success_seconds=0.3,
     pause_seconds=0.5,
     history="core",
+    error="additive",  # as the oracle has it
 )
 # One rejected row; ten in a row, so that the gate gives up and pauses; rejected rows around missing
 # ones.
@@ -230,7 +232,7 @@ def test_without_size_and_without_fixes_nothing_changes():
 
 def test_the_shortest_intervals_and_windows():
     walk = random_walk(2, n=1, clones=1, intervals=30, dt=0.05, nan_rows=(9, 10))
-    config = filtering.FilterConfig(0.05, 1, 1, convergence_seconds=0.5)
+    config = filtering.FilterConfig(0.05, 1, 1, convergence_seconds=0.5, error="additive")
     _, history = ours(config, noise_of(config), walk)
     assert history.covariance is None
     assert_same(history, oracle(config, noise_of(config), walk))

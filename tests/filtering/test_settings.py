@@ -1,10 +1,18 @@
 """The filter that the settings of an experiment describe, and its numbers as free parameters."""
 
+import dataclasses
+
 import jax
 import numpy as np
 
 from gnio_jax import filtering
-from gnio_jax.filtering.settings import free_parameters, with_free_parameters
+from gnio_jax.config import DataConfig, FilterSettings
+from gnio_jax.filtering.settings import (
+    FIXED,
+    filter_config,
+    free_parameters,
+    with_free_parameters,
+)
 from tests.support.filter_settings import changed
 
 
@@ -23,3 +31,25 @@ def test_free_parameters_and_back():
         lambda u: with_free_parameters(settings, {"noise.correlation.share": u}).noise[6][0]
     )
     np.testing.assert_allclose(slope(np.log(1 / 3)), 0.25 * 0.75)
+
+
+def test_every_setting_of_the_filter_is_reachable_from_a_file_or_fixed_by_name():
+    """And a value that a file gives is the value that the filter has."""
+    options = {field.name for field in dataclasses.fields(FilterSettings)}
+    fields = {field.name for field in dataclasses.fields(filtering.FilterConfig)}
+    assert fields == (options & fields) | FIXED.keys() and not options & FIXED.keys()
+    others = {
+        **{name: 0.5 for name in ("success_seconds", "pause_seconds", "rest_seconds")},
+        **{name: 0.25 for name in ("rest_gyro", "rest_accel", "bridge_seconds")},
+        **{name: 0.75 for name in ("gap_gyro_std", "gap_accel_std", "zero_velocity_std")},
+        **{"gate_threshold": 7.0, "convergence_seconds": 3.0},
+        **{"log_std_min": -5.0, "speed_limit": 9.0},
+        **{"error": "additive", "window_rotation": "single"},
+    }
+    assert others.keys() | {"mahalanobis_fail_scale"} == options & fields
+    config = filter_config(DataConfig(), FilterSettings(**others))
+    assert {name: getattr(config, name) for name in others} == others
+    scaled = FilterSettings(mahalanobis_fail_scale=8.0)
+    assert filter_config(DataConfig(), scaled).mahalanobis_fail_scale == 8.0
+    assert filter_config(DataConfig(), FilterSettings()).invariant
+    assert not filter_config(DataConfig(), FilterSettings(window_rotation="tlio")).invariant

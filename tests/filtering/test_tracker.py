@@ -150,6 +150,20 @@ def test_equals_the_scan(config, missing):
     jax.tree.map(np.asarray, state)  # the caller's own start is still his
 
 
+def test_goes_on_from_a_state_that_a_run_left(tracker):
+    """As a run from this state does, whose clones are held in another form inside a run."""
+    gyro, accel = recording()
+    everywhere = np.ones(len(gyro), bool)
+    state, _ = scan(start(), gyro, accel, everywhere)
+    assert np.abs(state.clone_covariance).max() > 0
+    tracker._start(state)
+    _, history = scan(state, gyro, accel, everywhere)
+    poses = feed(tracker, gyro, accel, np.arange(len(gyro)) * DT)
+    for name in (*Mean._fields, "covariance"):
+        rows = np.array([getattr(pose, name) for pose in poses])
+        np.testing.assert_allclose(rows, getattr(history, name), rtol=1e-9, atol=1e-9, err_msg=name)
+
+
 @pytest.mark.parametrize("config, last", [(CONFIG, 36), (AS_TLIO, 35)], ids=["ours", "TLIO's"])
 def test_windows_with_a_long_hole_are_no_measurements(config, last):
     """Coasting are samples 122 … 127, in intervals 30 and 31: in the windows, with what is before

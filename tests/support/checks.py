@@ -1,8 +1,20 @@
 """The run-time checks of shapes and types, where tens of thousands of calls would pay for them."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 from jaxtyping import config
+
+
+@contextmanager
+def unchecked() -> Iterator[None]:
+    """Nothing is checked inside: for arguments that a function refuses by itself, as a user's
+    process calls it."""
+    config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        config.update("jaxtyping_disable", False)
 
 
 def checked_at_first(samples: Iterable, count: int = 200) -> Iterator:

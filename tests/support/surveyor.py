@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.simulated.walker import Motion, integral, smooth_steps, wander
+from gnio_jax.data.simulated.walker import PhoneMotion, integral, smooth_steps, wander
 from gnio_jax.data.simulated.walks import PHONE, walk_sequence
 from gnio_jax.numerics import about_z
 from gnio_jax.types import Sequence, Waypoints
@@ -60,6 +60,6 @@ def survey(seed: int, legs: int = 8, pause: float = 0.0) -> Survey:
     aim, tilt = rng.normal(0.0, 0.05), rng.uniform(0.2, 0.7)
     held = Rotation.from_euler("ZXY", [aim - np.pi / 2, tilt, rng.normal(0.0, 0.05)])
     attitude = turn * Rotation.from_rotvec(wander(rng, time, 3, 0.05, 0.02, 0.9)) * held
-    motion = Motion(time, path(time) - path(0.0), path.derivative()(time), attitude)
+    motion = PhoneMotion(time, path(time) - path(0.0), path.derivative()(time), attitude)
     truth = walk_sequence(rng, f"survey {seed}", motion, 1 / RATE, PHONE, {})
     return Survey(truth, np.concatenate([[0.0], ends]))

@@ -7,8 +7,8 @@ import pytest
 
 from gnio_jax.evaluation import tabulate
 from gnio_jax.tables import make, plots
-from gnio_jax.tables.experiments import Experiment, Row
-from gnio_jax.tables.runs import Result
+from gnio_jax.tables.experiments import Experiment, TableRow
+from gnio_jax.tables.runs import RowResult
 from tests.support.reports import BASE, LOST, report_of
 
 
@@ -18,7 +18,7 @@ def result(name, ates, published=None, groups="xyz"):
     of = dict(zip(names, groups, strict=False))
     reports = [report_of(dict(zip(names, row, strict=True)), of) for row in ates]
     runs = [f"{name}_s{seed}" for seed in range(len(ates))]
-    return Result(Row(name, name.upper(), BASE, published), reports, runs, runs)
+    return RowResult(TableRow(name, name.upper(), BASE, published), reports, runs, runs)
 
 
 def table_of(*results):

@@ -1,6 +1,7 @@
 """Runs that are there already."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,22 +13,25 @@ from gnio_jax.tables import runs
 from tests.support.reports import BASE, write_run
 
 
-def test_a_calibration_is_of_the_best_checkpoint(tmp_path, monkeypatch):
+def test_a_calibration_is_of_the_best_checkpoint_and_warns(tmp_path, monkeypatch, capsys):
     run, made = tmp_path / "gnio_s0", []
 
     def calibrate(config, workers):
         made.append(config)
         (best,) = (run / "checkpoints" / "best").iterdir()
         (tmp_path / config.out / "checkpoints" / "best" / best.name).mkdir(parents=True)
+        return SimpleNamespace(warnings=("larger errors",))
 
     monkeypatch.setattr(runs.calibration, "calibrate", calibrate)
     (run / "checkpoints" / "best" / "7").mkdir(parents=True)
     for _ in range(2):
-        assert runs.calibrated(run, Lines()) == tmp_path / "gnio_s0_calibrated"
+        assert runs.calibrate_run(run, Lines()) == tmp_path / "gnio_s0_calibrated"
+    expected = ["calibrating gnio_s0", "warning: gnio_s0_calibrated: larger errors"]
+    assert capsys.readouterr().err.splitlines() == expected
     assert made == [CalibrateConfig(str(run), out=str(tmp_path / "gnio_s0_calibrated"))]
     # The run goes on and finds a better checkpoint: what was fitted to the old one is replaced.
     (run / "checkpoints" / "best" / "7").rename(run / "checkpoints" / "best" / "9")
-    runs.calibrated(run, Lines())
+    runs.calibrate_run(run, Lines())
     (kept,) = (tmp_path / "gnio_s0_calibrated" / "checkpoints" / "best").iterdir()
     assert len(made) == 2 and kept.name == "9"
 

@@ -321,6 +321,20 @@ def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(
     assert checkpoint.load_run(tmp_path / "run").epoch == epoch
 
 
+@pytest.mark.parametrize(
+    "begin, figures, epoch",
+    [(0.0, (1.0, 2.0, 3.0), 1), (1.0, (-9.0, 1.0, 2.0), 2), (2.0, (-9.0, -8.0, 1.0, 2.0), 3)],
+)
+def test_the_first_whole_epoch_of_what_is_trained_can_be_the_best(
+    counted, tmp_path, begin, figures, epoch
+):
+    """Here what is trained changes between two epochs, or before the first one."""
+    loss = LossConfig(nll_from_epoch=begin)
+    outcome, _ = counted([(value, 1.0) for value in figures], loss=loss)
+    assert outcome.best_loss == 1.0
+    assert checkpoint.load_run(tmp_path / "run").epoch == epoch
+
+
 def test_nan_on_validation_is_never_the_best(counted, tmp_path):
     nan, infinite = float("nan"), float("inf")
     outcome, _ = counted([(nan, nan), (3.0, 3.0), (infinite, 1.0), (2.0, 2.0), (4.0, 4.0)])

@@ -180,6 +180,14 @@ def test_schedule_of_the_paper(epochs, warmup):
     np.testing.assert_allclose(jax.jit(jax.vmap(rate))(steps), expected, rtol=1e-4)
 
 
+@pytest.mark.parametrize("scale", [300.0, 0.01])
+def test_the_whole_schedule_of_the_filter_is_scaled(scale):
+    """Its start, its peak and the end of its cosine."""
+    rate, steps = optimizer.schedule(OptimConfig(epochs=4), 7, scale), np.arange(7 * 4 + 1)
+    expected = [scale * by_formula(step, 7, 2, 4) for step in steps]
+    np.testing.assert_allclose(jax.jit(jax.vmap(rate))(steps), expected, rtol=1e-4)
+
+
 def test_plateau_waits_for_its_epochs_and_starts_counting_anew(monkeypatch):
     monkeypatch.setattr(optimizer, "PLATEAU_EPOCHS", 2)
     monkeypatch.setattr(optimizer, "PLATEAU_FACTOR", 0.5)

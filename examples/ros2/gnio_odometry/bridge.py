@@ -16,13 +16,13 @@ class Odometry(NamedTuple):
     stamp: tuple[int, int]
     """(sec, nanosec) of the pose."""
     position: tuple[float, float, float]
-    """In the frame `odom`, m."""
+    """Position in the frame `odom`, m."""
     orientation: tuple[float, float, float, float]
     """x, y, z, w: from the IMU to `odom`."""
     velocity: tuple[float, float, float]
-    """In the IMU's frame, as nav_msgs/Odometry asks for it, m/s."""
+    """Velocity in the IMU's frame, as nav_msgs/Odometry wants it, m/s."""
     rate: tuple[float, float, float]
-    """In the IMU's frame, rad/s: that of the message, without the gyro's bias."""
+    """Angular rate in the IMU's frame, rad/s: that of the message, without the gyro's bias."""
     pose_covariance: list[float]
     """36 numbers, row by row: x, y, z, and rotation about the fixed axes x, y, z of `odom`."""
     twist_covariance: list[float]
@@ -42,7 +42,7 @@ class Bridge:
         """Why the newest of them was refused."""
 
     def take(self, message: Any) -> Odometry | None:
-        """One message; returns the odometry of a clone step, if it made one.
+        """Take one message, and return the odometry of a clone step, if it made one.
 
         `linear_acceleration` must contain gravity, as REP 145 wants it of raw data.
         """

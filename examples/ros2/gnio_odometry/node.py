@@ -28,47 +28,49 @@ class GnioOdometry(Node):
         super().__init__("gnio_odometry")
         weights = self.declare_parameter("weights", "pedestrian").value
         rate = self.declare_parameter("imu_rate", 0.0).value
-        rest = self.declare_parameter("rest_seconds", 1.0).value
+        rest_seconds = self.declare_parameter("rest_seconds", 1.0).value
         self._odom = self.declare_parameter("odom_frame", "odom").value
         self._imu = self.declare_parameter("imu_frame", "imu_link").value
         publish_tf = self.declare_parameter("publish_tf", True).value
         run = packages.load_pretrained(weights)
-        self._bridge = Bridge(live.create_tracker(run, rate or None, rest))
+        self._bridge = Bridge(live.create_tracker(run, rate or None, rest_seconds))
         self._publisher = self.create_publisher(Odometry, "odometry", 10)
         self._transforms = TransformBroadcaster(self) if publish_tf else None
         self.create_subscription(Imu, "imu", self._take, SENSOR_DATA)
-        self.get_logger().info(f"ready with {weights}; keep the device still for {rest:g} s")
+        self.get_logger().info(
+            f"ready with {weights}; keep the device still for {rest_seconds:g} s"
+        )
 
     def _take(self, message: Imu) -> None:
-        refused = self._bridge.refused
-        found = self._bridge.take(message)
-        if self._bridge.refused > refused:
+        refusals = self._bridge.refused
+        estimate = self._bridge.take(message)
+        if self._bridge.refused > refusals:
             self.get_logger().warning(self._bridge.reason, throttle_duration_sec=5.0)
-        if found is None:
+        if estimate is None:
             return
         odometry = Odometry()
-        odometry.header.stamp.sec, odometry.header.stamp.nanosec = found.stamp
+        odometry.header.stamp.sec, odometry.header.stamp.nanosec = estimate.stamp
         odometry.header.frame_id = self._odom
         odometry.child_frame_id = message.header.frame_id or self._imu
-        place, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
-        place.x, place.y, place.z = found.position
-        turn.x, turn.y, turn.z, turn.w = found.orientation
+        position, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
+        position.x, position.y, position.z = estimate.position
+        turn.x, turn.y, turn.z, turn.w = estimate.orientation
         speed = odometry.twist.twist.linear
-        speed.x, speed.y, speed.z = found.velocity
+        speed.x, speed.y, speed.z = estimate.velocity
         rate = odometry.twist.twist.angular
-        rate.x, rate.y, rate.z = found.rate
-        odometry.pose.covariance = found.pose_covariance
-        odometry.twist.covariance = found.twist_covariance
+        rate.x, rate.y, rate.z = estimate.rate
+        odometry.pose.covariance = estimate.pose_covariance
+        odometry.twist.covariance = estimate.twist_covariance
         self._publisher.publish(odometry)
         if self._transforms is not None:
             self._send_transform(odometry)
 
     def _send_transform(self, odometry: Odometry) -> None:
-        """From the IMU's frame to `odom`."""
+        """Send the transform from the IMU's frame to `odom`."""
         transform = TransformStamped()
         transform.header, transform.child_frame_id = odometry.header, odometry.child_frame_id
-        place, move = odometry.pose.pose.position, transform.transform.translation
-        move.x, move.y, move.z = place.x, place.y, place.z
+        position, move = odometry.pose.pose.position, transform.transform.translation
+        move.x, move.y, move.z = position.x, position.y, position.z
         transform.transform.rotation = odometry.pose.pose.orientation
         self._transforms.sendTransform(transform)
 

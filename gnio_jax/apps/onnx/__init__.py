@@ -5,6 +5,6 @@ exported functions, `conversion` turns them into models, and `driver` is the loo
 which docs/deployment.md explains.
 """
 
-from gnio_jax.apps.onnx.run import Exported, export_run
+from gnio_jax.apps.onnx.run import ExportResult, export_run
 
-__all__ = ["Exported", "export_run"]
+__all__ = ["ExportResult", "export_run"]

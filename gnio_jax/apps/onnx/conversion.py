@@ -37,16 +37,16 @@ def to_model(program: Program, setup: FilterSetup) -> bytes:
 
     names, shapes = list(program.inputs), list(program.inputs.values())
 
-    def flat(*values: Any) -> list[Any]:
-        found = program.function(dict(zip(names, values, strict=True)))
-        return [found[name] for name in program.outputs]
+    def call_flat(*values: Any) -> list[Any]:
+        results = program.function(dict(zip(names, values, strict=True)))
+        return [results[name] for name in program.outputs]
 
     converted = to_onnx(
-        jaxpr_as_fun(jax.make_jaxpr(flat)(*shapes)),
+        jaxpr_as_fun(jax.make_jaxpr(call_flat)(*shapes)),
         shapes,
         model_name=program.name,
         opset=OPSET,
-        enable_double_precision=any(each.dtype == np.float64 for each in shapes),
+        enable_double_precision=any(shape.dtype == np.float64 for shape in shapes),
         return_mode="ir",
     )
     model = onnx_ir.to_proto(RemoveUnusedNodesPass()(converted).model)
@@ -66,16 +66,16 @@ def _name_ends(graph: Any, program: Program) -> None:
     outputs, or an input and an output. ONNX Runtime removes the copies."""
     from onnx import helper
 
-    at_start = zip(program.inputs, graph.input, strict=True)
-    at_end = zip(program.outputs, graph.output, strict=True)
+    inputs = zip(program.inputs, graph.input, strict=True)
+    outputs = zip(program.outputs, graph.output, strict=True)
     nodes = [
-        *(helper.make_node("Identity", [ours], [theirs.name]) for ours, theirs in at_start),
+        *(helper.make_node("Identity", [name], [port.name]) for name, port in inputs),
         *graph.node,
-        *(helper.make_node("Identity", [theirs.name], [ours]) for ours, theirs in at_end),
+        *(helper.make_node("Identity", [port.name], [name]) for name, port in outputs),
     ]
     del graph.node[:], graph.input[:], graph.output[:], graph.value_info[:]
     graph.node.extend(nodes)
     for ends, arrays in ((graph.input, program.inputs), (graph.output, program.outputs)):
-        for name, each in arrays.items():
-            dtype = helper.np_dtype_to_tensor_dtype(each.dtype)
-            ends.append(helper.make_tensor_value_info(name, dtype, each.shape))
+        for name, shape in arrays.items():
+            dtype = helper.np_dtype_to_tensor_dtype(shape.dtype)
+            ends.append(helper.make_tensor_value_info(name, dtype, shape.shape))

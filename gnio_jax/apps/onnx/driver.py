@@ -31,7 +31,7 @@ class Models(NamedTuple):
     log_std_min: float
 
 
-class Walked(NamedTuple):
+class WalkResult(NamedTuple):
     """The results of the models for K clone intervals."""
 
     windows: Float[np.ndarray, "m n 6"]
@@ -76,8 +76,8 @@ def open_session(path: Path, threads: int = 1) -> Any:
 
 def run(session: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Outputs by name; of `arrays` the session gets those that it takes."""
-    inputs = {each.name: arrays[each.name] for each in session.get_inputs()}
-    names = [each.name for each in session.get_outputs()]
+    inputs = {array.name: arrays[array.name] for array in session.get_inputs()}
+    names = [array.name for array in session.get_outputs()]
     return dict(zip(names, session.run(names, inputs), strict=True))
 
 
@@ -86,10 +86,10 @@ def walk(
     state: Mapping[str, np.ndarray],
     gyro: Float[np.ndarray, "s 3"],
     accel: Float[np.ndarray, "s 3"],
-) -> Walked:
+) -> WalkResult:
     """Filter K·n samples, rad/s and m/s², raw, from the state of `models.start` or
     `start_arrays`."""
-    n = next(each.shape[0] for each in models.step.get_inputs() if each.name == "gyro")
+    n = next(array.shape[0] for array in models.step.get_inputs() if array.name == "gyro")
     windows, displacements, poses = [], [], []
     for k in range(len(gyro) // n):
         rows = slice(k * n, (k + 1) * n)
@@ -100,19 +100,19 @@ def walk(
             measured = measure(models, window)
             windows.append(window[0])
             displacements.append(measured["displacement"])
-        after = run(models.step, {**state, **stride, **measured})
-        state = {STATE + name.removeprefix(NEXT): value for name, value in after.items()}
-        poses.append(after)
+        outputs = run(models.step, {**state, **stride, **measured})
+        state = {STATE + name.removeprefix(NEXT): value for name, value in outputs.items()}
+        poses.append(outputs)
     position, rotation, covariance = (
         np.array([pose[POSE + name] for pose in poses])
         for name in ("position", "rotation", "covariance")
     )
-    return Walked(np.array(windows), np.array(displacements), position, rotation, covariance)
+    return WalkResult(np.array(windows), np.array(displacements), position, rotation, covariance)
 
 
 def measure(models: Models, window: Float[np.ndarray, "1 n 6"]) -> dict[str, np.ndarray]:
     """The prediction of the network for a window, in the form that the filter step takes."""
-    predicted = run(models.network, {"window": window})
-    log_std = np.maximum(predicted["log_std"][0].astype(float), models.log_std_min)
-    displacement = predicted["displacement"][0].astype(float)
+    prediction = run(models.network, {"window": window})
+    log_std = np.maximum(prediction["log_std"][0].astype(float), models.log_std_min)
+    displacement = prediction["displacement"][0].astype(float)
     return {"displacement": displacement, "covariance": np.diag(np.exp(2 * log_std))}

@@ -83,12 +83,12 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
     def start(arrays: Arrays) -> dict[str, Array]:
         """`level_state` of a second at rest."""
         state = level_state(config, arrays["gyro"], arrays["accel"], setup.initial_std)
-        return _to_arrays(_started(state, setup))
+        return _to_arrays(_deploy_state(state, setup))
 
     def window(arrays: Arrays) -> dict[str, Array]:
         """`network_window` from the oldest clone of the next step to the end of that step."""
         state = _from_arrays(arrays, shape)
-        samples = _with_latest(state.samples, arrays)
+        samples = _append_samples(state.samples, arrays)
         oldest = (state.filter.step + 1) % config.clones
         signals = samples[:, GYRO], samples[:, ACCEL]
         return {"window": network_window(state.filter, oldest, *signals, config)}
@@ -96,8 +96,8 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
     def step(arrays: Arrays) -> dict[str, Array]:
         """`advance_filter` with a given displacement."""
         state = _from_arrays(arrays, shape)
-        given = arrays["displacement"], arrays["covariance"]
-        measurement = scaled_displacement(*given, noise, config.displacement_frame)
+        prediction = arrays["displacement"], arrays["covariance"]
+        measurement = scaled_displacement(*prediction, noise, config.displacement_frame)
         filtered, history = advance_filter(
             state.filter,
             Imu(arrays["gyro"], arrays["accel"], None),
@@ -107,22 +107,30 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
             config,
             noise,
         )
-        after = _to_arrays(DeployedState(filtered, _with_latest(state.samples, arrays)))
-        state_after = {NEXT + name.removeprefix(STATE): value for name, value in after.items()}
+        next_arrays = _to_arrays(DeployedState(filtered, _append_samples(state.samples, arrays)))
+        next_state = {NEXT + name.removeprefix(STATE): value for name, value in next_arrays.items()}
         fields = (name for name in Pose._fields if name != "time")
-        return state_after | {POSE + name: getattr(history, name)[0] for name in fields}
+        return next_state | {POSE + name: getattr(history, name)[0] for name in fields}
 
     def float64(*shape: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, jnp.float64)
 
-    state, n, rest = _to_arrays(shape), config.samples_per_clone, round(REST_SECONDS / config.dt)
+    state, n, rest_samples = (
+        _to_arrays(shape),
+        config.samples_per_clone,
+        round(REST_SECONDS / config.dt),
+    )
     read_by_window = {STATE + name: state[STATE + name] for name in _READ_BY_WINDOW}
     interval = {"gyro": float64(n, 3), "accel": float64(n, 3)}
     measured = {"displacement": float64(3), "covariance": float64(3, 3)}
     network_input = jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32)
     return [
         Program("network", infer, {"window": network_input}),
-        Program("filter_start", start, {"gyro": float64(rest, 3), "accel": float64(rest, 3)}),
+        Program(
+            "filter_start",
+            start,
+            {"gyro": float64(rest_samples, 3), "accel": float64(rest_samples, 3)},
+        ),
         Program("filter_window", window, read_by_window | interval),
         Program("filter_step", step, state | interval | measured),
     ]
@@ -137,16 +145,18 @@ def start_arrays(state: FilterState, setup: FilterSetup) -> dict[str, np.ndarray
     if state.step > 0:
         problem = f"is one after {int(state.step)} clone intervals of a run"
         raise ValueError(f"state: {problem}; a deployed filter begins with one without clones")
-    return {name: np.asarray(value) for name, value in _to_arrays(_started(state, setup)).items()}
+    return {
+        name: np.asarray(value) for name, value in _to_arrays(_deploy_state(state, setup)).items()
+    }
 
 
-def _started(state: FilterState, setup: FilterSetup) -> DeployedState:
+def _deploy_state(state: FilterState, setup: FilterSetup) -> DeployedState:
     """A deployed filter before its first sample."""
     state = checked_state(state, setup.config, setup.noise)
     return DeployedState(state, jnp.zeros((setup.config.reach, 6)))
 
 
-def _with_latest(samples: Array, arrays: Arrays) -> Array:
+def _append_samples(samples: Array, arrays: Arrays) -> Array:
     """The stored samples, shifted by those of a clone interval."""
     latest = jnp.concatenate([arrays["gyro"], arrays["accel"]], axis=1)
     return jnp.concatenate([samples, latest])[len(latest) :]

@@ -16,9 +16,8 @@ import numpy as np
 
 from gnio_jax.apps import packages
 from gnio_jax.apps.onnx import conversion, driver
-from gnio_jax.apps.onnx.driver import Walked
+from gnio_jax.apps.onnx.driver import WalkResult
 from gnio_jax.apps.onnx.programs import programs, start_arrays
-from gnio_jax.apps.track import tracking_filter
 from gnio_jax.config import DataConfig
 from gnio_jax.config.files import plain
 from gnio_jax.data.simulated.walks import pedestrian
@@ -26,7 +25,7 @@ from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
 from gnio_jax.evaluation.metrics import ate
 from gnio_jax.files import fingerprint, replacing_folder
-from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.filtering.settings import FilterSetup, filter_setup
 from gnio_jax.models import Network
 
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
@@ -58,12 +57,12 @@ class Deviation(NamedTuple):
     position_largest: float
     """Deviation of the filter, m."""
     ate: float
-    """Error of the exported odometry against the truth, m …"""
+    """Error of the exported odometry against the truth, m."""
     ate_of_package: float
-    """… and of the package's own."""
+    """Error of the package's own odometry against the truth, m."""
 
 
-class Exported(NamedTuple):
+class ExportResult(NamedTuple):
     """The result of `export_run`."""
 
     folder: Path
@@ -72,7 +71,7 @@ class Exported(NamedTuple):
     deviation: Deviation
 
 
-def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Exported:
+def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> ExportResult:
     """Export the network and the filter of a run or package into the folder `out`.
 
     The filter is that of `gnio track`. The models are then run over a simulated walk of this
@@ -84,9 +83,10 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(out, "is there already", "name another --out, or remove it")
     require_packages("gnio export", "onnx", *PACKAGES)
-    place = packages.find(which)
-    run = packages.load_pretrained(place)
-    network, setup = Network.of(run.model, run.variables), tracking_filter(run)
+    source = packages.find(which)
+    run = packages.load_pretrained(source)
+    network = Network.of(run.model, run.variables)
+    setup = filter_setup(run.config.data, run.config.filter)
     with replacing_folder(out) as folder, ExitStack() as at_end:
         at_end.callback(logging.disable, logging.root.manager.disable)
         logging.disable(logging.WARNING)  # Converters write a log line for almost every node.
@@ -96,23 +96,23 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
             (folder / f"{program.name}.onnx").write_bytes(content)
             files[f"{program.name}.onnx"] = {
                 **fingerprint(content),
-                "inputs": _described(program.inputs),
-                "outputs": _described(program.outputs),
+                "inputs": _describe_arrays(program.inputs),
+                "outputs": _describe_arrays(program.outputs),
             }
         windows = run.config.data
         walk = draw_walk(windows, setup, seconds)
         start = walk.start.state(setup.config)
         models = driver.open_models(folder)
-        found = driver.walk(models, start_arrays(start, setup), walk.gyro, walk.accel)
-        (own,) = estimate([walk], network, windows, setup._replace(considered=None))
-        deviation = deviation_of(found, own)
-        check(deviation, place.name)
+        result = driver.walk(models, start_arrays(start, setup), walk.gyro, walk.accel)
+        (package_estimate,) = estimate([walk], network, windows, setup._replace(considered=None))
+        deviation = deviation_of(result, package_estimate)
+        check(deviation, source.name)
         manifest = {
             "format": FORMAT,
             "version": VERSION,
             "made_by": f"gnio-jax {version('gnio-jax')}",
             "conventions": CONVENTIONS,
-            "run": place.name,
+            "run": source.name,
             "network": run.config.model.name,
             "epoch": run.epoch,
             "step": run.step,
@@ -122,14 +122,14 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
         }
         text = json.dumps(manifest, indent=2, ensure_ascii=False, allow_nan=False)
         (folder / "export.json").write_text(text + "\n", encoding="utf-8")
-    return Exported(out, {name: each["bytes"] for name, each in files.items()}, deviation)
+    return ExportResult(out, {name: file["bytes"] for name, file in files.items()}, deviation)
 
 
-def _described(arrays: dict[str, jax.ShapeDtypeStruct]) -> list[dict[str, Any]]:
+def _describe_arrays(arrays: dict[str, jax.ShapeDtypeStruct]) -> list[dict[str, Any]]:
     """Name, shape and type of the inputs or outputs of a model."""
     return [
-        {"name": name, "shape": list(each.shape), "dtype": str(each.dtype)}
-        for name, each in arrays.items()
+        {"name": name, "shape": list(array.shape), "dtype": str(array.dtype)}
+        for name, array in arrays.items()
     ]
 
 
@@ -155,29 +155,32 @@ def _filter(setup: FilterSetup) -> dict[str, Any]:
 def draw_walk(windows: DataConfig, setup: FilterSetup, seconds: float) -> Recording:
     """A pedestrian at the network's rate, with its true start."""
     length = seconds + 1.0 / windows.rate  # a stride ends with the sample after it
-    drawn = pedestrian(SEED, PERSON, PLACEMENT, seconds=length, rate=windows.rate)
-    (walk,), _ = prepare([drawn], windows, setup.initial_std)
+    sequence = pedestrian(SEED, PERSON, PLACEMENT, seconds=length, rate=windows.rate)
+    (walk,), _ = prepare([sequence], windows, setup.initial_std)
     return walk
 
 
-def deviation_of(found: Walked, own: Estimate) -> Deviation:
+def deviation_of(result: WalkResult, package_estimate: Estimate) -> Deviation:
     """The deviation of the models' walk from the package's own."""
-    ours, true = (each.position[1:] for each in (own.trajectory, own.reference))
-    assert own.displacements is not None
-    given = own.displacements.value[-len(found.displacement) :]
-    apart = np.linalg.norm(found.displacement - given, axis=1)
+    position, true = (
+        trajectory.position[1:]
+        for trajectory in (package_estimate.trajectory, package_estimate.reference)
+    )
+    assert package_estimate.displacements is not None
+    displacement = package_estimate.displacements.value[-len(result.displacement) :]
+    error = np.linalg.norm(result.displacement - displacement, axis=1)
     return Deviation(
-        displacement_rms=float(np.sqrt(np.mean(apart**2))),
-        displacement_largest=float(apart.max()),
-        position_largest=float(np.linalg.norm(found.position - ours, axis=1).max()),
-        ate=ate(found.position, true),
-        ate_of_package=ate(ours, true),
+        displacement_rms=float(np.sqrt(np.mean(error**2))),
+        displacement_largest=float(error.max()),
+        position_largest=float(np.linalg.norm(result.position - position, axis=1).max()),
+        ate=ate(result.position, true),
+        ate_of_package=ate(position, true),
     )
 
 
-def check(found: Deviation, where: Any) -> None:
+def check(deviation: Deviation, where: Any) -> None:
     """Raise `InputError` if an export deviates from the package's odometry."""
-    largest = found.displacement_largest, found.position_largest
+    largest = deviation.displacement_largest, deviation.position_largest
     if not (largest[0] <= DISPLACEMENT_LIMIT and largest[1] <= POSITION_LIMIT):
         problem = f"the conversion is off by {largest[0]:.2g} m a window, {largest[1]:.2g} m a walk"
         raise InputError(where, problem, "another version of jax2onnx may be more accurate")

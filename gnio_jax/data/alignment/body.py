@@ -34,10 +34,10 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import fminbound, least_squares
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.assembly import Samples, Streams, ordered
+from gnio_jax.data.assembly import Samples, Streams, sort_streams
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.reference import LOST_POSES, Poses, longest_trusted, one_sign
-from gnio_jax.data.resampling import known_at, splined
+from gnio_jax.data.resampling import covered_at, interpolate_splines
 from gnio_jax.numerics import (
     hat,
     interpolate,
@@ -134,7 +134,8 @@ class BodyFit(NamedTuple):
     """Power of the filtered angular rate's error over that of the tracker's angular rate: 0 for a
     perfect fit, 1 for one that explains nothing."""
     accel_unexplained: float
-    """The same for the acceleration, without gravity."""
+    """Power of the filtered acceleration's error over that of the tracker's acceleration, without
+    gravity."""
     runner_up: float
     """The unexplained share of this fit over that of the best fit with another lag; 0 if there is
     no other, 1 if both are equally good."""
@@ -167,7 +168,7 @@ class BodyFit(NamedTuple):
         }
 
 
-def laid_on(
+def with_tracker_poses(
     phone: Streams,
     track: Poses,
     limits: Mapping[str, tuple[float, str]],
@@ -175,8 +176,9 @@ def laid_on(
     search_seconds: float = 5.0,
     closest_runner_up: float = 1.0,
 ) -> Streams:
-    """A phone with a tracker's poses as its own, without the accelerometer's delay, and with the
-    fit's figures among its attributes. Raises `Refusal` if they do not fit together."""
+    """The phone's streams with the tracker's poses moved to the phone and its clock, with the delay
+    of its accelerometer removed, and with the fit's figures as attributes. Raises `Refusal` if both
+    do not fit together."""
     try:
         fit = align(phone, track, knot_seconds, search_seconds)
     except TooLittle as error:
@@ -201,17 +203,17 @@ def align(
     `search_seconds`. Raises `TooLittle` if too little of the track is usable, and `InputError` for
     damaged stamps. `check_fit` decides whether the best fit is good enough.
     """
-    imu = ordered(imu._replace(poses=track))
+    imu = sort_streams(imu._replace(poses=track))
     assert imu.poses is not None
     track = imu.poses
     check_lengths(SHORTEST_OVERLAP, imu.gyro, imu.accel, track)
-    felt, seen = _felt(imu), _seen(track)
-    thinned, knots = seen.rows(slice(None, None, THINNED)), uniform_knots(track.time, 30.0)
+    inertial, tracker = _inertial_signals(imu), _tracker_signals(track)
+    thinned, knots = tracker.rows(slice(None, None, THINNED)), uniform_knots(track.time, 30.0)
     candidates = []
-    for lag, extrinsic in _first_guesses(seen, felt, search_seconds)[:STARTS]:
+    for lag, extrinsic in _first_guesses(tracker, inertial, search_seconds)[:STARTS]:
         with suppress(TooLittle):
             unknowns = np.concatenate([np.zeros(LAG.start), np.full(len(knots), lag)])
-            candidates.append(_fit(thinned, felt, knots, extrinsic, unknowns))
+            candidates.append(_fit(thinned, inertial, knots, extrinsic, unknowns))
     if not candidates:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track overlap the IMU's samples")
     best = min(candidates, key=lambda fit: fit.unexplained)
@@ -223,7 +225,7 @@ def align(
     ]
     finer = uniform_knots(track.time, knot_seconds)
     unknowns = np.concatenate([best.unknowns[: LAG.start], np.interp(finer, knots, lag)])
-    fit = _fit(seen, felt, finer, best.extrinsic, unknowns)
+    fit = _fit(tracker, inertial, finer, best.extrinsic, unknowns)
     x, up = fit.unknowns, upward(fit.unknowns[TILT])
     return BodyFit(
         extrinsic=fit.extrinsic,
@@ -235,8 +237,8 @@ def align(
         accel_delay=float(x[DELAY]),
         gyro_residual=robust_std(fit.gyro),
         accel_residual=robust_std(fit.accel),
-        gyro_unexplained=unexplained(fit.gyro, fit.seen.rate),
-        accel_unexplained=unexplained(fit.accel, fit.seen.acceleration),
+        gyro_unexplained=unexplained(fit.gyro, fit.tracker.rate),
+        accel_unexplained=unexplained(fit.accel, fit.tracker.acceleration),
         runner_up=best.unexplained / min(others) if others else 0.0,
         turn_std=fit.turn_std,
         poses=_poses_of_the_imu(fit, finer, track, levelling(up)),
@@ -259,7 +261,7 @@ def check_fit(
             problem = f"does not move as the phone does: {share:.0%} of the power of its {what}"
             most = f"stays unexplained, at most {MOST_UNEXPLAINED[what]:.0%} is plausible"
             raise Refusal(source, f"{problem} {most}", remedy)
-    found = {
+    figures = {
         "lag": np.abs(fit.lag).max(),
         "lag's drift": np.ptp(fit.lag),
         "accel's delay": abs(fit.accel_delay),
@@ -271,8 +273,8 @@ def check_fit(
         "accel's bias": np.linalg.norm(fit.accel_bias),
     }
     for what, (most, unit) in limits.items():
-        if not found[what] <= most:
-            value = f"the {what} would be {found[what]:.3g} {unit}, at most {most:g} {unit}"
+        if not figures[what] <= most:
+            value = f"the {what} would be {figures[what]:.3g} {unit}, at most {most:g} {unit}"
             problem = f"fits the phone only with impossible values: {value} is plausible"
             raise Refusal(source, problem, remedy)
     if not fit.runner_up <= closest_runner_up:
@@ -291,12 +293,12 @@ def _poses_of_the_imu(
 ) -> Poses:
     # A track that strongly contradicts the accelerometer has jumped.
     contradiction = np.linalg.norm(fit.accel, axis=1)
-    jumps = fit.seen.time[contradiction > max(6.0, 8.0 * robust_std(fit.accel))]
-    kept = track.rows(np.flatnonzero(~near_any(track.time, jumps, jumps, 0.1)))
-    return kept._replace(
-        time=kept.time + np.interp(kept.time, knots, fit.unknowns[LAG]),
-        attitude=level * kept.attitude * fit.extrinsic,
-        position=level.apply(kept.position),
+    jumps = fit.tracker.time[contradiction > max(6.0, 8.0 * robust_std(fit.accel))]
+    poses = track.rows(np.flatnonzero(~near_any(track.time, jumps, jumps, 0.1)))
+    return poses._replace(
+        time=poses.time + np.interp(poses.time, knots, fit.unknowns[LAG]),
+        attitude=level * poses.attitude * fit.extrinsic,
+        position=level.apply(poses.position),
         lever=fit.extrinsic.inv().apply(fit.unknowns[LEVER]),
         noisy=True,
     )
@@ -316,8 +318,8 @@ def without_jumps(poses: Poses, fastest_turn: float, fastest: float) -> Poses:
 # --- both sides of the equations, filtered
 
 
-class _Seen(NamedTuple):
-    """The tracker's side where its poses are reliable."""
+class _TrackerSignals(NamedTuple):
+    """The tracker's side of both equations, filtered, where its poses are reliable."""
 
     time: Float[np.ndarray, " n"]
     """s, on the tracker's clock, `ROW_SECONDS` apart."""
@@ -330,12 +332,12 @@ class _Seen(NamedTuple):
     to_body: Float[np.ndarray, "n 3 3"]
     """Rᵀ."""
 
-    def rows(self, rows: np.ndarray | slice) -> _Seen:
-        return _Seen(*(values[rows] for values in self))
+    def rows(self, rows: np.ndarray | slice) -> _TrackerSignals:
+        return _TrackerSignals(*(values[rows] for values in self))
 
 
-class _Felt(NamedTuple):
-    """The IMU's side, at any time of its clock (s)."""
+class _InertialSignals(NamedTuple):
+    """The IMU's side of both equations, filtered, at any time of its clock (s)."""
 
     gyro: CubicSpline
     """rad/s."""
@@ -350,44 +352,48 @@ class _Felt(NamedTuple):
         return ~np.any([near_any(time, *gaps, MARGIN) for gaps in self.unknown], axis=0)
 
 
-def _seen(track: Poses) -> _Seen:
+def _tracker_signals(track: Poses) -> _TrackerSignals:
     clock, steps = np.arange(track.time[0], track.time[-1], 1.0 / RATE), np.diff(track.time)
     longest, sigma = LOST_POSES * float(np.median(steps)), FILTER_SECONDS * RATE
-    known = known_at(track.time, clock, longest)
-    rows = np.flatnonzero(~within(~known, int(np.ceil(3 * sigma))))[:: round(ROW_SECONDS * RATE)]
+    present = covered_at(track.time, clock, longest)
+    rows = np.flatnonzero(~within(~present, int(np.ceil(3 * sigma))))[:: round(ROW_SECONDS * RATE)]
     if len(rows) * ROW_SECONDS < SHORTEST_OVERLAP:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track hold poses in a row")
     poses = np.concatenate([one_sign(quaternions(track.attitude)), track.position], axis=1)
-    wxyz, place = np.split(splined(track.time, poses, clock, steps > longest), [4], axis=1)
+    wxyz, position = np.split(
+        interpolate_splines(track.time, poses, clock, steps > longest), [4], axis=1
+    )
     attitude = rotations(wxyz)
     turning, matrices = turns_between(attitude) * RATE, attitude.as_matrix()
     to_body = matrices.transpose(0, 2, 1)
     sides = (
         np.concatenate([turning[:1], midpoints(turning), turning[-1:]]),
-        np.einsum("nij,nj->ni", to_body, second_difference(place, 1.0 / RATE)),
+        np.einsum("nij,nj->ni", to_body, second_difference(position, 1.0 / RATE)),
         to_body @ second_difference(matrices, 1.0 / RATE),
         to_body,
     )
-    return _Seen(clock[rows], *(smooth(side, sigma)[rows] for side in sides))
+    return _TrackerSignals(clock[rows], *(smooth(side, sigma)[rows] for side in sides))
 
 
-def _felt(imu: Streams) -> _Felt:
-    """Both sensors filtered on uniform clocks."""
+def _inertial_signals(imu: Streams) -> _InertialSignals:
+    """Filter both sensors on uniform clocks."""
     splines, unknown = [], []
     for time, values, _ in (imu.gyro, imu.accel):
         clock, broken = np.arange(time[0], time[-1], 1.0 / RATE), gaps(time)
-        filtered = smooth(splined(time, values, clock, broken), FILTER_SECONDS * RATE)
+        filtered = smooth(interpolate_splines(time, values, clock, broken), FILTER_SECONDS * RATE)
         splines.append(CubicSpline(clock, filtered, axis=0))
-        begun = np.concatenate([[-np.inf], time[:-1][broken], time[-1:]])
-        unknown.append((begun, np.concatenate([time[:1], time[1:][broken], [np.inf]])))
+        gap_starts = np.concatenate([[-np.inf], time[:-1][broken], time[-1:]])
+        unknown.append((gap_starts, np.concatenate([time[:1], time[1:][broken], [np.inf]])))
     gyro, accel = splines
-    return _Felt(gyro, accel, unknown)
+    return _InertialSignals(gyro, accel, unknown)
 
 
 # --- first guesses
 
 
-def _first_guesses(seen: _Seen, felt: _Felt, search_seconds: float) -> list[tuple[float, Rotation]]:
+def _first_guesses(
+    tracker: _TrackerSignals, inertial: _InertialSignals, search_seconds: float
+) -> list[tuple[float, Rotation]]:
     """(lag s, extrinsic rotation) where the magnitudes of both angular rates correlate better than
     nearby, the most plausible first.
 
@@ -398,12 +404,19 @@ def _first_guesses(seen: _Seen, felt: _Felt, search_seconds: float) -> list[tupl
     # This import takes half a second.
     from scipy.signal import correlate, correlation_lags, find_peaks
 
-    grid = np.arange(seen.time[0] - search_seconds, seen.time[-1] + search_seconds, 1.0 / RATE)
-    tracked, own = (
-        np.interp(grid, time, np.minimum(np.linalg.norm(rate, axis=1), FASTEST_TURN), 0.0, 0.0)
-        for time, rate in ((seen.time, seen.rate), (felt.gyro.x, felt.gyro(felt.gyro.x)))
+    grid = np.arange(
+        tracker.time[0] - search_seconds, tracker.time[-1] + search_seconds, 1.0 / RATE
     )
-    score = correlate(own - own.mean(), tracked - tracked.mean(), method="fft")
+    tracker_rate, inertial_rate = (
+        np.interp(grid, time, np.minimum(np.linalg.norm(rate, axis=1), FASTEST_TURN), 0.0, 0.0)
+        for time, rate in (
+            (tracker.time, tracker.rate),
+            (inertial.gyro.x, inertial.gyro(inertial.gyro.x)),
+        )
+    )
+    score = correlate(
+        inertial_rate - inertial_rate.mean(), tracker_rate - tracker_rate.mean(), method="fft"
+    )
     lags = correlation_lags(len(grid), len(grid)) / RATE
     near = np.abs(lags) <= search_seconds
     # A peak may be at the end of the search.
@@ -411,12 +424,12 @@ def _first_guesses(seen: _Seen, felt: _Felt, search_seconds: float) -> list[tupl
     peaks, _ = find_peaks(padded, distance=max(round(SAME_LAG * RATE), 1))
     guesses = []
     for lag in lags[near][peaks - 1]:
-        rows = felt.covers(seen.time + lag)
+        rows = inertial.covers(tracker.time + lag)
         if rows.sum() * ROW_SECONDS >= SHORTEST_OVERLAP:
-            rate, turning = felt.gyro(seen.time[rows] + lag), seen.rate[rows]
-            left, _, right = np.linalg.svd(turning.T @ rate)
-            left[:, 2] *= np.linalg.det(left @ right)  # a rotation, no reflection
-            rotation = Rotation.from_matrix(left @ right)
+            rate, turning = inertial.gyro(tracker.time[rows] + lag), tracker.rate[rows]
+            u, _, vt = np.linalg.svd(turning.T @ rate)
+            u[:, 2] *= np.linalg.det(u @ vt)  # a rotation, no reflection
+            rotation = Rotation.from_matrix(u @ vt)
             guesses.append((unexplained(turning - rotation.apply(rate), turning), lag, rotation))
     guesses.sort(key=lambda guess: guess[0])
     return [(lag, rotation) for _, lag, rotation in guesses]
@@ -429,26 +442,26 @@ class _Fit(NamedTuple):
     extrinsic: Rotation
     unknowns: Float[np.ndarray, " u"]
     """The vector with the slices above; `TURN` is included in `extrinsic`."""
-    seen: _Seen
+    tracker: _TrackerSignals
     """The tracker's side in the rows that the IMU covers at the start."""
     gyro: Float[np.ndarray, "n 3"]
     """Errors of the angular rate in these rows, rad/s."""
     accel: Float[np.ndarray, "n 3"]
     """Errors of the acceleration, m/s²."""
     turn_std: float
-    """As in `BodyFit`."""
+    """`BodyFit.turn_std`."""
 
     @property
     def unexplained(self) -> float:
         """Geometric mean of the shares of both signals' power. For noise of unknown size the fit
         with the smallest mean is the most likely."""
-        turning = unexplained(self.gyro, self.seen.rate)
-        return float(np.sqrt(turning * unexplained(self.accel, self.seen.acceleration)))
+        turning = unexplained(self.gyro, self.tracker.rate)
+        return float(np.sqrt(turning * unexplained(self.accel, self.tracker.acceleration)))
 
 
 def _fit(
-    seen: _Seen,
-    felt: _Felt,
+    tracker: _TrackerSignals,
+    inertial: _InertialSignals,
     knots: Float[np.ndarray, " k"],
     extrinsic: Rotation,
     unknowns: Float[np.ndarray, " u"],
@@ -458,19 +471,24 @@ def _fit(
     There are two rounds. Scale of the errors, variance of their offsets (`_Noise`) and outliers are
     those of the round before, or of the guess. Raises `TooLittle`.
     """
-    hats = hat_functions(seen.time, knots)
-    covered = felt.covers(seen.time + hats @ unknowns[LAG])
-    seen, hats = seen.rows(covered), hats[covered]
-    if np.minimum(np.diff(seen.time, append=np.inf), 1.0).sum() < SHORTEST_OVERLAP:
+    hats = hat_functions(tracker.time, knots)
+    covered = inertial.covers(tracker.time + hats @ unknowns[LAG])
+    tracker, hats = tracker.rows(covered), hats[covered]
+    if np.minimum(np.diff(tracker.time, append=np.inf), 1.0).sum() < SHORTEST_OVERLAP:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track overlap the IMU's samples")
     reach = np.concatenate([np.full(3, TURN_STEP), PRIOR_STD, np.full(len(knots), LAG_STEP)])
-    found = Problem(seen, felt, hats, extrinsic).errors(unknowns)
+    errors = Problem(tracker, inertial, hats, extrinsic).errors(unknowns)
     for _ in range(2):
-        scales = max(robust_std(found[0]), 1e-4), max(robust_std(found[1]), 1e-3)
-        off = [np.linalg.norm(e, axis=1) / s for e, s in zip(found, scales, strict=True)]
-        kept = np.maximum(*off) <= max(OUTLIER, np.median(np.maximum(*off)))
-        noises = [_noise(seen.time[kept], e[kept], s) for e, s in zip(found, scales, strict=True)]
-        problem = Problem(seen.rows(kept), felt, hats[kept], extrinsic, noises, unknowns)
+        scales = max(robust_std(errors[0]), 1e-4), max(robust_std(errors[1]), 1e-3)
+        deviations = [np.linalg.norm(e, axis=1) / s for e, s in zip(errors, scales, strict=True)]
+        inliers = np.maximum(*deviations) <= max(OUTLIER, np.median(np.maximum(*deviations)))
+        noises = [
+            _noise(tracker.time[inliers], e[inliers], s)
+            for e, s in zip(errors, scales, strict=True)
+        ]
+        problem = Problem(
+            tracker.rows(inliers), inertial, hats[inliers], extrinsic, noises, unknowns
+        )
         result = least_squares(
             problem.residuals,
             np.zeros(len(unknowns)),
@@ -484,8 +502,8 @@ def _fit(
         unknowns = unknowns + result.x
         extrinsic = extrinsic * Rotation.from_rotvec(unknowns[TURN])
         unknowns[TURN] = 0.0
-        found = Problem(seen, felt, hats, extrinsic).errors(unknowns)
-    return _Fit(extrinsic, unknowns, seen, *found, _turn_std(result.jac, int(kept.sum())))
+        errors = Problem(tracker, inertial, hats, extrinsic).errors(unknowns)
+    return _Fit(extrinsic, unknowns, tracker, *errors, _turn_std(result.jac, int(inliers.sum())))
 
 
 def _turn_std(jacobian: Float[np.ndarray, "r u"], rows: int) -> float:
@@ -504,16 +522,16 @@ def _turn_std(jacobian: Float[np.ndarray, "r u"], rows: int) -> float:
             (slice(TURN.stop, None), slice(TURN.stop, None)),
         )
     )
-    known = turn - mixed @ np.linalg.pinv(others, hermitian=True) @ mixed.T
-    return float(1.0 / np.sqrt(max(np.linalg.eigvalsh(known)[0] - 4.0 * rows, 1e-12)))
+    turn_information = turn - mixed @ np.linalg.pinv(others, hermitian=True) @ mixed.T
+    return float(1.0 / np.sqrt(max(np.linalg.eigvalsh(turn_information)[0] - 4.0 * rows, 1e-12)))
 
 
 class Problem(NamedTuple):
     """Both equations in some rows, and one round of least squares, whose unknowns are changes from
     `start`."""
 
-    seen: _Seen
-    felt: _Felt
+    tracker: _TrackerSignals
+    inertial: _InertialSignals
     hats: Float[np.ndarray, "n k"]
     guess: Rotation
     noises: list[_Noise] = []
@@ -524,12 +542,12 @@ class Problem(NamedTuple):
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """The tracker's side minus the IMU's, in the marker body: rad/s and m/s²."""
         extrinsic = self.guess * Rotation.from_rotvec(x[TURN])
-        there = self.seen.time + self.hats @ x[LAG]
-        rate = self.felt.gyro(there) - x[GYRO_BIAS]
-        force = self.felt.accel(there + x[DELAY]) - x[ACCEL_BIAS]
-        tracked = self.seen.acceleration + self.seen.lever_gain @ x[LEVER]
-        tracked = tracked + GRAVITY * self.seen.to_body @ upward(x[TILT])
-        return self.seen.rate - extrinsic.apply(rate), tracked - extrinsic.apply(force)
+        imu_time = self.tracker.time + self.hats @ x[LAG]
+        rate = self.inertial.gyro(imu_time) - x[GYRO_BIAS]
+        force = self.inertial.accel(imu_time + x[DELAY]) - x[ACCEL_BIAS]
+        tracked = self.tracker.acceleration + self.tracker.lever_gain @ x[LEVER]
+        tracked = tracked + GRAVITY * self.tracker.to_body @ upward(x[TILT])
+        return self.tracker.rate - extrinsic.apply(rate), tracked - extrinsic.apply(force)
 
     def jacobians(
         self, x: Float[np.ndarray, " u"]
@@ -539,20 +557,20 @@ class Problem(NamedTuple):
         rotation = (self.guess * Rotation.from_rotvec(x[TURN])).as_matrix()
         # Derivative by the rotation vector, to the second order of the turn.
         turned = np.eye(3) - hat(x[TURN]) / 2.0 + hat(x[TURN]) @ hat(x[TURN]) / 6.0
-        there = self.seen.time + self.hats @ x[LAG]
-        late = there + x[DELAY]
+        imu_time = self.tracker.time + self.hats @ x[LAG]
+        accel_time = imu_time + x[DELAY]
         gyro, accel = (np.zeros((len(self.hats), 3, len(x))) for _ in range(2))
-        gyro[:, :, TURN] = rotation @ hat(self.felt.gyro(there) - x[GYRO_BIAS]) @ turned
+        gyro[:, :, TURN] = rotation @ hat(self.inertial.gyro(imu_time) - x[GYRO_BIAS]) @ turned
         gyro[:, :, GYRO_BIAS] = rotation
-        turning = self.felt.gyro(there, 1) @ rotation.T
+        turning = self.inertial.gyro(imu_time, 1) @ rotation.T
         gyro[:, :, LAG] = -turning[:, :, None] * self.hats[:, None, :]
-        accel[:, :, TURN] = rotation @ hat(self.felt.accel(late) - x[ACCEL_BIAS]) @ turned
+        accel[:, :, TURN] = rotation @ hat(self.inertial.accel(accel_time) - x[ACCEL_BIAS]) @ turned
         accel[:, :, ACCEL_BIAS] = rotation
-        accel[:, :, LEVER] = self.seen.lever_gain
+        accel[:, :, LEVER] = self.tracker.lever_gain
         up = upward(x[TILT])
         by_tilt = up[2] * np.eye(3)[:, :2] - up[2] * np.outer(up, up[:2])
-        accel[:, :, TILT] = GRAVITY * self.seen.to_body @ by_tilt
-        accel[:, :, DELAY] = -self.felt.accel(late, 1) @ rotation.T
+        accel[:, :, TILT] = GRAVITY * self.tracker.to_body @ by_tilt
+        accel[:, :, DELAY] = -self.inertial.accel(accel_time, 1) @ rotation.T
         accel[:, :, LAG] = accel[:, :, DELAY, None] * self.hats[:, None, :]
         return gyro, accel
 
@@ -643,28 +661,28 @@ def pose_lag(
     margin = round((LONGEST_POSE_LAG + 0.1) * RATE)
     if not steps.any():
         return PoseLag(0.0, 1.0)
-    near = (steps > 0.0) & (steps <= LOST_POSES * np.median(steps[steps > 0.0]))
+    adjacent = (steps > 0.0) & (steps <= LOST_POSES * np.median(steps[steps > 0.0]))
     clock = np.arange(max(time[0], middle[0]), min(time[-1], middle[-1]), 1.0 / RATE)
     if len(clock) < 5 * RATE + 2 * margin:
         return PoseLag(0.0, 1.0)
-    turning = turns_between(attitude)[near] / steps[near, None]
-    felt, tracked = (
-        smooth(interpolate(clock, own, rate), POSE_LAG_FILTER_SECONDS * RATE)
-        for own, rate in ((time, gyro), (middle[near], turning))
+    turning = turns_between(attitude)[adjacent] / steps[adjacent, None]
+    gyro_rate, pose_rate = (
+        smooth(interpolate(clock, sample_times, rate), POSE_LAG_FILTER_SECONDS * RATE)
+        for sample_times, rate in ((time, gyro), (middle[adjacent], turning))
     )
-    tracked = CubicSpline(clock, tracked, axis=0)
-    clock, felt = clock[margin:-margin], felt[margin:-margin]
-    if float(np.median(np.linalg.norm(felt - np.median(felt, axis=0), axis=1))) < 0.02:
+    pose_rate = CubicSpline(clock, pose_rate, axis=0)
+    clock, gyro_rate = clock[margin:-margin], gyro_rate[margin:-margin]
+    if float(np.median(np.linalg.norm(gyro_rate - np.median(gyro_rate, axis=0), axis=1))) < 0.02:
         return PoseLag(0.0, 1.0)
 
-    def off(lag: float) -> float:
-        error = felt - tracked(clock + lag)
+    def mismatch(lag: float) -> float:
+        error = gyro_rate - pose_rate(clock + lag)
         return float(np.abs(error - np.median(error, axis=0)).mean())
 
     most = round(LONGEST_POSE_LAG * 100)
-    lag = min((i / 100.0 for i in range(-most, most + 1)), key=off)
-    best = float(fminbound(off, lag - 0.01, lag + 0.01, xtol=1e-5))
-    first, second = (rate - rate.mean(axis=0) for rate in (felt, tracked(clock + best)))
+    lag = min((i / 100.0 for i in range(-most, most + 1)), key=mismatch)
+    best = float(fminbound(mismatch, lag - 0.01, lag + 0.01, xtol=1e-5))
+    first, second = (rate - rate.mean(axis=0) for rate in (gyro_rate, pose_rate(clock + best)))
     power = np.sqrt((first**2).sum() * (second**2).sum())
     return PoseLag(best, float((first * second).sum() / power))
 
@@ -674,9 +692,9 @@ def pose_lag(
 
 def check_lengths(seconds: float, *streams: Samples | Poses) -> None:
     """Raise `TooLittle` if one of the streams is shorter than this."""
-    for each in streams:
-        if len(each.time) < 2 or each.time[-1] - each.time[0] < seconds:
-            raise TooLittle(f"less than {seconds:g} s are recorded in {each.source}")
+    for stream in streams:
+        if len(stream.time) < 2 or stream.time[-1] - stream.time[0] < seconds:
+            raise TooLittle(f"less than {seconds:g} s are recorded in {stream.source}")
 
 
 def gaps(time: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " i"]:
@@ -688,12 +706,12 @@ def near_any(
     time: Real[np.ndarray, " n"],
     starts: Real[np.ndarray, " k"],
     ends: Real[np.ndarray, " k"],
-    around: float,
+    margin: float,
 ) -> Bool[np.ndarray, " n"]:
     """Whether a time is within an interval from one of `starts` to its end, extended by `around`.
     Starts and ends increase."""
-    begun = np.searchsorted(starts, time + around, side="right")
-    return begun != np.searchsorted(ends, time - around)
+    started = np.searchsorted(starts, time + margin, side="right")
+    return started != np.searchsorted(ends, time - margin)
 
 
 def smooth(values: np.ndarray, sigma: float) -> np.ndarray:

@@ -33,10 +33,10 @@ from gnio_jax.data.alignment.body import (
     smooth,
     uniform_knots,
 )
-from gnio_jax.data.assembly import Samples, Streams, ordered
+from gnio_jax.data.assembly import Samples, Streams, sort_streams
 from gnio_jax.data.parsing.stamps import in_order
 from gnio_jax.data.reference import Poses, longest_trusted, smooth_positions
-from gnio_jax.data.resampling import known_at, slerped, splined
+from gnio_jax.data.resampling import covered_at, interpolate_attitudes, interpolate_splines
 from gnio_jax.numerics import (
     about_z,
     integrate_gyro,
@@ -98,7 +98,7 @@ class _Signals(NamedTuple):
     """Accelerations of both in level worlds, m/s², on uniform clocks of their own, s."""
 
     clock: Float[np.ndarray, " n"]
-    felt: Float[np.ndarray, "n 3"]
+    inertial: Float[np.ndarray, "n 3"]
     """The IMU's acceleration by the device's own attitude, without gravity."""
     grid: Float[np.ndarray, " m"]
     tracked: Float[np.ndarray, "m 3"]
@@ -107,17 +107,19 @@ class _Signals(NamedTuple):
     """False near positions that are missing, and where the tracker relocalised."""
 
     def filtered(self, seconds: float) -> _Signals:
-        """Both accelerations after a Gaussian filter."""
-        felt, tracked = (smooth(each, seconds * RATE) for each in (self.felt, self.tracked))
-        return self._replace(felt=felt, tracked=tracked)
+        """The signals with both accelerations passed through a Gaussian filter."""
+        inertial, tracked = (
+            smooth(acceleration, seconds * RATE) for acceleration in (self.inertial, self.tracked)
+        )
+        return self._replace(inertial=inertial, tracked=tracked)
 
-    def in_step(self, lag: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def overlap_at(self, lag: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Good rows of the grid that the IMU covers at a constant lag, and the accelerations of the
         IMU and of the tracker there."""
-        there = self.grid + lag
-        covered = self.good & (there > self.clock[0]) & (there < self.clock[-1])
+        imu_time = self.grid + lag
+        covered = self.good & (imu_time > self.clock[0]) & (imu_time < self.clock[-1])
         rows = np.flatnonzero(covered)
-        return rows, interpolate(there[rows], self.clock, self.felt), self.tracked[rows]
+        return rows, interpolate(imu_time[rows], self.clock, self.inertial), self.tracked[rows]
 
 
 def align_positions(imu: Streams, track: Samples) -> PositionsFit:
@@ -128,28 +130,34 @@ def align_positions(imu: Streams, track: Samples) -> PositionsFit:
     of tilt, and its yaw drifts. Over minutes, however, it finds the gyro's bias in tilt from
     gravity. Raises `TooLittle` if both share less than 20 s.
     """
-    imu = ordered(imu)
+    imu = sort_streams(imu)
     rows, _ = in_order(track.time, track.values, track.source)
     stamps, values = track.time[rows], track.values[rows]
     assert imu.device is not None
     streams = (imu.gyro, imu.accel, imu.device)
     check_lengths(SHORTEST_OVERLAP, *streams, track._replace(time=stamps))
-    first, last = max(each.time[0] for each in streams), min(each.time[-1] for each in streams)
+    first, last = (
+        max(stream.time[0] for stream in streams),
+        min(stream.time[-1] for stream in streams),
+    )
     if last - first < SHORTEST_OVERLAP:
         raise TooLittle(f"gyro, accelerometer and attitude share less than {SHORTEST_OVERLAP:g} s")
     clock = np.arange(first, last, 1.0 / RATE)
-    gyro, accel = (splined(each.time, each.values, clock, gaps(each.time)) for each in streams[:2])
-    device = rotations(slerped(imu.device.time, imu.device.values, clock))
+    gyro, accel = (
+        interpolate_splines(stream.time, stream.values, clock, gaps(stream.time))
+        for stream in streams[:2]
+    )
+    device = rotations(interpolate_attitudes(imu.device.time, imu.device.values, clock))
 
     grid = np.arange(stamps[0], stamps[-1], 1.0 / RATE)
-    position = splined(stamps, values, grid, gaps(stamps))
-    seen = known_at(stamps, grid, longest_trusted(stamps))
+    position = interpolate_splines(stamps, values, grid, gaps(stamps))
+    present = covered_at(stamps, grid, longest_trusted(stamps))
     tracked = second_difference(position, 1.0 / RATE)
     # Accelerations beyond those of a pedestrian are jumps.
     strength = np.linalg.norm(smooth(tracked, STEP_FILTER_SECONDS * RATE), axis=1)
-    usual = float(np.median(strength[seen])) if seen.any() else 0.0
+    usual = float(np.median(strength[present])) if present.any() else 0.0
     jumps = strength > 8.0 * max(usual, 0.1)
-    good = ~within(~seen | jumps, round(2 * SLOW_FILTER_SECONDS * RATE))
+    good = ~within(~present | jumps, round(2 * SLOW_FILTER_SECONDS * RATE))
     signals = _Signals(clock, device.apply(accel) - UPWARD, grid, tracked, good)
     lag, correlation, runner_up = _constant_lag(signals)
 
@@ -165,16 +173,16 @@ def align_positions(imu: Streams, track: Samples) -> PositionsFit:
     correction, lags = _fit(signals, accel, integrated, knots, guess, lags)
 
     attitude = slerp(clock, knots, correction) * integrated
-    there = clock - np.interp(clock, lag_knots, lags)
-    shared = np.flatnonzero((there >= grid[0]) & (there <= grid[-1]))
-    place, velocity, kept = smooth_positions(
-        splined(grid, position, there[shared], gaps(grid)),
-        np.interp(there[shared], grid, (seen & ~jumps).astype(float)) > 0.99,
+    tracker_time = clock - np.interp(clock, lag_knots, lags)
+    shared = np.flatnonzero((tracker_time >= grid[0]) & (tracker_time <= grid[-1]))
+    smoothed, velocity, used = smooth_positions(
+        interpolate_splines(grid, position, tracker_time[shared], gaps(grid)),
+        np.interp(tracker_time[shared], grid, (present & ~jumps).astype(float)) > 0.99,
         1.0 / RATE,
         CUTOFF,
     )
-    rows = shared[kept]
-    poses = Poses(clock[rows], attitude[rows], place[kept], velocity[kept], source=track.source)
+    rows = shared[used]
+    poses = Poses(clock[rows], attitude[rows], smoothed[used], velocity[used], source=track.source)
     return PositionsFit(lags, float(np.ptp(yaw)), correlation, runner_up, poses)
 
 
@@ -197,51 +205,54 @@ def _constant_lag(signals: _Signals) -> tuple[float, float, float]:
     signals = signals.filtered(STEP_FILTER_SECONDS)
     stretch = np.floor((signals.grid - signals.grid[0]) / STRETCH_SECONDS).astype(int)
 
-    def correlations(lag: float) -> tuple[float, float]:
+    def correlate_at(lag: float) -> tuple[float, float]:
         """Correlations of the vertical accelerations, and of the horizontal ones for any yaw of
         each stretch (the mean square, by the time that both share)."""
-        rows, own, seen = signals.in_step(lag)
+        rows, inertial, tracked = signals.overlap_at(lag)
         if len(rows) < SHORTEST_OVERLAP * RATE:
             return 0.0, 0.0
-        powers = ((own[:, :2] ** 2).sum(axis=1), (seen[:, :2] ** 2).sum(axis=1))
-        along, across, power, other = (
-            np.bincount(stretch[rows], values) for values in (*_both_ways(own, seen), *powers)
+        powers = ((inertial[:, :2] ** 2).sum(axis=1), (tracked[:, :2] ** 2).sum(axis=1))
+        along, across, inertial_power, tracked_power = (
+            np.bincount(stretch[rows], values)
+            for values in (*_dot_and_cross(inertial, tracked), *powers)
         )
-        level = (along**2 + across**2) / np.maximum(power * other, 1e-12)
-        up, risen = (each[:, 2] - each[:, 2].mean() for each in (own, seen))
+        level = (along**2 + across**2) / np.maximum(inertial_power * tracked_power, 1e-12)
+        up, risen = (
+            acceleration[:, 2] - acceleration[:, 2].mean() for acceleration in (inertial, tracked)
+        )
         vertical = float(up @ risen / max(np.linalg.norm(up) * np.linalg.norm(risen), 1e-12))
         return vertical, float(np.average(level, weights=np.bincount(stretch[rows]) + 1e-9))
 
     most = round(SEARCH_SECONDS / LAG_STEP)
     lags = np.arange(-most, most + 1) * LAG_STEP
-    found = np.array([correlations(lag) for lag in lags])
-    if not found.any():
+    correlations = np.array([correlate_at(lag) for lag in lags])
+    if not correlations.any():
         problem = f"less than {SHORTEST_OVERLAP:g} s of moving positions overlap the IMU's samples"
         raise TooLittle(problem)
     # A negative correlation explains nothing.
-    explained = 0.5 * (np.maximum(found[:, 0], 0.0) ** 2 + found[:, 1])
+    explained = 0.5 * (np.maximum(correlations[:, 0], 0.0) ** 2 + correlations[:, 1])
     best = int(np.argmax(explained))
     peaks, _ = find_peaks(np.pad(explained, 1, constant_values=-np.inf))
     others = [explained[i] for i in peaks - 1 if abs(lags[i] - lags[best]) > SAME_LAG]
     runner_up = (1.0 - explained[best]) / (1.0 - max(others)) if others else 0.0
-    return float(lags[best]), float(found[best, 0]), float(runner_up)
+    return float(lags[best]), float(correlations[best, 0]), float(runner_up)
 
 
-def _both_ways(own: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _dot_and_cross(inertial: np.ndarray, tracked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Horizontal dot and cross product of each row."""
-    along = (own[:, :2] * seen[:, :2]).sum(axis=1)
-    return along, own[:, 0] * seen[:, 1] - own[:, 1] * seen[:, 0]
+    along = (inertial[:, :2] * tracked[:, :2]).sum(axis=1)
+    return along, inertial[:, 0] * tracked[:, 1] - inertial[:, 1] * tracked[:, 0]
 
 
 def _yaw(signals: _Signals, knots: Float[np.ndarray, " k"], lag: float) -> Float[np.ndarray, " k"]:
     """Yaw (rad) from the device's world to the tracker's about each knot, by the slow horizontal
     accelerations of one and a half stretches to either side."""
-    rows, own, seen = signals.filtered(SLOW_FILTER_SECONDS).in_step(lag)
+    rows, inertial, tracked = signals.filtered(SLOW_FILTER_SECONDS).overlap_at(lag)
     near = np.abs(signals.grid[rows, None] + lag - knots) < 1.5 * STRETCH_SECONDS
-    along, across = _both_ways(own, seen)
-    told = near.any(axis=0)  # in a gap of the tracker the yaw is unknown
-    yaw = np.unwrap(np.arctan2(across @ near, along @ near)[told])
-    return np.interp(knots, knots[told], yaw)
+    along, across = _dot_and_cross(inertial, tracked)
+    observed = near.any(axis=0)  # in a gap of the tracker the yaw is unknown
+    yaw = np.unwrap(np.arctan2(across @ near, along @ near)[observed])
+    return np.interp(knots, knots[observed], yaw)
 
 
 def _fit(
@@ -259,19 +270,19 @@ def _fit(
     slow ones, in all axes, determine the attitude.
     """
     clock, count = signals.clock, len(knots)
-    there = clock - lags.mean()
-    inside = (there > signals.grid[0] + 1.0) & (there < signals.grid[-1] - 1.0)
-    usable = inside & (np.interp(there, signals.grid, signals.good.astype(float)) > 0.99)
+    tracker_time = clock - lags.mean()
+    inside = (tracker_time > signals.grid[0] + 1.0) & (tracker_time < signals.grid[-1] - 1.0)
+    usable = inside & (np.interp(tracker_time, signals.grid, signals.good.astype(float)) > 0.99)
     step, slow = STEP_FILTER_SECONDS * RATE, SLOW_FILTER_SECONDS * RATE
     rises = CubicSpline(signals.grid, smooth(signals.tracked[:, 2], step))
     tracked = CubicSpline(signals.grid, smooth(signals.tracked, slow), axis=0)
     at_steps, at_slow = (np.flatnonzero(usable)[:: round(sigma)] for sigma in (step, slow))
-    felt_rises = smooth(signals.felt[:, 2], step)[at_steps]
+    inertial_rises = smooth(signals.inertial[:, 2], step)[at_steps]
     lag_knots = uniform_knots(clock, LAG_KNOT_SECONDS)
     step_hats, slow_hats = (hat_functions(clock[rows], lag_knots) for rows in (at_steps, at_slow))
     turn_hats = hat_functions(clock[at_slow], knots)
 
-    def improved(
+    def improve(
         correction: Rotation, lags: Float[np.ndarray, " l"]
     ) -> tuple[Rotation, Float[np.ndarray, " l"]]:
         turned = (slerp(clock, knots, correction) * integrated).apply(accel)
@@ -279,9 +290,9 @@ def _fit(
 
         def errors(change: Float[np.ndarray, " u"]) -> list[np.ndarray]:
             turns, lag = change[: 3 * count].reshape(count, 3), lags + change[3 * count :]
-            felt = Rotation.from_rotvec(turn_hats @ turns).apply(force) - UPWARD
-            of_steps = rises(clock[at_steps] - step_hats @ lag) - felt_rises
-            return [of_steps, tracked(clock[at_slow] - slow_hats @ lag) - felt]
+            inertial = Rotation.from_rotvec(turn_hats @ turns).apply(force) - UPWARD
+            of_steps = rises(clock[at_steps] - step_hats @ lag) - inertial_rises
+            return [of_steps, tracked(clock[at_slow] - slow_hats @ lag) - inertial]
 
         start = np.zeros(3 * count + len(lags))
         scales = [max(robust_std(error), 1e-3) for error in errors(start)]
@@ -289,8 +300,10 @@ def _fit(
         def residuals(change: Float[np.ndarray, " u"]) -> Float[np.ndarray, " r"]:
             # Neighbouring rows are correlated by the filter.
             parts = [(e / s).ravel() / 1.6 for e, s in zip(errors(change), scales, strict=True)]
-            now = Rotation.from_rotvec(change[: 3 * count].reshape(count, 3)) * correction
-            drift = np.diff((now[1:] * now[:-1].inv()).as_rotvec(), axis=0) / DRIFT_STD
+            corrections = Rotation.from_rotvec(change[: 3 * count].reshape(count, 3)) * correction
+            drift = (
+                np.diff((corrections[1:] * corrections[:-1].inv()).as_rotvec(), axis=0) / DRIFT_STD
+            )
             bends = np.diff(lags + change[3 * count :], 2) / LAG_BEND_STD
             return np.concatenate([*parts, drift.ravel(), bends])
 
@@ -302,5 +315,5 @@ def _fit(
         return turns * correction, lags + change[3 * count :]
 
     for _ in range(3):
-        correction, lags = improved(correction, lags)
+        correction, lags = improve(correction, lags)
     return correction, lags

@@ -22,9 +22,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import damaged, read_hdf5_fields, read_text
-from gnio_jax.data.splits import listed
+from gnio_jax.data.splits import read_list
 from gnio_jax.data.validation import FASTEST, check_unit_norm
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
 from gnio_jax.types import Sequence
@@ -35,9 +35,9 @@ _TABLE = "data.hdf5"
 _TRUTH = "stamped_groundtruth_imu.txt"
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split's list that are present."""
-    folders = listed(
+    folders = read_list(
         root / f"{split}.txt",
         lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
         root,
@@ -45,13 +45,13 @@ def recordings(root: Path, split: str) -> list[Recording]:
     )
     names = ["_".join(folder.relative_to(root).parts) for folder in folders]
     return [
-        Recording(name, partial(read, folder, name))
+        RecordingSource(name, partial(read, folder, name))
         for name, folder in zip(names, folders, strict=True)
     ]
 
 
 def read(folder: Path, name: str | None = None) -> list[Sequence]:
-    """One sequence of its folder, in a z-up world. Raises `InputError` naming file and field."""
+    """Read the sequence of a folder, in a z-up world. Raises `InputError` naming file and field."""
     path = folder / _TABLE
     table = read_hdf5_fields(path, ("ts", "gyro_calib", "accel_calib", "traj_target"))
     time, start, _ = table.clock("ts", "s")
@@ -62,7 +62,7 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
 
     upside_down = attitude.apply(accel).mean(axis=0)[2] < 0
     turn = Rotation.from_rotvec([np.pi if upside_down else 0.0, 0.0, 0.0])
-    about = {
+    attributes = {
         "group": folder.parent.name,
         "session": "/".join(folder.parts[-4:-1]),
         "placement": "quadrotor",
@@ -74,7 +74,7 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
     velocity = velocity if velocity is None else turn.apply(velocity)
     poses = Poses(time, turn * attitude, turn.apply(pose[:, :3]), velocity, source=str(path))
     streams = Streams.of_imu(name or folder.name, path, time, gyro, accel)
-    streams = streams._replace(attributes=about, start=start, poses=poses)
+    streams = streams._replace(attributes=attributes, start=start, poses=poses)
     return assemble(streams, RATE)
 
 
@@ -89,9 +89,9 @@ def _velocity(
     table = read_text(path, separator=" ", header=False, widths=(8, 11))
     if table.width() == 8:
         return None
-    own, velocity = table.take(0), table.take(8, 9, 10)
-    if len(own) != len(time) or np.abs(own - start - time).max() > 1e-3:
-        rows = f"{len(own)} and {len(time)} rows"
+    stamps, velocity = table.take(0), table.take(8, 9, 10)
+    if len(stamps) != len(time) or np.abs(stamps - start - time).max() > 1e-3:
+        rows = f"{len(stamps)} and {len(time)} rows"
         raise damaged(path, f"field 'ts' is not that of {_TABLE} beside it ({rows})")
     if np.abs(velocity).max() > FASTEST:
         raise damaged(path, f"field 'velocity' is beyond {FASTEST:g} m/s")

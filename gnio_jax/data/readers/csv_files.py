@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.hdf5 import read_hdf5
 from gnio_jax.data.parsing.stamps import check_seconds, rounded_rate
 from gnio_jax.data.parsing.tables import Table, read_text, shortened
 from gnio_jax.data.resampling import resample
-from gnio_jax.data.splits import listed
+from gnio_jax.data.splits import read_list
 from gnio_jax.data.validation import check_gaps, check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.files import HDF5
@@ -46,18 +46,18 @@ _FILES = (".csv", *HDF5)
 # --- which recordings there are
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split, in the order of their names: those that <root>/<split>.txt lists,
     or all as `test` if there is no list.
 
     Raises `InputError` if two files would have the same name.
     """
     if split not in SPLITS and not _is_list(root / f"{split}.txt"):
-        known = f"known splits: {', '.join(SPLITS)}, or that of a list {split}.txt there"
-        raise InputError(root, f"unknown split '{split}'", known)
+        remedy = f"known splits: {', '.join(SPLITS)}, or that of a list {split}.txt there"
+        raise InputError(root, f"unknown split '{split}'", remedy)
     layout = f"expected layout: {DATASET.layout}"
     if split not in SPLITS or any((root / f"{name}.txt").is_file() for name in SPLITS):
-        paths = listed(root / f"{split}.txt", partial(_find, root), root, DATASET.layout)
+        paths = read_list(root / f"{split}.txt", partial(_find, root), root, DATASET.layout)
     else:
         paths = files_of(root)
         if paths and split != "test":
@@ -67,7 +67,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
     for path in paths:
         if (other := named.setdefault(path.stem, path)) != path:
             raise InputError(path, f"has the name of {other}", "rename or remove one of them")
-    return [Recording(name, partial(read, path)) for name, path in sorted(named.items())]
+    return [RecordingSource(name, partial(read, path)) for name, path in sorted(named.items())]
 
 
 def files_of(root: Path) -> list[Path]:
@@ -105,8 +105,8 @@ def _find(root: Path, entry: str) -> Path | None:
 
 
 def read(path: Path) -> list[Sequence]:
-    """One recording, on a uniform clock of its own rate, named after its file. Raises `InputError`
-    naming file and field."""
+    """Read a recording, on a uniform clock of its own rate, named after its file. Raises
+    `InputError` naming file and field."""
     if path.suffix.lower() not in HDF5:
         return assemble(_streams(read_text(path)), whole=True)
     sequence = read_hdf5(path)._replace(name=path.stem)
@@ -117,58 +117,58 @@ def read(path: Path) -> list[Sequence]:
 
 def _streams(table: Table) -> Streams:
     path, attitude = table.path, REFERENCE["orientation"]
-    wanted = {name: name for name in ("time", *GYRO, *ACCEL)}
+    expected = {name: name for name in ("time", *GYRO, *ACCEL)}
     remedy = f"name them: gnio data import {path.name} --out own/{path.stem}.h5 --columns"
-    check_columns(path, table.columns, wanted, remedy)
+    check_columns(path, table.columns, expected, remedy)
     time = table.take("time")
     check_increasing(time, path, table.row)
     poses, device = reference(table, time), None
     if poses is None and attitude[0] in table.columns:
-        known = finite_rows(table.take(*attitude, gaps=True))
-        if known.any():  # an attitude alone is no reference: it is the device's own
-            own = quaternions(table.rotations(*attitude, rows=known))
-            device = Samples(time[known], own, str(path))
-    about = {"group": path.stem, "truth": "given" if poses else "none"}
+        present = finite_rows(table.take(*attitude, gaps=True))
+        if present.any():  # an attitude alone is no reference: it is the device's own
+            quaternion = quaternions(table.rotations(*attitude, rows=present))
+            device = Samples(time[present], quaternion, str(path))
+    attributes = {"group": path.stem, "truth": "given" if poses else "none"}
     streams = Streams.of_imu(path.stem, path, time, table.take(*GYRO), table.take(*ACCEL))
-    return streams._replace(attributes=about, poses=poses, device=device)
+    return streams._replace(attributes=attributes, poses=poses, device=device)
 
 
 def reference(table: Table, time: Float[np.ndarray, " n"]) -> Poses | None:
     """The poses in a table's columns `REFERENCE`, at the stamps `time` (s) of its rows; None if it
     has none. A field of the reference must have all its columns, or none."""
-    given = {}
+    fields = {}
     for field, columns in REFERENCE.items():
-        present = [name for name in columns if name in table.columns]
-        if present:
+        named = [name for name in columns if name in table.columns]
+        if named:
             for name in columns:
                 if name not in table.columns:
-                    problem = f"column '{name}' is missing while '{present[0]}' is there"
+                    problem = f"column '{name}' is missing while '{named[0]}' is there"
                     remedy = f"the {field} of a reference has {', '.join(columns)}"
                     raise InputError(table.path, problem, remedy)
-            given[field] = table.take(*columns, gaps=True)
-    known = np.all([finite_rows(values) for values in given.values()] or [[False]], axis=0)
-    if not {"orientation", "position"} <= given.keys() or not known.any():
+            fields[field] = table.take(*columns, gaps=True)
+    present = np.all([finite_rows(values) for values in fields.values()] or [[False]], axis=0)
+    if not {"orientation", "position"} <= fields.keys() or not present.any():
         return None
     return Poses(
-        time[known],
-        table.rotations(*REFERENCE["orientation"], rows=known),
-        given["position"][known],
-        given["velocity"][known] if "velocity" in given else None,
+        time[present],
+        table.rotations(*REFERENCE["orientation"], rows=present),
+        fields["position"][present],
+        fields["velocity"][present] if "velocity" in fields else None,
         source=str(table.path),
     )
 
 
 def check_columns(
-    path: Path, found: Iterable[object], wanted: Mapping[str, str], remedy: str
+    path: Path, columns: Iterable[object], expected: Mapping[str, str], remedy: str
 ) -> None:
-    """Raise `InputError` if a file lacks columns; `wanted` has our names and the file's. The
+    """Raise `InputError` if a file lacks columns; `expected` has our names and the file's. The
     message has all missing columns, and after `remedy` the words that name them."""
-    names = [str(name) for name in found]
-    missing = [ours for ours, theirs in wanted.items() if theirs not in names]
+    names = [str(name) for name in columns]
+    missing = [field for field, column in expected.items() if column not in names]
     if missing:
-        lacking = ", ".join(f"'{wanted[ours]}'" for ours in missing)
+        lacking = ", ".join(f"'{expected[field]}'" for field in missing)
         are = "columns {} are" if len(missing) > 1 else "column {} is"
-        words = " ".join(f"{ours}={_guess(ours, names)}" for ours in missing)
+        words = " ".join(f"{field}={_guess(field, names)}" for field in missing)
         problem = f"{are.format(lacking)} missing; found: {shortened(', '.join(names), 600)}"
         raise InputError(path, problem, f"{remedy} {words}")
 
@@ -182,10 +182,10 @@ _LIKE = {
 """Names of the columns in loggers, without unit and in small letters; the axis follows."""
 
 
-def _guess(ours: str, names: list[str]) -> str:
+def _guess(field: str, names: list[str]) -> str:
     """The column that is probably meant, or a placeholder."""
-    sensor, _, axis = ours.partition("_")
-    pattern = _LIKE[ours] if ours in _LIKE else _LIKE[sensor] + axis
+    sensor, _, axis = field.partition("_")
+    pattern = _LIKE[field] if field in _LIKE else _LIKE[sensor] + axis
     for name in names:
         if re.fullmatch(pattern, re.sub(r"\s*[\[(].*", "", name).strip().lower()):
             return f"'{name}'" if " " in name else name

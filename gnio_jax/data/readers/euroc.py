@@ -37,7 +37,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text
 from gnio_jax.data.reference import LONGEST_BRIDGE, SHORTEST_RUN
 from gnio_jax.errors import InputError
@@ -82,23 +82,23 @@ _SHORT = {
 """Other names of columns → the authors' names, both without unit and in small letters."""
 
 
-def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording]:
+def recordings(root: Path, split: str, dataset: str = "euroc") -> list[RecordingSource]:
     """The recordings of a split."""
-    known = EUROC_SPLITS if dataset == "euroc" else TUMVI_SPLITS
-    split_of = {name: own for own, names in known.items() for name in names}
-    wanted, folders = "test" if split == "seen" else split, find_sequences(root)
-    chosen = [path for name, path in folders.items() if split_of.get(name, "test") == wanted]
+    published = EUROC_SPLITS if dataset == "euroc" else TUMVI_SPLITS
+    split_of = {name: part for part, names in published.items() for name in names}
+    group, folders = "test" if split == "seen" else split, find_sequences(root)
+    chosen = [path for name, path in folders.items() if split_of.get(name, "test") == group]
     if folders and not chosen:
-        remedy = f"its sequences are {', '.join(known[wanted])}"
+        remedy = f"its sequences are {', '.join(published[group])}"
         raise InputError(root, f"holds no sequence of split '{split}'", remedy)
     return [_recording(folder, dataset) for folder in chosen]
 
 
-def _recording(folder: Path, dataset: str) -> Recording:
+def _recording(folder: Path, dataset: str) -> RecordingSource:
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *REFERENCES)]
-    files = tuple(each / name for each in sensors for name in ("data.csv", "sensor.yaml"))
+    files = tuple(sensor / name for sensor in sensors for name in ("data.csv", "sensor.yaml"))
     read_it = partial(read, folder, dataset)
-    return Recording(short_name(folder.name), read_it, files, slow=True, form=dataset)
+    return RecordingSource(short_name(folder.name), read_it, files, slow=True, form=dataset)
 
 
 def find_sequences(root: Path) -> dict[str, Path]:
@@ -107,15 +107,15 @@ def find_sequences(root: Path) -> dict[str, Path]:
     TUM-VI is published with two sizes of the images, `dataset-room1_512_16` and
     `dataset-room1_1024_16`. The walk is the same, and it is taken once.
     """
-    found: dict[str, Path] = {}
+    sequences: dict[str, Path] = {}
     for depth in ("", "*/", "*/*/", "*/*/*/"):
         for mav in sorted(root.glob(f"{depth}mav0")):
             # TUM-VI's calibration recordings are of a camera in front of a board and have no walk.
             if (mav / "imu0" / "data.csv").is_file() and not mav.parent.name.startswith(
                 "dataset-calib"
             ):
-                found.setdefault(short_name(mav.parent.name), mav.parent)
-    return dict(sorted(found.items()))
+                sequences.setdefault(short_name(mav.parent.name), mav.parent)
+    return dict(sorted(sequences.items()))
 
 
 def short_name(folder: str) -> str:
@@ -128,7 +128,7 @@ def short_name(folder: str) -> str:
 
 
 def read(folder: Path, dataset: str = "euroc") -> list[Sequence]:
-    """One sequence from its folder (the one with `mav0`). Raises `InputError` naming file and
+    """Read the sequence of a folder (the one with `mav0`). Raises `InputError` naming file and
     field."""
     mav, name = folder / "mav0", short_name(folder.name)
     path = mav / "imu0" / "data.csv"
@@ -153,9 +153,9 @@ def read_table(path: Path) -> Table:
     table = read_text(path)
     plain = (re.sub(r"[\[(].*", "", str(name)).strip().lower() for name in table.columns)
     names = [_SHORT.get(name, name) for name in plain]
-    known = {STAMP, *GYRO, *ACCEL, *_POSITION, *_QUATERNION, *_VELOCITY}
-    given = zip(names, table.columns, strict=True)
-    labels = [theirs if theirs in known else name for theirs, name in given]
+    used = {STAMP, *GYRO, *ACCEL, *_POSITION, *_QUATERNION, *_VELOCITY}
+    pairs = zip(names, table.columns, strict=True)
+    labels = [title if title in used else name for title, name in pairs]
     return table.renamed(labels)
 
 
@@ -170,20 +170,20 @@ def read_reference(mav: Path, start: float | int) -> Poses | None:
     time, *_ = table.clock(STAMP, "ns", start, "kept")
     position, quaternion = table.take(*_POSITION, gaps=True), table.take(*_QUATERNION, gaps=True)
     velocity = table.take(*_VELOCITY, gaps=True) if _VELOCITY[0] in table.columns else None
-    seen = finite_rows(position) & finite_rows(quaternion)
+    present = finite_rows(position) & finite_rows(quaternion)
     if velocity is not None:
-        seen &= finite_rows(velocity)
-    if seen.sum() < SHORTEST_RUN:
-        raise damaged(path, f"holds {seen.sum()} poses")
-    time = time[seen]
+        present &= finite_rows(velocity)
+    if present.sum() < SHORTEST_RUN:
+        raise damaged(path, f"holds {present.sum()} poses")
+    time = time[present]
     if (usual := float(np.median(np.abs(np.diff(time))))) > LONGEST_BRIDGE:
         problem = f"field 'time' runs at {1 / usual:.3g} Hz, too slow for a reference"
         raise InputError(path, problem, f"give at least {1 / LONGEST_BRIDGE:g} Hz")
     poses = Poses(
         time,
-        table.rotations(*_QUATERNION, rows=seen),
-        position[seen],
-        None if velocity is None else velocity[seen],
+        table.rotations(*_QUATERNION, rows=present),
+        position[present],
+        None if velocity is None else velocity[present],
         noisy=velocity is None,
         source=str(path),
     )

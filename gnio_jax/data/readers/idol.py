@@ -30,11 +30,11 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.alignment.body import LONGEST_POSE_LAG, pose_lag
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording, Refusal
+from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.parsing.stamps import distinct
 from gnio_jax.data.parsing.tables import Table, damaged, json_object, read_feather, shortened
 from gnio_jax.data.reference import LONGEST_BRIDGE
-from gnio_jax.data.splits import drawn
+from gnio_jax.data.splits import draw_share
 from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE, WINDOW_SECONDS
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, levelling, stretches
@@ -65,14 +65,14 @@ _SPLITS = {
 _BUILDINGS = ("building1", "building2", "building3")
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The walks of a split."""
     chosen = find_walks(root, _SPLITS[split])
     if split not in ("train", "val"):
         return chosen
     people = {walk.attributes["subject"] for walk in chosen}
-    held = {person for person in people if drawn(SEED, person) < HELD_OUT}
-    chosen = [w for w in chosen if (w.attributes["subject"] in held) == (split == "val")]
+    held = {person for person in people if draw_share(SEED, person) < HELD_OUT}
+    chosen = [walk for walk in chosen if (walk.attributes["subject"] in held) == (split == "val")]
     if people and not chosen:
         problem = f"{len(held)} of {len(people)} people are held out"
         problem = f"split '{split}' would be empty: {problem}"
@@ -81,19 +81,19 @@ def recordings(root: Path, split: str) -> list[Recording]:
     return [walk._replace(attributes=walk.attributes | note) for walk in chosen]
 
 
-def find_walks(root: Path, folder: str) -> list[Recording]:
+def find_walks(root: Path, part: str) -> list[RecordingSource]:
     """The recordings in `folder` ("train", "known", "unknown") of every building; the buildings may
     be a folder or two deeper."""
-    walks: list[Recording] = []
+    walks: list[RecordingSource] = []
     nameless: list[Path] = []
     for building in _BUILDINGS:
         depths = ("", "*/", "*/*/")
-        places = [p for depth in depths for p in sorted(root.glob(f"{depth}{building}/{folder}"))]
-        for place in places[:1]:
-            metadata = place / "metadata.json"
-            about = json_object(metadata) if metadata.is_file() else {}
-            for path in sorted(place.glob("*.feather"), key=lambda p: (len(p.stem), p.stem)):
-                entry = about.get(path.stem)
+        folders = [p for depth in depths for p in sorted(root.glob(f"{depth}{building}/{part}"))]
+        for folder in folders[:1]:
+            metadata_path = folder / "metadata.json"
+            metadata = json_object(metadata_path) if metadata_path.is_file() else {}
+            for path in sorted(folder.glob("*.feather"), key=lambda p: (len(p.stem), p.stem)):
+                entry = metadata.get(path.stem)
                 entry = entry if isinstance(entry, dict) else {}
                 subject = _name(path)
                 if (person := entry.get("subjectID")) is None:
@@ -101,15 +101,17 @@ def find_walks(root: Path, folder: str) -> list[Recording]:
                 else:
                     subject = shortened(f"subject{person}")
                 # Times at which the rig was turned about its axes: start, end, ...
-                known = {"calibration": shortened(entry.get("calibration", "unknown"))}
-                known |= {"subject": subject, "group": subject}
+                attributes = {"calibration": shortened(entry.get("calibration", "unknown"))}
+                attributes |= {"subject": subject, "group": subject}
                 walks.append(
-                    Recording(_name(path), partial(read, path), (path,), True, attributes=known)
+                    RecordingSource(
+                        _name(path), partial(read, path), (path,), True, attributes=attributes
+                    )
                 )
     if nameless:
         problem = f"metadata.json does not name the subject of {len(nameless)} recordings"
-        each = "each is treated as a different person"
-        warnings.warn(f"{root}: {problem}, e.g. {nameless[0]}; {each}", stacklevel=3)
+        remark = "each is treated as a different person"
+        warnings.warn(f"{root}: {problem}, e.g. {nameless[0]}; {remark}", stacklevel=3)
     return walks
 
 
@@ -121,7 +123,7 @@ def _name(path: Path) -> str:
 
 
 def read(path: Path) -> list[Sequence]:
-    """One walk at 100 Hz: levelled, with the reference turned to the phone and shifted to its
+    """Read a walk at 100 Hz: levelled, with the reference turned to the phone and shifted to its
     clock.
 
     Level and lag are those of the whole walk, which is divided at gaps longer than a window. Raises
@@ -140,18 +142,18 @@ def read(path: Path) -> list[Sequence]:
     orientation = table.axes("orient", "WXYZ", gaps=True)[rows]
     position = table.axes("processedPos", "XYZ", gaps=True)[rows]
     # Neither a quaternion of zeros nor NaN is an attitude.
-    known = orientation.any(axis=1) & finite_rows(orientation) & finite_rows(position)
-    if known.sum() < max(fewest, 0.5 * len(rows)):
-        problem = f"hold a pose in only {known.sum()} of {len(rows)} rows"
+    present = orientation.any(axis=1) & finite_rows(orientation) & finite_rows(position)
+    if present.sum() < max(fewest, 0.5 * len(rows)):
+        problem = f"hold a pose in only {present.sum()} of {len(rows)} rows"
         raise Refusal(path, f"columns 'orient', 'processedPos' {problem}")
-    rig = table.rotations(*(f"orient{axis}" for axis in "WXYZ"), rows=rows[known])
+    rig = table.rotations(*(f"orient{axis}" for axis in "WXYZ"), rows=rows[present])
 
     # The map is levelled by the rig's own accelerometer.
-    felt = table.axes("stencilAcc", "XYZ", gaps=True)[rows][known]
-    if (measured := finite_rows(felt)).sum() < fewest:
-        raise Refusal(path, f"columns 'stencilAcc' hold numbers in only {measured.sum()} rows")
-    force = rig[measured].apply(felt[measured])
-    level = levelling(_gravity(time[known][measured], force, position[known][measured]))
+    rig_accel = table.axes("stencilAcc", "XYZ", gaps=True)[rows][present]
+    if (has_accel := finite_rows(rig_accel)).sum() < fewest:
+        raise Refusal(path, f"columns 'stencilAcc' hold numbers in only {has_accel.sum()} rows")
+    force = rig[has_accel].apply(rig_accel[has_accel])
+    level = levelling(_gravity(time[present][has_accel], force, position[present][has_accel]))
     if (tilt := float(np.degrees(level.magnitude()))) > MAX_TILT:
         problem = f"gravity by 'orient' and 'stencilAcc' is {tilt:.0f}° off the vertical"
         raise Refusal(path, problem)
@@ -159,14 +161,14 @@ def read(path: Path) -> list[Sequence]:
 
     # A gap gives no information about the lag, so it is shortened to a window here.
     closed = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(time), WINDOW_SECONDS))])
-    fit = pose_lag(closed, gyro, closed[known], attitude)
+    fit = pose_lag(closed, gyro, closed[present], attitude)
     if not fit.correlation >= 0.5:  # NaN if the poses do not turn at all
         problem = f"do not turn as 'iphoneGyro' does (they correlate by {fit.correlation:.2f})"
         raise Refusal(path, f"columns 'orient' {problem}")
     if abs(fit.lag) >= LONGEST_POSE_LAG:
         problem = f"are out of step with 'iphoneGyro' by {LONGEST_POSE_LAG:g} s or more"
         raise Refusal(path, f"columns 'orient' {problem}")
-    about = {
+    attributes = {
         "group": _name(path),
         "subject": "unknown",
         "building": path.parent.parent.name,
@@ -178,18 +180,20 @@ def read(path: Path) -> list[Sequence]:
         "rate_correlation": fit.correlation,
         "tilt_degrees": tilt,
     }
-    place = level.apply(position[known])
+    smoothed = level.apply(position[present])
     streams = Streams.of_imu(_name(path), path, time, gyro, -STANDARD_G * accel)._replace(
-        attributes=about,
+        attributes=attributes,
         start=start,
-        poses=Poses(time[known] - fit.lag, attitude, place, source=str(path)),
+        poses=Poses(time[present] - fit.lag, attitude, smoothed, source=str(path)),
         device=_device(table, time, rows),
     )
     return assemble(streams, RATE, divide=True, max_speed=FASTEST_WALKER)
 
 
 def _gravity(
-    time: Float[np.ndarray, " n"], force: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "n 3"]
+    time: Float[np.ndarray, " n"],
+    force: Float[np.ndarray, "n 3"],
+    position: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "3"]:
     """The mean force in the map's world minus the mean acceleration of the positions, m/s².
 
@@ -198,20 +202,20 @@ def _gravity(
     are medians over a second of displacements over a second, which no single pose can change.
     """
     mean, second = force.mean(axis=0), round(RATE)
-    gained, seconds = np.zeros(3), 0.0
+    velocity_gain, seconds = np.zeros(3), 0.0
     for run in stretches(np.diff(time) > LONGEST_BRIDGE):
         if run.stop - run.start >= 3 * second:
-            then, apart = time[run], force[run] - mean
+            run_time, difference = time[run], force[run] - mean
             for _ in range(2):
-                apart = cumulative_trapezoid(apart, then, axis=0, initial=0.0)
-            apart = place[run] - apart
-            lasted = then[second:] - then[:-second]
-            speed = (apart[second:] - apart[:-second]) / lasted[:, None]
-            middle = then[:-second] + lasted / 2.0
+                difference = cumulative_trapezoid(difference, run_time, axis=0, initial=0.0)
+            difference = position[run] - difference
+            duration = run_time[second:] - run_time[:-second]
+            speed = (difference[second:] - difference[:-second]) / duration[:, None]
+            middle = run_time[:-second] + duration / 2.0
             first, last = slice(second), slice(-second, None)
-            gained += np.median(speed[last], axis=0) - np.median(speed[first], axis=0)
+            velocity_gain += np.median(speed[last], axis=0) - np.median(speed[first], axis=0)
             seconds += float(np.median(middle[last]) - np.median(middle[first]))
-    return mean - gained / max(seconds, 1.0)
+    return mean - velocity_gain / max(seconds, 1.0)
 
 
 def _device(table: Table, time: Float[np.ndarray, " n"], rows: np.ndarray) -> Samples | None:
@@ -220,10 +224,10 @@ def _device(table: Table, time: Float[np.ndarray, " n"], rows: np.ndarray) -> Sa
     if not {f"iphoneOrient{axis}" for axis in "WXYZ"} <= set(table.columns):
         return None
     wxyz = table.axes("iphoneOrient", "WXYZ", gaps=True)[rows]
-    known = np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= UNIT_NORM_TOLERANCE
-    if known.sum() < 0.5 * len(rows):
+    present = np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= UNIT_NORM_TOLERANCE
+    if present.sum() < 0.5 * len(rows):
         return None
-    return Samples(time[known], wxyz[known], str(table.path))
+    return Samples(time[present], wxyz[present], str(table.path))
 
 
 DATASET = Dataset(

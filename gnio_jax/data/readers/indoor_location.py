@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from gnio_jax.data.assembly import Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording, Refusal
+from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.parsing.tables import Table, damaged, shortened, text_of
 from gnio_jax.data.validation import FARTHEST, FEWEST_WAYPOINTS
 from gnio_jax.errors import InputError
@@ -48,16 +48,17 @@ _MERGED = re.compile(r"(?<!^)(?=\d{13}\tTYPE_)")
 year 2286."""
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split: whole floors. `all` is every walk below the root."""
     paths = sorted(root.glob("**/path_data_files/*.txt"), key=lambda path: path.parts[-3:])
     chosen = [path for path in paths if split in ("all", FLOORS.get(_floor(path)))]
     if paths and not chosen:
-        floors = ", ".join(floor for floor, own in FLOORS.items() if own == split)
+        floors = ", ".join(floor for floor, part in FLOORS.items() if part == split)
         problem = f"holds no walk of split '{split}'"
         raise InputError(root, problem, f"it consists of the floors {floors}; complete the data")
     return [
-        Recording(_name(path), partial(read, path), files=(path,), slow=True) for path in chosen
+        RecordingSource(_name(path), partial(read, path), files=(path,), slow=True)
+        for path in chosen
     ]
 
 
@@ -73,25 +74,25 @@ def _name(path: Path) -> str:
 
 
 def read(path: Path) -> list[Sequence]:
-    """One walk from its file, at 50 Hz, with waypoints instead of poses.
+    """Read a walk from its file, at 50 Hz, with waypoints instead of poses.
 
     Raises `InputError` naming file and field, and `Refusal` for a walk with too few waypoints.
     """
-    header, found = read_lines(path)
-    for kind, table in found.items():
+    header, tables = read_lines(path)
+    for kind, table in tables.items():
         fewest = FEWEST_WAYPOINTS if kind == _WAYPOINT else 2
         if (count := len(table.stamps(kind))) < fewest:
             problem = f"field '{kind}' holds {count}, at least {fewest} are needed"
             raise Refusal(path, problem) if kind == _WAYPOINT else damaged(path, problem)
-    start = found[_GYRO].clock(_GYRO, "ms", repeats="kept")[1]
+    start = tables[_GYRO].clock(_GYRO, "ms", repeats="kept")[1]
 
     def samples(kind: str) -> Samples:
-        time, _, rows = found[kind].clock(kind, "ms", start, "dropped")
-        return Samples(time, found[kind].take("values", width=_VALUES[kind])[rows], str(path))
+        time, _, rows = tables[kind].clock(kind, "ms", start, "dropped")
+        return Samples(time, tables[kind].take("values", width=_VALUES[kind])[rows], str(path))
 
     gyro, accel = samples(_GYRO), samples(_ACCEL)
     device = re.search(r"Brand:(\S+)\s+Model:(\S+)", header)
-    about = {
+    attributes = {
         "group": f"{path.parent.parent.parent.name}_{_floor(path)}",
         "subject": "unknown",
         "device": " ".join(device.groups()) if device else "Android phone",
@@ -104,7 +105,7 @@ def read(path: Path) -> list[Sequence]:
         str(path),
         gyro,
         accel,
-        about,
+        attributes,
         start * 1e-3,
         waypoints=_taps(samples(_WAYPOINT), gyro, accel),
     )
@@ -113,18 +114,18 @@ def read(path: Path) -> list[Sequence]:
 
 def _taps(taps: Samples, gyro: Samples, accel: Samples) -> Samples:
     """The waypoints on the IMU's clock."""
-    time, place, path = taps
+    time, position, path = taps
     first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
-    off = np.maximum(first - time, time - last)
-    if (off > TAP_SECONDS).any():
-        problem = f"field '{_WAYPOINT}' has {np.sum(off > TAP_SECONDS)} of {len(time)} stamps"
-        problem += f" beyond the IMU's, by up to {off.max():.1f} s"
+    excess = np.maximum(first - time, time - last)
+    if (excess > TAP_SECONDS).any():
+        problem = f"field '{_WAYPOINT}' has {np.sum(excess > TAP_SECONDS)} of {len(time)} stamps"
+        problem += f" beyond the IMU's, by up to {excess.max():.1f} s"
         raise InputError(path, problem, "check that all lines are of one phone and one walk")
-    time, own = np.unique(np.clip(time, first, last), return_index=True)
+    time, rows = np.unique(np.clip(time, first, last), return_index=True)
     if len(time) < FEWEST_WAYPOINTS:
         problem = f"field '{_WAYPOINT}' holds {len(time)}, at least {FEWEST_WAYPOINTS} are needed"
         raise Refusal(path, problem)
-    return Samples(time, place[own], path)
+    return Samples(time, position[rows], path)
 
 
 def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
@@ -139,7 +140,7 @@ def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
     if starts > 1:
         problem = f"field 'startTime' is there {starts} times: it holds several recordings"
         raise InputError(path, problem, "divide it")
-    found: dict[str, tuple[list[int], list[list[float]]]] = {kind: ([], []) for kind in _VALUES}
+    columns: dict[str, tuple[list[int], list[list[float]]]] = {kind: ([], []) for kind in _VALUES}
     for number, line in lines:
         if not line.strip() or line.startswith("#"):
             continue
@@ -150,7 +151,7 @@ def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
             raise damaged(path, problem)
         if kind not in _VALUES:
             continue
-        stamps, values = found[kind]
+        stamps, values = columns[kind]
         numbers = cells[2 : 2 + _VALUES[kind]]
         try:
             stamp, row = int(cells[0]), [float(cell) for cell in numbers]
@@ -162,7 +163,7 @@ def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
         stamps.append(stamp)
         values.append(row)
     tables = {}
-    for kind, (stamps, rows) in found.items():
+    for kind, (stamps, rows) in columns.items():
         values = np.array(rows).reshape(-1, _VALUES[kind])
         if not (np.abs(values) < FARTHEST).all():
             raise damaged(path, f"field '{kind}' holds NaN, Inf or impossible values")

@@ -39,10 +39,10 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.stamps import in_order
 from gnio_jax.data.parsing.tables import damaged, read_npz, shortened, text_of
-from gnio_jax.data.splits import drawn
+from gnio_jax.data.splits import draw_share
 from gnio_jax.data.validation import FASTEST
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import stretches
@@ -82,24 +82,26 @@ used."""
 # --- the drives
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The drives of a split, or their pieces if these are separate files."""
-    found, drives = [], find_drives(root)
+    sources, drives = [], find_drives(root)
     for drive, paths in drives.items():
-        if share_of(drive) == split and paths[0].is_dir():
-            found.append(Recording(drive, partial(read_packets, paths[0])))
-        elif share_of(drive) == split:
-            found += [Recording(_piece_name(path), partial(read_piece, path)) for path in paths]
-    if drives and not found:
+        if split_of(drive) == split and paths[0].is_dir():
+            sources.append(RecordingSource(drive, partial(read_packets, paths[0])))
+        elif split_of(drive) == split:
+            sources += [
+                RecordingSource(_piece_name(path), partial(read_piece, path)) for path in paths
+            ]
+    if drives and not sources:
         problem = f"none of its drives falls into split '{split}'"
         raise InputError(root, problem, "take another split or more drives")
-    return found
+    return sources
 
 
-def share_of(drive: str) -> str:
+def split_of(drive: str) -> str:
     """The split of a drive, which depends only on its name."""
-    place = drawn(SEED, drive)
-    return "train" if place < 0.7 else "val" if place < 0.8 else "test"
+    share = draw_share(SEED, drive)
+    return "train" if share < 0.7 else "val" if share < 0.8 else "test"
 
 
 def find_drives(root: Path) -> dict[str, list[Path]]:
@@ -142,10 +144,10 @@ def read_packets(oxts: Path) -> list[Sequence]:
     stamps = _stamps(times)
     if rows.max() >= len(stamps):
         raise damaged(times, f"holds {len(stamps)} stamps, but there is a packet {rows.max()}")
-    known = ~np.isnat(stamps[rows])
-    if known.sum() < 2:
-        raise damaged(times, f"gives {known.sum()} packets a stamp")
-    stamps, packets = stamps[rows][known], packets[known]
+    stamped = ~np.isnat(stamps[rows])
+    if stamped.sum() < 2:
+        raise damaged(times, f"gives {stamped.sum()} packets a stamp")
+    stamps, packets = stamps[rows][stamped], packets[stamped]
     start = stamps.min()
     time = (stamps - start).astype(np.int64) * 1e-9
     order, repairs = in_order(time, packets, times)
@@ -161,14 +163,14 @@ def read_packets(oxts: Path) -> list[Sequence]:
     gyro, accel = values("wx", "wy", "wz"), values("ax", "ay", "az")
     epoch = float(start.astype(np.int64) * 1e-9)
     sequences, short = [], 0
-    for number, own in enumerate(stretches(np.diff(time) > LONGEST_GAP)):
-        if time[own.stop - 1] - time[own.start] < SHORTEST_PIECE:
+    for number, run in enumerate(stretches(np.diff(time) > LONGEST_GAP)):
+        if time[run.stop - 1] - time[run.start] < SHORTEST_PIECE:
             short += 1
             continue
         name = f"{drive}_extract{number}"
-        streams = Streams.of_imu(name, oxts, time[own], gyro[own], accel[own])
-        streams = streams._replace(attributes=repairs, start=epoch, poses=poses.rows(own))
-        sequences += _assembled(streams, drive)
+        streams = Streams.of_imu(name, oxts, time[run], gyro[run], accel[run])
+        streams = streams._replace(attributes=repairs, start=epoch, poses=poses.rows(run))
+        sequences += _assemble_drive(streams, drive)
     if short:
         problem = f"{short} pieces between missing packets are shorter than {SHORTEST_PIECE:g} s"
         warnings.warn(f"{oxts}: {problem}; left out", stacklevel=2)
@@ -184,7 +186,7 @@ def read_piece(path: Path) -> list[Sequence]:
     attitude = Rotation.from_euler("ZYX", angles[:, ::-1])
     poses = Poses(time, attitude, position, velocity, source=str(path))
     streams = Streams.of_imu(_piece_name(path), path, time, imu[:, :3], imu[:, 3:])
-    return _assembled(streams._replace(start=start, poses=poses), _drive_of(path.stem))
+    return _assemble_drive(streams._replace(start=start, poses=poses), _drive_of(path.stem))
 
 
 def _check_rate(time: Float[np.ndarray, " n"], path: Path) -> None:
@@ -193,15 +195,15 @@ def _check_rate(time: Float[np.ndarray, " n"], path: Path) -> None:
         raise InputError(path, problem, "get the _extract archive")
 
 
-def _assembled(streams: Streams, drive: str) -> list[Sequence]:
-    about = {
+def _assemble_drive(streams: Streams, drive: str) -> list[Sequence]:
+    attributes = {
         "group": drive,
         "session": drive[:10],
         "placement": "car",
         "truth": "INS with RTK-GPS (OXTS RT3003)",
         "imu_compensated": "reference",
     }
-    streams = streams._replace(attributes=about | streams.attributes)
+    streams = streams._replace(attributes=attributes | streams.attributes)
     return assemble(streams, RATE, max_drift=LARGEST_JUMP)
 
 

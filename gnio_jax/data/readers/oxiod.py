@@ -32,14 +32,14 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.alignment.body import (
     TooLittle,
     hat_functions,
-    laid_on,
     near_any,
     uniform_knots,
+    with_tracker_poses,
     without_jumps,
 )
 from gnio_jax.data.alignment.positions import align_positions
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording, Refusal
+from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.parsing.tables import Table, damaged, read_text, shortened
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import quaternions
@@ -108,8 +108,8 @@ _TRACKER += [f"rotation_{axis}" for axis in "xyzw"]
 _TRUTHS = ("vi", "hand", "tango")
 
 
-class Walk(NamedTuple):
-    """One walk: the files of one recording."""
+class WalkFiles(NamedTuple):
+    """The files of one walk, which is one recording."""
 
     scene: str
     folder: str
@@ -131,13 +131,13 @@ class Walk(NamedTuple):
 
     def attributes(self, kind: str) -> dict[str, str]:
         """Attributes of the walk that are known without reading it."""
-        own = "user1" if self.scene in SINGLE_USER else "unknown"
+        subject = "user1" if self.scene in SINGLE_USER else "unknown"
         return {
             "scene": self.scene,
             "session": self.session,
             "group": self.session,
             "kind": kind,
-            "subject": self.folder if self.scene == "multi users" else own,
+            "subject": self.folder if self.scene == "multi users" else subject,
             "device": self.folder if self.scene == "multi devices" else "iPhone 7 Plus",
             "placement": self.placement,
         }
@@ -146,13 +146,13 @@ class Walk(NamedTuple):
 # --- walks
 
 
-def find_walks(root: Path) -> list[Walk]:
-    """Every walk below `root`, whose scenes may be some folders deeper."""
+def find_walks(root: Path) -> list[WalkFiles]:
+    """Find every walk below `root`, whose scenes may be some folders deeper."""
     return [
         walk
         for scene in (*SINGLE_USER, *UNSEEN, LARGE_SCALE)
-        for place in _scene_folders(root, scene)
-        for folder in sorted(path for path in place.iterdir() if path.is_dir())
+        for scene_folder in _scene_folders(root, scene)
+        for folder in sorted(path for path in scene_folder.iterdir() if path.is_dir())
         for walk in _walks_of(scene, folder)
     ]
 
@@ -163,20 +163,22 @@ def _scene_folders(root: Path, scene: str) -> list[Path]:
     return [path for path in places if path.is_dir()][:1]
 
 
-def _walks_of(scene: str, folder: Path) -> list[Walk]:
+def _walks_of(scene: str, folder: Path) -> list[WalkFiles]:
     files: dict[int, dict[str, tuple[Path, Path]]] = {}
     # `raw` of the large scale is another format, without Tango's pairs.
     for kind in ("syn",) if scene == LARGE_SCALE else ("raw", "syn"):
         for imu in sorted((folder / kind).glob("imu*.csv")):
             if match := re.fullmatch(r"imu(\d+)\.csv", imu.name):
-                beside = (imu.with_name(f"{name}{match[1]}.csv") for name in _TRUTHS)
-                if truth := next((path for path in beside if path.is_file()), None):
+                truths = (imu.with_name(f"{name}{match[1]}.csv") for name in _TRUTHS)
+                if truth := next((path for path in truths if path.is_file()), None):
                     files.setdefault(int(match[1]), {})[kind] = (imu, truth)
                 else:
                     problem = "has no vi, hand or tango file beside it; left out"
                     warnings.warn(f"{imu}: {problem}", stacklevel=2)
     placement = _placements(scene, folder)
-    return [Walk(scene, folder.name, n, kinds, placement(n)) for n, kinds in sorted(files.items())]
+    return [
+        WalkFiles(scene, folder.name, n, kinds, placement(n)) for n, kinds in sorted(files.items())
+    ]
 
 
 def _placements(scene: str, folder: Path) -> Callable[[int], str]:
@@ -196,7 +198,7 @@ def _placements(scene: str, folder: Path) -> Callable[[int], str]:
 # --- splits
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The walks of `split` below `root`.
 
     `train`, `test` (also called `seen`)
@@ -219,18 +221,18 @@ def recordings(root: Path, split: str) -> list[Recording]:
     return [recording_of(walk) for walk in chosen]
 
 
-def recording_of(walk: Walk) -> Recording:
+def recording_of(walk: WalkFiles) -> RecordingSource:
     """The recording of a walk: `raw` first, and `syn` if `raw` is refused."""
-    found = None
+    source = None
     for kind in ("syn", "raw"):
         if kind in walk.files:
             read, files = partial(build, walk, kind), walk.files[kind]
-            found = Recording(walk.name, read, files, slow=True, form=kind, fallback=found)
-    assert found is not None
-    return found
+            source = RecordingSource(walk.name, read, files, slow=True, form=kind, fallback=source)
+    assert source is not None
+    return source
 
 
-def select(walks: list[Walk], split: str, root: Path) -> list[Walk]:
+def select(walks: list[WalkFiles], split: str, root: Path) -> list[WalkFiles]:
     """The walks of `split`. Raises `InputError` if a list is missing or empty."""
     if split == "unseen":
         return [walk for walk in walks if walk.scene in UNSEEN]
@@ -238,23 +240,23 @@ def select(walks: list[Walk], split: str, root: Path) -> list[Walk]:
         return [walk for walk in walks if walk.scene == LARGE_SCALE]
     if split.startswith("sessions_"):
         held = {"sessions_val": SESSIONS_VAL, "sessions_test": SESSIONS_TEST}
-        of = {session: name for name, sessions in held.items() for session in sessions}
+        split_of = {session: name for name, sessions in held.items() for session in sessions}
         room = [walk for walk in walks if walk.scene != LARGE_SCALE]
-        return [walk for walk in room if of.get(walk.session, "sessions_train") == split]
+        return [walk for walk in room if split_of.get(walk.session, "sessions_train") == split]
     if split in ("test", "seen"):
-        return _on_lists(walks, "Test.txt", root)
-    listed = _on_lists(walks, "Train.txt", root)
-    return [walk for walk in listed if (walk.session in VALIDATION) == (split == "val")]
+        return _read_lists(walks, "Test.txt", root)
+    training = _read_lists(walks, "Train.txt", root)
+    return [walk for walk in training if (walk.session in VALIDATION) == (split == "val")]
 
 
-def _on_lists(walks: list[Walk], name: str, root: Path) -> list[Walk]:
+def _read_lists(walks: list[WalkFiles], name: str, root: Path) -> list[WalkFiles]:
     """The walks that the lists `name` of the single-user scenes name, by lines `dataN` (all its
     walks) and `dataN/imuK.csv`. The last line may be without a newline."""
-    folders = {scene: place for scene in SINGLE_USER for place in _scene_folders(root, scene)}
-    lists = {s: place / name for s, place in folders.items() if (place / name).is_file()}
+    folders = {scene: folder for scene in SINGLE_USER for folder in _scene_folders(root, scene)}
+    lists = {s: folder / name for s, folder in folders.items() if (folder / name).is_file()}
     if not lists:
         raise InputError(root, f"no scene has its list {name}", f"expected layout: {LAYOUT}")
-    chosen: list[Walk] = []
+    chosen: list[WalkFiles] = []
     absent = 0
     for scene, path in lists.items():
         text = path.read_text(encoding="utf-8", errors="replace")
@@ -268,9 +270,11 @@ def _on_lists(walks: list[Walk], name: str, root: Path) -> list[Walk]:
                 raise damaged(path, problem)
             session = f"{scene}/{match[1]}"
             number = None if match[2] is None else int(match[2])
-            here = [w for w in walks if w.session == session and number in (None, w.number)]
-            absent += not here
-            chosen += [walk for walk in here if walk not in chosen]
+            matches = [
+                walk for walk in walks if walk.session == session and number in (None, walk.number)
+            ]
+            absent += not matches
+            chosen += [walk for walk in matches if walk not in chosen]
     if absent:
         problem = f"{absent} entries of the lists {name} are not in this copy"
         warnings.warn(f"{root}: {problem}", stacklevel=2)
@@ -280,22 +284,22 @@ def _on_lists(walks: list[Walk], name: str, root: Path) -> list[Walk]:
 # --- one walk
 
 
-def build(walk: Walk, kind: str) -> list[Sequence]:
-    """One walk at 100 Hz. Raises `Refusal` if its files are damaged, or if they or the fit of phone
-    and tracker cannot be used: another form of the walk may be usable."""
+def build(walk: WalkFiles, kind: str) -> list[Sequence]:
+    """Read a walk at 100 Hz. Raises `Refusal` if its files are damaged, or if they or the fit of
+    phone and tracker cannot be used: another form of the walk may be usable."""
     imu_path, truth_path = walk.files[kind]
     try:
         # The syn files of the large scale still have the phone's stamps.
         phone = read_phone(imu_path, "raw" if walk.scene == LARGE_SCALE else kind)
         on_tango = truth_path.name.startswith("tango")
-        about = walk.attributes(kind) | {"truth": "tango" if on_tango else "vicon"}
-        phone = phone._replace(name=walk.name, attributes=about | phone.attributes)
+        attributes = walk.attributes(kind) | {"truth": "tango" if on_tango else "vicon"}
+        phone = phone._replace(name=walk.name, attributes=attributes | phone.attributes)
         if on_tango:
-            phone = _on_tango(phone, truth_path, kind)
+            phone = _with_tango_positions(phone, truth_path, kind)
         else:
             limits = {"lag": (LONGEST_LAG[kind], "s")} | LIMITS
             track = read_vicon(truth_path, kind, phone.start)
-            phone = laid_on(
+            phone = with_tracker_poses(
                 phone, track, limits, LAG_KNOTS[kind], closest_runner_up=CLOSEST_RUNNER_UP
             )
         (sequence,) = assemble(phone, RATE)
@@ -308,7 +312,7 @@ def build(walk: Walk, kind: str) -> list[Sequence]:
     return [sequence]
 
 
-def _on_tango(phone: Streams, path: Path, kind: str) -> Streams:
+def _with_tango_positions(phone: Streams, path: Path, kind: str) -> Streams:
     """The phone with Tango's positions as its own."""
     if phone.device is None:
         raise Refusal(path, "belongs to a phone that recorded no attitude")
@@ -320,14 +324,14 @@ def _on_tango(phone: Streams, path: Path, kind: str) -> Streams:
         problem = f"by {lag:.2f} s, at most {LONGEST_LAG[kind]:g} s is plausible"
     if problem:
         raise Refusal(path, f"Tango is out of step with the phone ({problem})")
-    about = {
+    figures = {
         "lag": float(np.mean(fit.lag)),
         "lag_drift": float(np.ptp(fit.lag)),
         "yaw_drift_degrees": float(np.degrees(fit.yaw_drift)),
         "vertical_correlation": fit.correlation,
         "runner_up": fit.runner_up,
     }
-    return phone._replace(poses=fit.poses, attributes=phone.attributes | about)
+    return phone._replace(poses=fit.poses, attributes=phone.attributes | figures)
 
 
 # --- the phone's text
@@ -348,7 +352,7 @@ def read_phone(path: Path, kind: str) -> Streams:
     if "gravity_x" not in table.columns:
         values = table.take(*_NEXUS[:7])[:, 1:]
         awake = values[:, 3:].any(axis=1)  # the gyro starts some rows after the accelerometer
-        rows = _sampled(np.flatnonzero(awake) / RATE, values[awake], path)
+        rows = _fresh_samples(np.flatnonzero(awake) / RATE, values[awake], path)
         streams = Streams.of_imu("", path, rows.time, rows.values[:, 3:], rows.values[:, :3])
         return streams._replace(attributes={"imu_compensated": "no"})
     values = table.take(*_IPHONE[:13])
@@ -357,7 +361,7 @@ def read_phone(path: Path, kind: str) -> Streams:
         values = values[np.argsort(values[:, 0], kind="stable")]
         start = float(values[0, 0])
         stamps = values[:, 0] - start
-    rows = _sampled(stamps, values[:, 1:], path)
+    rows = _fresh_samples(stamps, values[:, 1:], path)
     angles, rate, gravity, user_acc = np.split(rows.values, 4, axis=1)
     length = float(np.median(np.linalg.norm(gravity, axis=1)))
     if not 0.9 < length < 1.1:
@@ -384,7 +388,7 @@ def _nexus_events(table: Table) -> Streams:
             problem = f"holds {len(rows)} rows of type {number}, less than {SHORTEST:g} s"
             raise damaged(table.path, problem)
         rows = rows[np.argsort(stamps[rows], kind="stable")]
-        time = restored_clock(stamps[rows] / 1e3 - start, table.path)
+        time = restore_clock(stamps[rows] / 1e3 - start, table.path)
         sensors.append(Samples(time, values[rows], str(table.path)))
     gyro, accel = sensors
     return Streams("", str(table.path), gyro, accel, {"imu_compensated": "no"}, start)
@@ -399,18 +403,18 @@ def _read_table(path: Path, *layouts: list[str]) -> Table:
     return table.renamed(named[table.width()])
 
 
-def _sampled(stamps: np.ndarray, values: np.ndarray, path: Path) -> Samples:
+def _fresh_samples(stamps: np.ndarray, values: np.ndarray, path: Path) -> Samples:
     """The rows that do not repeat the row before, on the phone's own clock. Rows that repeat it are
     filler, with any stamp. A repeated stamp with other values comes from a rounded clock."""
     fresh = _is_fresh(values)
-    return Samples(restored_clock(stamps[fresh], path), values[fresh], str(path))
+    return Samples(restore_clock(stamps[fresh], path), values[fresh], str(path))
 
 
 def _is_fresh(values: Float[np.ndarray, "n w"]) -> Bool[np.ndarray, " n"]:
     return np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
 
 
-def restored_clock(stamps: Float[np.ndarray, " n"], path: Path) -> Float[np.ndarray, " n"]:
+def restore_clock(stamps: Float[np.ndarray, " n"], path: Path) -> Float[np.ndarray, " n"]:
     """Times (s) of uniformly taken samples from stamps rounded to 10 ms.
 
     The times are piecewise linear in the number of the sample, counting lost ones, with a knot per
@@ -463,18 +467,18 @@ def read_vicon(path: Path, kind: str, start: float) -> Poses:
         values[np.abs(time) > 3600.0] = np.nan  # poses of another time
         order = np.argsort(time, kind="stable")
         time, values = time[order], values[order]
-    known = np.isfinite(values).all(axis=1) & _is_fresh(values)
-    known &= np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) < 0.01
-    known &= np.concatenate([[True], np.diff(time) > 0])
-    rows = _enough(known, 0.5, "rows hold a pose", path)
-    place, attitude = values[rows, :3], Rotation.from_quat(values[rows, 3:])
-    if np.ptp(place, axis=0).max() > WIDEST:
+    present = np.isfinite(values).all(axis=1) & _is_fresh(values)
+    present &= np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) < 0.01
+    present &= np.concatenate([[True], np.diff(time) > 0])
+    rows = _usable_rows(present, 0.5, "rows hold a pose", path)
+    position, attitude = values[rows, :3], Rotation.from_quat(values[rows, 3:])
+    if np.ptp(position, axis=0).max() > WIDEST:
         problem = f"field 'translation' spans more than {WIDEST:g} m, it looks like mm"
         raise InputError(path, problem, "convert it to m")
-    poses = Poses(time[rows], attitude, place, noisy=True, source=str(path))
-    good = without_jumps(poses, FASTEST_TURN, FASTEST)
-    _enough(np.isin(time, good.time), 0.3, "poses are plausible", path)
-    return good
+    poses = Poses(time[rows], attitude, position, noisy=True, source=str(path))
+    plausible = without_jumps(poses, FASTEST_TURN, FASTEST)
+    _usable_rows(np.isin(time, plausible.time), 0.3, "poses are plausible", path)
+    return plausible
 
 
 def read_tango(path: Path) -> Samples:
@@ -482,7 +486,7 @@ def read_tango(path: Path) -> Samples:
     are rounded to a second in some files. Raises `InputError`."""
     values = _read_table(path, _TRACKER).take(*_TRACKER[2:5], gaps=True)
     usable = _is_fresh(values) & np.isfinite(values).all(axis=1)
-    rows = _enough(usable, 0.5, "rows hold a position", path)
+    rows = _usable_rows(usable, 0.5, "rows hold a position", path)
     steps = np.linalg.norm(np.diff(values[rows], axis=0), axis=1)
     jumps = np.flatnonzero(steps > FASTEST_TANGO * np.diff(rows) / RATE)
     # The rows on both sides of a jump, and 0.1 s around them.
@@ -490,7 +494,7 @@ def read_tango(path: Path) -> Samples:
     return Samples(rows / RATE, values[rows], str(path))
 
 
-def _enough(usable: Bool[np.ndarray, " n"], share: float, what: str, path: Path) -> np.ndarray:
+def _usable_rows(usable: Bool[np.ndarray, " n"], share: float, what: str, path: Path) -> np.ndarray:
     """The usable rows; raises `InputError` if they are fewer than this share."""
     rows = np.flatnonzero(usable)
     if len(rows) < share * len(usable):

@@ -13,7 +13,7 @@ android_sensor_pose.txt has the poses of the IMU; it is used if it exists, turne
 rates depend on the phone.
 
 Sequences have 200 Hz. The lists name train and test; for validation whole people are held out of
-train (`held_out_of_train`).
+train (`hold_out_of_train`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import Table, read_text
-from gnio_jax.data.splits import find_folders, find_list, held_out, listed
+from gnio_jax.data.splits import find_folders, find_list, hold_out, read_list
 from gnio_jax.data.validation import FASTEST_WALKER
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import quaternions, rotations
@@ -49,7 +49,7 @@ _LISTS = {
 _PLACEMENTS = {"handheld": "handheld", "leg": "pocket", "bag": "bag", "body": "body"}
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split that are present, anywhere below the root; `seen` is `test`.
 
     `unseen` is the authors' cross-subject list. Recordings in no list are only in `all`, which is
@@ -59,10 +59,10 @@ def recordings(root: Path, split: str) -> list[Recording]:
     if split == "all":
         return [_recording(folder, {}) for _, folder in sorted(folders.items())]
     path = find_list(root, _LISTS[split])
-    chosen = listed(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
+    chosen = read_list(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
     if split not in ("train", "val"):
         return [_recording(folder, {}) for folder in chosen]
-    held = held_out_of_train(path)
+    held = hold_out_of_train(path)
     chosen = [folder for folder in chosen if (folder.name in held) == (split == "val")]
     if not chosen:
         problem = f"split '{split}' would be empty: {len(held)} sequences of this list are held out"
@@ -71,16 +71,16 @@ def recordings(root: Path, split: str) -> list[Recording]:
     return [_recording(folder, {"held_out": subjects}) for folder in chosen]
 
 
-def _recording(folder: Path, attributes: dict[str, str]) -> Recording:
+def _recording(folder: Path, attributes: dict[str, str]) -> RecordingSource:
     files = tuple(folder / name for name in (_TABLE, *_TEXT_FILES))
-    return Recording(folder.name, partial(read, folder), files, True, attributes)
+    return RecordingSource(folder.name, partial(read, folder), files, True, attributes)
 
 
-def held_out_of_train(path: Path) -> set[str]:
+def hold_out_of_train(path: Path) -> set[str]:
     """Names in the training list for validation: whole people, about a tenth of the list, the same
     in every copy of the data."""
-    folders = listed(path, lambda entry: Path(_name(entry)), path.parent, DATASET.layout)
-    return held_out({folder.name: _subject(folder.name) for folder in folders})
+    folders = read_list(path, lambda entry: Path(_name(entry)), path.parent, DATASET.layout)
+    return hold_out({folder.name: _subject(folder.name) for folder in folders})
 
 
 def _is_recording(folder: Path) -> bool:
@@ -102,7 +102,7 @@ def _subject(name: str) -> str:
 
 
 def read(folder: Path) -> list[Sequence]:
-    """One recording from its folder, at 200 Hz, from its table or else from the recorder's text
+    """Read a recording from its folder, at 200 Hz, from its table or else from the recorder's text
     files, divided at gaps of IMU or odometry that are longer than a window.
 
     `device_orientation` is the game rotation vector, turned to begin at the reference's attitude,
@@ -111,7 +111,7 @@ def read(folder: Path) -> list[Sequence]:
     table, arcore = (folder / _TABLE).is_file(), (folder / _ARCORE).is_file()
     streams = _from_table(folder) if table else _from_text_files(folder, arcore)
     words = re.findall("|".join(_PLACEMENTS), folder.name)
-    about = {
+    attributes = {
         "group": _subject(folder.name),
         "subject": _subject(folder.name),
         "device": "Android phone" if arcore and not table else "Tango phone",
@@ -119,12 +119,12 @@ def read(folder: Path) -> list[Sequence]:
         "truth": f"{'ARCore' if arcore and not table else 'Tango'} VIO of the phone itself",
         "imu_compensated": "Android's gyro bias" if arcore and not table else "no",
     }
-    streams = streams._replace(attributes=about)
+    streams = streams._replace(attributes=attributes)
     pieces = assemble(streams, RATE, divide=True, max_speed=FASTEST_WALKER)
     for number, piece in enumerate(pieces):
         if piece.device_orientation is not None:
-            own, first = rotations(piece.device_orientation), int(np.argmax(piece.valid))
-            turned = rotations(piece.orientation[first]) * own[first].inv() * own
+            device, first = rotations(piece.device_orientation), int(np.argmax(piece.valid))
+            turned = rotations(piece.orientation[first]) * device[first].inv() * device
             pieces[number] = piece._replace(device_orientation=quaternions(turned))
     return pieces
 
@@ -155,23 +155,23 @@ def _from_text_files(folder: Path, arcore: bool) -> Streams:
     start = gyro.clock(0, "ns", repeats="kept")[1]
 
     def samples(table: Table) -> Samples:
-        time, _, own = table.clock(0, "ns", start, "dropped")
-        return Samples(time, table.take(1, 2, 3)[own], str(table.path))
+        time, _, rows = table.clock(0, "ns", start, "dropped")
+        return Samples(time, table.take(1, 2, 3)[rows], str(table.path))
 
     upright = Rotation.from_euler("x", 90.0 if arcore else 0.0, degrees=True)  # of a y-up world
-    time, _, own = pose.clock(0, "ns", start, "dropped")
+    time, _, rows = pose.clock(0, "ns", start, "dropped")
     poses = Poses(
         time,
-        upright * pose.rotations(4, 5, 6, 7, scalar_first=False)[own],
-        upright.apply(pose.take(1, 2, 3)[own]),
+        upright * pose.rotations(4, 5, 6, 7, scalar_first=False)[rows],
+        upright.apply(pose.take(1, 2, 3)[rows]),
         ends_pieces=True,
         source=str(pose.path),
     )
     device = None
     if (folder / "orientation.txt").is_file():
         game = text("orientation.txt")
-        time, _, own = game.clock(0, "ns", start, "dropped")
-        attitude = game.rotations(1, 2, 3, 4, scalar_first=False)[own]
+        time, _, rows = game.clock(0, "ns", start, "dropped")
+        attitude = game.rotations(1, 2, 3, 4, scalar_first=False)[rows]
         device = Samples(time, quaternions(attitude), str(game.path))
     streams = Streams(folder.name, str(folder), samples(gyro), samples(accel))
     return streams._replace(start=start * 1e-9, poses=poses, device=device)

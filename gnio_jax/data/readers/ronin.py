@@ -24,9 +24,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import damaged, json_object, read_hdf5_fields, shortened
-from gnio_jax.data.splits import find_folders, find_list, listed
+from gnio_jax.data.splits import find_folders, find_list, read_list
 from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE
 from gnio_jax.numerics import integrate_gyro, quaternions, rotations
 from gnio_jax.types import Sequence
@@ -55,44 +55,44 @@ _ERRORS = {
 }
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split's list that are present, anywhere below the root; `test` is
     `seen`."""
     folders = find_folders(root, lambda folder: (folder / _TABLE).is_file())
-    chosen = listed(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
+    chosen = read_list(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
     choose = split in ("train", "val")
-    return [Recording(folder.name, partial(read, folder, choose)) for folder in chosen]
+    return [RecordingSource(folder.name, partial(read, folder, choose)) for folder in chosen]
 
 
 def read(folder: Path, choose: bool = False) -> list[Sequence]:
-    """One recording of its folder, from its `start_frame` on.
+    """Read the recording of a folder, from its `start_frame` on.
 
     With `choose` the source of the orientation is chosen by its errors against the truth, as in
     training; without it the source is the game rotation vector. `device_orientation` is the game
     rotation vector of the phone. Raises `InputError` naming file and field.
     """
-    path, about = folder / _TABLE, folder / _INFO
-    info = json_object(about, f"it belongs beside {_TABLE}")
+    path, info_path = folder / _TABLE, folder / _INFO
+    info = json_object(info_path, f"it belongs beside {_TABLE}")
     table = read_hdf5_fields(path, (_TIME, _GYRO, _ACCEL, _GAME, _POSITION, _CHEST, _EKF))
     time, start, _ = table.clock(_TIME, "s")
     game, chest = table.rotations(_GAME, width=4), table.rotations(_CHEST, width=4, rows=slice(1))
     gyro, accel, position = (table.take(name, width=3) for name in (_GYRO, _ACCEL, _POSITION))
-    gyro = gyro - _vector(info, "imu_init_gyro_bias", 3, about)
-    accel = accel - _vector(info, "imu_acce_bias", 3, about)
-    accel = accel * _vector(info, "imu_acce_scale", 3, about)
-    on_chest = _vector(info, "start_calibration", 4, about)
+    gyro = gyro - _vector(info, "imu_init_gyro_bias", 3, info_path)
+    accel = accel - _vector(info, "imu_acce_bias", 3, info_path)
+    accel = accel * _vector(info, "imu_acce_scale", 3, info_path)
+    on_chest = _vector(info, "start_calibration", 4, info_path)
     if abs(np.linalg.norm(on_chest) - 1.0) > UNIT_NORM_TOLERANCE:
-        raise damaged(about, "field 'start_calibration' is not a unit quaternion")
+        raise damaged(info_path, "field 'start_calibration' is not a unit quaternion")
 
     source, error = "game_rv", info.get(_ERRORS["game_rv"])
     if choose:
-        source, error = _choice(info, _EKF in table.columns, about)
-    followed = game
+        source, error = _choose_orientation(info, _EKF in table.columns, info_path)
+    attitude = game
     if source == "ekf":
-        followed = table.rotations(_EKF, width=4)
+        attitude = table.rotations(_EKF, width=4)
     elif source == "gyro_integration":
-        followed = game[0] * integrate_gyro(gyro, np.diff(time))
-    orientation = chest[0] * rotations(on_chest) * followed[0].inv() * followed
+        attitude = game[0] * integrate_gyro(gyro, np.diff(time))
+    orientation = chest[0] * rotations(on_chest) * attitude[0].inv() * attitude
 
     attributes = {
         "group": folder.name.partition("_")[0],
@@ -106,13 +106,13 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
     }
     if isinstance(error, int | float) and abs(error) <= 360.0:
         attributes["orientation_error_degrees"] = float(error)
-    kept = slice(_start_frame(info, len(time), about), None)
-    time = time[kept]
-    streams = Streams.of_imu(folder.name, path, time, gyro[kept], accel[kept])._replace(
+    rows = slice(_start_frame(info, len(time), info_path), None)
+    time = time[rows]
+    streams = Streams.of_imu(folder.name, path, time, gyro[rows], accel[rows])._replace(
         attributes=attributes,
         start=start,
-        poses=Poses(time, orientation[kept], position[kept], source=str(path)),
-        device=Samples(time, quaternions(game[kept]), str(path)),
+        poses=Poses(time, orientation[rows], position[rows], source=str(path)),
+        device=Samples(time, quaternions(game[rows]), str(path)),
     )
     return assemble(streams, RATE, max_speed=FASTEST_WALKER)
 
@@ -120,7 +120,7 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
 # --- info.json
 
 
-def _choice(info: dict[str, Any], has_ekf: bool, path: Path) -> tuple[str, float]:
+def _choose_orientation(info: dict[str, Any], has_ekf: bool, path: Path) -> tuple[str, float]:
     """The source for training, and its final error against the truth, degrees."""
     errors = {
         name: float(_vector(info, field, 1, path)[0])
@@ -144,12 +144,12 @@ def _vector(info: dict[str, Any], name: str, length: int, path: Path) -> Float[n
     """A field of `length` finite numbers, or of a single one."""
     if info.get(name) is None:
         raise damaged(path, f"field '{name}' is missing")
-    given = [info[name]] if length == 1 else info[name]
+    entries = [info[name]] if length == 1 else info[name]
     values = np.empty(0)
-    numbers = isinstance(given, list) and all(type(each) in (int, float) for each in given)
-    if numbers and len(given) == length:
+    numbers = isinstance(entries, list) and all(type(number) in (int, float) for number in entries)
+    if numbers and len(entries) == length:
         # JSON's integers may be of any size.
-        values = np.array([float(each) if abs(each) < 1e300 else np.inf for each in given])
+        values = np.array([float(number) if abs(number) < 1e300 else np.inf for number in entries])
     if values.shape != (length,) or not np.isfinite(values).all():
         what = "is no number" if length == 1 else f"does not hold {length} numbers"
         raise damaged(path, f"field '{name}' {what}")

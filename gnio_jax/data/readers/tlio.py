@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import json_object, read_npy, shortened
-from gnio_jax.data.splits import listed
+from gnio_jax.data.splits import read_list
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
@@ -31,19 +31,19 @@ _WIDTHS = {_STAMPS: 1, _GYRO: 3, _ACCEL: 3, _ATTITUDE: 4, _POSITION: 3, _VELOCIT
 _LISTS = {"train": "train_list.txt", "val": "val_list.txt", "test": "test_list.txt"}
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split's list that are present."""
-    folders = listed(
+    folders = read_list(
         root / _LISTS[split],
         lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
         root,
         DATASET.layout,
     )
-    return [Recording(folder.name, partial(read, folder)) for folder in folders]
+    return [RecordingSource(folder.name, partial(read, folder)) for folder in folders]
 
 
 def read(folder: Path) -> list[Sequence]:
-    """One sequence of its folder. Raises `InputError` naming file and field."""
+    """Read the sequence of a folder. Raises `InputError` naming file and field."""
     path = folder / _TABLE
     table = read_npy(path, *_columns(folder / _DESCRIPTION))
     time, start, _ = table.clock(_STAMPS, "us")
@@ -52,7 +52,7 @@ def read(folder: Path) -> list[Sequence]:
         table.take(name, width=3) for name in (_GYRO, _ACCEL, _POSITION, _VELOCITY)
     )
     gyro, accel = (attitude.inv().apply(values) for values in (gyro, accel))
-    about = {
+    attributes = {
         "group": folder.name,
         "placement": "head",
         "truth": "visual-inertial (VIO or motion capture)",
@@ -60,7 +60,7 @@ def read(folder: Path) -> list[Sequence]:
     }
     poses = Poses(time, attitude, position, velocity, source=str(path))
     streams = Streams.of_imu(folder.name, path, time, gyro, accel)
-    streams = streams._replace(attributes=about, start=start * 1e-6, poses=poses)
+    streams = streams._replace(attributes=attributes, start=start * 1e-6, poses=poses)
     return assemble(streams, RATE)
 
 
@@ -79,8 +79,8 @@ def _columns(path: Path) -> tuple[dict[str, slice], int]:
         start += int(match[2])
     for name, expected in _WIDTHS.items():
         if name not in columns:
-            known = shortened(", ".join(columns), 600)
-            raise InputError(path, f"column '{name}' is missing", f"found: {known}")
+            names = shortened(", ".join(columns), 600)
+            raise InputError(path, f"column '{name}' is missing", f"found: {names}")
         width = columns[name].stop - columns[name].start
         if width != expected:
             raise InputError(path, f"column '{name}' has width {width}, expected {expected}")

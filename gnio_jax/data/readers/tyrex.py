@@ -37,9 +37,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.alignment.body import laid_on, without_jumps
+from gnio_jax.data.alignment.body import with_tracker_poses, without_jumps
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text, shortened, text_of
 from gnio_jax.data.splits import find_folders
 from gnio_jax.errors import InputError
@@ -94,8 +94,8 @@ _TEXT_FILES = ("accelerometer.txt", "gyroscope.txt", "description.txt", "timeAli
 _NAME = re.compile(rf"(\w+?)_({'|'.join(DEVICES)})_(Dist|NoDist)_(\w+)")
 
 
-class Walk(NamedTuple):
-    """One walk: the folder of its phone, and the parts of its name."""
+class WalkFolder(NamedTuple):
+    """The folder of the phone of one walk, and the parts of its name."""
 
     folder: Path
     person: str
@@ -109,56 +109,59 @@ class Walk(NamedTuple):
         return self.folder.parents[1] / "qualisys" / f"{self.folder.name}.mat"
 
 
-def walk_of(folder: Path) -> Walk | None:
+def walk_of(folder: Path) -> WalkFolder | None:
     """The walk of a folder, by its name; None for another folder."""
     match = _NAME.fullmatch(folder.name)
     if match is None:
         return None
     person, device, magnets, way = match.groups()
-    return Walk(folder, person, DEVICES[device], magnets == "Dist", way)
+    return WalkFolder(folder, person, DEVICES[device], magnets == "Dist", way)
 
 
-def recordings(root: Path, split: str) -> list[Recording]:
+def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split that are present, anywhere below the root.
 
     `train` has the walks of one person. `val` has those of the other person with magnets beside the
     path, and `test` those without (including running). `all` is every walk, and `all-0of2`,
     `all+0of2` divide it by person.
     """
-    found = find_folders(root, lambda folder: walk_of(folder) is not None)
-    walks = [walk for folder in found.values() if (walk := walk_of(folder)) is not None]
-    chosen = sorted((w for w in walks if split in ("all", _split(w))), key=lambda w: w.folder.name)
+    folders = find_folders(root, lambda folder: walk_of(folder) is not None)
+    walks = [walk for folder in folders.values() if (walk := walk_of(folder)) is not None]
+    chosen = sorted(
+        (walk for walk in walks if split in ("all", _split(walk))),
+        key=lambda walk: walk.folder.name,
+    )
     if walks and not chosen:
         people = f"'{TRAINS}' trains, and the other people validate and test"
         raise InputError(root, f"holds no walk of split '{split}'", f"complete the data: {people}")
     return [_recording(walk) for walk in chosen]
 
 
-def _split(walk: Walk) -> str:
+def _split(walk: WalkFolder) -> str:
     if walk.person == TRAINS:
         return "train"
     return "val" if walk.magnets else "test"
 
 
-def _recording(walk: Walk) -> Recording:
+def _recording(walk: WalkFolder) -> RecordingSource:
     files = *(walk.folder / name for name in _TEXT_FILES), walk.track
-    return Recording(walk.folder.name, partial(read, walk.folder), files, slow=True)
+    return RecordingSource(walk.folder.name, partial(read, walk.folder), files, slow=True)
 
 
 # --- one walk
 
 
 def read(folder: Path) -> list[Sequence]:
-    """One walk from its phone's folder. Raises `InputError` naming file and field, and `Refusal` if
-    phone and tracker do not have the same motion."""
+    """Read a walk from its phone's folder. Raises `InputError` naming file and field, and `Refusal`
+    if phone and tracker do not have the same motion."""
     walk = walk_of(folder)
     if walk is None:
         problem = "is not named <Person>_<Device>_<Dist|NoDist>_<Way>"
         raise InputError(folder, problem, "give the folder its published name")
     phone, track = read_phone(walk), read_track(walk.track, _offset(folder))
     # One of these files is damaged, so they do not fit together.
-    both = f"{walk.track} and accelerometer.txt, gyroscope.txt, timeAlignment.txt of the phone"
-    about = {
+    files = f"{walk.track} and accelerometer.txt, gyroscope.txt, timeAlignment.txt of the phone"
+    attributes = {
         "group": walk.person,
         "subject": walk.person,
         "device": walk.device,
@@ -166,24 +169,27 @@ def read(folder: Path) -> list[Sequence]:
         "gait": "running" if walk.way.startswith("Running") else "walking",
         "truth": "Qualisys",
         "imu_compensated": "no" if walk.device.startswith("iPhone") else "Android's gyro bias",
-        "accel_clipped": clipped(phone.accel.values),
+        "accel_clipped": clipped_share(phone.accel.values),
     }
-    phone, track = phone._replace(attributes=about), track._replace(source=both)
-    return assemble(laid_on(phone, track, LIMITS, LAG_KNOTS, LAG_SEARCH), RATE, divide=True)
+    phone, track = phone._replace(attributes=attributes), track._replace(source=files)
+    return assemble(
+        with_tracker_poses(phone, track, LIMITS, LAG_KNOTS, LAG_SEARCH), RATE, divide=True
+    )
 
 
-def clipped(accel: Float[np.ndarray, "n 3"]) -> float:
+def clipped_share(accel: Float[np.ndarray, "n 3"]) -> float:
     """Share of the samples (m/s²) at the ends of an accelerometer's range; 0 if it reaches beyond
     `CLIPS`."""
-    felt = np.abs(accel).max(axis=1) / STANDARD_G
-    return float((felt > CLIPS[0]).mean()) if felt.max() < CLIPS[1] else 0.0
+    magnitude = np.abs(accel).max(axis=1) / STANDARD_G
+    return float((magnitude > CLIPS[0]).mean()) if magnitude.max() < CLIPS[1] else 0.0
 
 
 # --- the phone's text
 
 
-def read_phone(walk: Walk) -> Streams:
-    """Both sensors, in s of the record, as SI units in the phone's axes. Raises `InputError`."""
+def read_phone(walk: WalkFolder) -> Streams:
+    """Read both sensors: SI units, the phone's axes, time in s of the record. Raises
+    `InputError`."""
     apple = walk.device.startswith("iPhone")
     start = _boot_time(walk.folder / "description.txt") if apple else 0.0
     sensors = []
@@ -209,10 +215,10 @@ def read_phone(walk: Walk) -> Streams:
 
 def _boot_time(path: Path) -> float:
     """Time of the beginning of an iPhone's record, s since boot."""
-    found = re.search(r"BootTime\s*=\s*(\d{1,12}(?:\.\d{1,9})?)", text_of(path))
-    if found is None:
+    match = re.search(r"BootTime\s*=\s*(\d{1,12}(?:\.\d{1,9})?)", text_of(path))
+    if match is None:
         raise damaged(path, "field 'BootTime' is missing")
-    return float(found[1])
+    return float(match[1])
 
 
 def _offset(folder: Path) -> float:
@@ -250,26 +256,26 @@ def read_track(path: Path, offset: float) -> Poses:
     if not isinstance(rate, int | float) or not 1.0 <= rate <= 1000.0:
         raise damaged(path, f"field 'FrameRate' is {shortened(rate)} Hz, expected 60")
     table = Table(path, {name: np.asarray(bodies[name]).T for name in widths}, "field")
-    place, matrices = (table.take(name, width=w, gaps=True) for name, w in widths.items())
-    seen = np.flatnonzero(finite_rows(place) & finite_rows(matrices))
-    if len(seen) < 0.5 * len(place):
-        raise damaged(path, f"only {len(seen)} of {len(place)} frames hold a pose")
-    place = place[seen] * 1e-3
-    turns = matrices[seen].reshape(-1, 3, 3).transpose(0, 2, 1)  # column by column
-    off = np.abs(turns.transpose(0, 2, 1) @ turns - np.eye(3)).max(axis=(1, 2))
-    bad = ~(off <= 1e-3) | ~(np.linalg.det(turns) > 0)
+    position, matrices = (table.take(name, width=w, gaps=True) for name, w in widths.items())
+    frames = np.flatnonzero(finite_rows(position) & finite_rows(matrices))
+    if len(frames) < 0.5 * len(position):
+        raise damaged(path, f"only {len(frames)} of {len(position)} frames hold a pose")
+    position = position[frames] * 1e-3
+    turns = matrices[frames].reshape(-1, 3, 3).transpose(0, 2, 1)  # column by column
+    deviation = np.abs(turns.transpose(0, 2, 1) @ turns - np.eye(3)).max(axis=(1, 2))
+    bad = ~(deviation <= 1e-3) | ~(np.linalg.det(turns) > 0)
     if bad.any():
-        frame = f"first in frame {seen[np.argmax(bad)] + 1}"
+        frame = f"first in frame {frames[np.argmax(bad)] + 1}"
         raise damaged(path, f"field 'Rotations' is no rotation in {bad.sum()} frames, {frame}")
-    poses = Poses(seen / rate - offset, Rotation.from_matrix(turns), place, noisy=True)
-    good = without_jumps(poses, FASTEST_TURN, FASTEST)._replace(source=str(path))
-    if len(good.time) < 0.5 * len(seen):
-        raise damaged(path, f"only {len(good.time)} of {len(seen)} poses are plausible")
+    poses = Poses(frames / rate - offset, Rotation.from_matrix(turns), position, noisy=True)
+    plausible = without_jumps(poses, FASTEST_TURN, FASTEST)._replace(source=str(path))
+    if len(plausible.time) < 0.5 * len(frames):
+        raise damaged(path, f"only {len(plausible.time)} of {len(frames)} poses are plausible")
     least, most = WIDEST
-    if not least <= (span := float(np.ptp(good.position, axis=0).max())) <= most:
+    if not least <= (span := float(np.ptp(plausible.position, axis=0).max())) <= most:
         problem = f"field 'Positions' spans {span:.3g} m as mm, expected {least:g} to {most:g} m"
         raise InputError(path, problem, "give it in mm")
-    return good
+    return plausible
 
 
 DATASET = Dataset(

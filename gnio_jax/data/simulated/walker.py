@@ -24,7 +24,7 @@ from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.numerics import about_z, convolved
+from gnio_jax.numerics import about_z, convolve
 
 Range = tuple[float, float]
 Ranges = tuple[Range, Range, Range]
@@ -64,7 +64,7 @@ class Carrying(NamedTuple):
     roll: float
     """Standard deviation of the rotation about the phone's y axis, rad."""
     lever: Ranges
-    """From the walker's axis to the phone, m; left is the side of the phone."""
+    """Vector from the walker's axis to the phone, m; left is the side of the phone."""
 
 
 CARRYING = {
@@ -170,19 +170,19 @@ class Population(NamedTuple):
 def _narrow(ranges: Any, share: float) -> Any:
     """A range, or a tuple of them, with this share of its width about the same middle."""
     if isinstance(ranges[0], tuple):
-        return tuple(_narrow(each, share) for each in ranges)
+        return tuple(_narrow(bounds, share) for bounds in ranges)
     low, high = 0.5 * (1 + share), 0.5 * (1 - share)
     return (low * ranges[0] + high * ranges[1], high * ranges[0] + low * ranges[1])
 
 
-def _narrow_carrying(carried: Carrying, share: float) -> Carrying:
-    values = carried._asdict()
+def _narrow_carrying(carrying: Carrying, share: float) -> Carrying:
+    values = carrying._asdict()
     ranges = {name: _narrow(value, share) for name, value in values.items() if type(value) is tuple}
     # The fore-aft motion of the trunk reaches the phone in every placement, and shows the direction
     # of walking.
-    mean, std = carried.surge_phase
+    mean, std = carrying.surge_phase
     ranges |= {"surge": (0.9, 1.1), "surge_phase": (mean, share * std)}
-    return carried._replace(**ranges, turned=0.0, roll=share * carried.roll)
+    return carrying._replace(**ranges, turned=0.0, roll=share * carrying.roll)
 
 
 MANY_PEOPLE = Population(
@@ -209,7 +209,7 @@ FEW_PEOPLE = Population(
         "upstairs": Activity(0.06, (0.45, 0.6), (6.0, 10.0), 0.6, 0.0),
         "downstairs": Activity(0.06, (0.5, 0.65), (6.0, 10.0), -0.6, 0.0),
     },
-    carrying={name: _narrow_carrying(each, 0.2) for name, each in CARRYING.items()},
+    carrying={name: _narrow_carrying(carrying, 0.2) for name, carrying in CARRYING.items()},
     cadence=_narrow((0.86, 1.16), 0.2),
     idle=(0.001, 0.003),
 )
@@ -247,7 +247,7 @@ class Steps(NamedTuple):
         return (self.length / (self.length + 0.5) * (_STEP + 0.5) / _STEP)[:, None]
 
 
-class Motion(NamedTuple):
+class PhoneMotion(NamedTuple):
     """True motion of the phone. There is one more pose than samples, because the last sample also
     drives an interval."""
 
@@ -267,46 +267,46 @@ def draw_motion(
     placement: str,
     time: Float[np.ndarray, " n"],
     dt: float,
-    who: int | None = None,
-) -> Motion:
+    person: int | None = None,
+) -> PhoneMotion:
     """The motion of a phone on a walk that is drawn from `people`; `time` (s) is uniform with the
     step `dt`. `placement` is a way of `people.carrying`.
 
-    The gait of walker number `who` is the same in every walk; without a number it is also drawn
+    The gait of walker number `person` is the same in every walk; without a number it is also drawn
     from `rng`. Position and velocity are value and derivative of one spline.
     """
-    own = rng if who is None else np.random.default_rng([7, who])
-    carried = people.carrying[placement]
-    planned = _plan(rng, people.activities, time, dt)
-    walking = step_frequency(planned.speed, own.uniform(*people.cadence))
-    hurried = own.uniform(2.3, 2.8) + 0.1 * planned.speed
-    cadence = walking + planned.running * (hurried - walking)
+    gait_rng = rng if person is None else np.random.default_rng([7, person])
+    carrying = people.carrying[placement]
+    plan = _plan(rng, people.activities, time, dt)
+    walking_cadence = step_frequency(plan.speed, gait_rng.uniform(*people.cadence))
+    running_cadence = gait_rng.uniform(2.3, 2.8) + 0.1 * plan.speed
+    cadence = walking_cadence + plan.running * (running_cadence - walking_cadence)
     cadence = cadence * (1.0 + 0.03 * wander(rng, time, 1, 1.0, 0.05, 0.5)[:, 0])
     phase = 2.0 * np.pi * integral(time, cadence) + rng.uniform(0.0, 2.0 * np.pi)
-    steps = Steps(time, planned, planned.speed / cadence, cadence, phase)
-    offset = _trunk(rng, own, carried, steps)
-    offset = offset + _strides(rng, own, carried, steps)
-    offset = offset + _strikes(own, carried, steps, dt)
-    lever = np.array([rng.uniform(*each) for each in carried.lever])
+    steps = Steps(time, plan, plan.speed / cadence, cadence, phase)
+    offset = _trunk(rng, gait_rng, carrying, steps)
+    offset = offset + _strides(rng, gait_rng, carrying, steps)
+    offset = offset + _strikes(gait_rng, carrying, steps, dt)
+    lever = np.array([rng.uniform(*bounds) for bounds in carrying.lever])
     lever[1] *= rng.choice([-1.0, 1.0])
     offset = offset + lever + wander(rng, time, 3, rng.uniform(*people.idle), 0.1, 0.8)
-    swing = _swing(rng, own, carried, steps)
+    swing = _swing(rng, gait_rng, carrying, steps)
 
     # The yaw of the mounting is arbitrary, so that the phone's heading does not show the direction
     # of walking.
-    tilt = rng.uniform(*carried.tilt)
-    if rng.random() < carried.turned:
+    tilt = rng.uniform(*carrying.tilt)
+    if rng.random() < carrying.turned:
         tilt = -tilt
-    roll = np.clip(carried.roll * rng.standard_normal(), -1.0, 1.0)
+    roll = np.clip(carrying.roll * rng.standard_normal(), -1.0, 1.0)
     mounting = Rotation.from_euler("ZXY", [rng.uniform(-np.pi, np.pi), tilt, roll])
 
-    speed, heading, rise, _ = planned
+    speed, heading, rise, _ = plan
     course = np.stack([speed * np.cos(heading), speed * np.sin(heading), speed * rise], axis=1)
     turn = about_z(heading)
     path = make_interp_spline(time, integral(time, course) + turn.apply(offset), k=5)
     position, velocity = path(time), path.derivative()(time)
     attitude = turn * Rotation.from_rotvec(swing) * mounting
-    return Motion(time, position - position[0], velocity, attitude)
+    return PhoneMotion(time, position - position[0], velocity, attitude)
 
 
 def step_frequency(speed: Float[np.ndarray, " n"], gain: float = 1.0) -> Float[np.ndarray, " n"]:
@@ -322,14 +322,14 @@ def _plan(
 ) -> Plan:
     """A walk through random activities, with bends and corners."""
     speed, rise, running = (np.zeros_like(time) for _ in range(3))
-    names, chances = list(activities), [each.share for each in activities.values()]
+    names, chances = list(activities), [activity.share for activity in activities.values()]
     clock = STANDING_START
     while clock < time[-1]:
         activity = activities[rng.choice(names, p=chances)]
         end = clock + rng.uniform(*activity.seconds)
-        during = (time >= clock) & (time < end)
-        speed[during] = rng.uniform(*activity.speed)
-        rise[during], running[during] = activity.rise, activity.running
+        interval = (time >= clock) & (time < end)
+        speed[interval] = rng.uniform(*activity.speed)
+        rise[interval], running[interval] = activity.rise, activity.running
         clock = end
     speed = smooth_steps(speed, rng.uniform(1.6, 3.0), dt)
     speed = speed * (1.0 + 0.06 * wander(rng, time, 1, 1.0, 0.05, 0.4)[:, 0])
@@ -358,23 +358,27 @@ def _turn_rate(rng: np.random.Generator, time: Float[np.ndarray, " n"]) -> np.nd
 
 
 def _trunk(
-    rng: np.random.Generator, own: np.random.Generator, carried: Carrying, steps: Steps
+    rng: np.random.Generator, gait_rng: np.random.Generator, carrying: Carrying, steps: Steps
 ) -> Float[np.ndarray, "n 3"]:
     """The part of the trunk's fore-aft and vertical motion at step frequency that reaches the
     phone, m."""
-    time, planned, length, _, phase = steps
-    bounce = own.uniform(*carried.bounce) * 0.28 * length**2 / (8.0 * own.uniform(0.8, 1.0))
-    surge = own.uniform(*carried.surge) * 0.016 * length / 0.7
-    mean, std = carried.surge_phase
+    time, plan, length, _, phase = steps
+    bounce = (
+        gait_rng.uniform(*carrying.bounce) * 0.28 * length**2 / (8.0 * gait_rng.uniform(0.8, 1.0))
+    )
+    surge = gait_rng.uniform(*carrying.surge) * 0.016 * length / 0.7
+    mean, std = carrying.surge_phase
     # A walker is fastest where the trunk is lowest, a runner is slowest there.
-    forward_phase = phase + mean + std * own.standard_normal() + np.pi * planned.running
-    surge = surge * (1.0 - 0.4 * planned.running)
-    forward = surge * _harmonics(own, carried.harmonics, forward_phase, np.sin, 0.6)
-    up = bounce * _harmonics(own, carried.harmonics, phase, lambda x: -np.cos(x), np.pi + 0.4)
-    stairs = planned.rise / 0.6
+    forward_phase = phase + mean + std * gait_rng.standard_normal() + np.pi * plan.running
+    surge = surge * (1.0 - 0.4 * plan.running)
+    forward = surge * _harmonics(gait_rng, carrying.harmonics, forward_phase, np.sin, 0.6)
+    up = bounce * _harmonics(gait_rng, carrying.harmonics, phase, lambda x: -np.cos(x), np.pi + 0.4)
+    stairs = plan.rise / 0.6
     up = up + 0.02 * stairs * np.sin(phase) + 0.006 * stairs**2 * np.cos(2 * phase)
-    varied = 1.0 + 0.08 * wander(rng, time, 2, 1.0, 0.1, 1.0)
-    return np.stack([forward * varied[:, 0], np.zeros_like(forward), up * varied[:, 1]], axis=1)
+    variation = 1.0 + 0.08 * wander(rng, time, 2, 1.0, 0.1, 1.0)
+    return np.stack(
+        [forward * variation[:, 0], np.zeros_like(forward), up * variation[:, 1]], axis=1
+    )
 
 
 def _harmonics(
@@ -383,51 +387,53 @@ def _harmonics(
     """A wave at step frequency with its second and third harmonic. `ratio` is that of the
     accelerations; the phase of the second harmonic is about `second`."""
     twice, thrice = rng.uniform(*ratio), rng.uniform(*ratio) * rng.uniform(0.0, 0.6)
-    start = second + 0.7 * rng.standard_normal()
-    anywhere = rng.uniform(0.0, 2.0 * np.pi)
-    overtones = thrice / 9.0 * wave(3.0 * phase + anywhere)
-    return wave(phase) + twice / 4.0 * wave(2.0 * phase + start) + overtones
+    second_start = second + 0.7 * rng.standard_normal()
+    third_start = rng.uniform(0.0, 2.0 * np.pi)
+    overtones = thrice / 9.0 * wave(3.0 * phase + third_start)
+    return wave(phase) + twice / 4.0 * wave(2.0 * phase + second_start) + overtones
 
 
 def _strides(
-    rng: np.random.Generator, own: np.random.Generator, carried: Carrying, steps: Steps
+    rng: np.random.Generator, gait_rng: np.random.Generator, carrying: Carrying, steps: Steps
 ) -> Float[np.ndarray, "n 3"]:
     """Motion at stride frequency: the sway of the trunk, an arm or a bag that swings, m."""
-    accel = np.sqrt(2.0) * np.array([own.uniform(*each) for each in carried.stride])
+    accel = np.sqrt(2.0) * np.array([gait_rng.uniform(*bounds) for bounds in carrying.stride])
     amplitude = accel / (np.pi * _CADENCE) ** 2
-    start, phase = own.uniform(0.0, 2.0 * np.pi, size=3), steps.phase[:, None] / 2.0
+    start, phase = gait_rng.uniform(0.0, 2.0 * np.pi, size=3), steps.phase[:, None] / 2.0
     wave = np.sin(phase + start) * (1.0 + 0.1 * wander(rng, steps.time, 3, 1.0, 0.1, 1.0))
     return amplitude * wave * (steps.growth() * (1.0 + 0.5 * steps.plan.running[:, None]))
 
 
 def _strikes(
-    own: np.random.Generator, carried: Carrying, steps: Steps, dt: float
+    gait_rng: np.random.Generator, carrying: Carrying, steps: Steps, dt: float
 ) -> Float[np.ndarray, "n 3"]:
     """The heel strikes: an oscillation that rises and decays within a fraction of a step, m."""
-    since = np.mod(steps.phase, 2.0 * np.pi) / (2.0 * np.pi * steps.cadence)
-    decay, frequency = own.uniform(0.02, 0.06), own.uniform(4.0, 14.0, size=3)
-    angle = 2.0 * np.pi * frequency * since[:, None] + own.uniform(0.0, 0.8, size=3)
-    envelope = (since / decay) ** 2 * np.exp(2.0 - 2.0 * since / decay)
+    elapsed = np.mod(steps.phase, 2.0 * np.pi) / (2.0 * np.pi * steps.cadence)
+    decay, frequency = gait_rng.uniform(0.02, 0.06), gait_rng.uniform(4.0, 14.0, size=3)
+    angle = 2.0 * np.pi * frequency * elapsed[:, None] + gait_rng.uniform(0.0, 0.8, size=3)
+    envelope = (elapsed / decay) ** 2 * np.exp(2.0 - 2.0 * elapsed / decay)
     blow = envelope[:, None] * np.sin(angle) * (steps.length / _STEP)[:, None]
     # Left and right heels differ.
     side = np.sin(np.floor(steps.phase / (2.0 * np.pi)) * np.pi + 0.5)
-    blow = blow * (1.0 + own.uniform(0.0, 0.4) * side)[:, None]
+    blow = blow * (1.0 + gait_rng.uniform(0.0, 0.4) * side)[:, None]
     accel = np.gradient(np.gradient(blow, dt, axis=0), dt, axis=0)
-    strength = own.uniform(*carried.strike) * own.uniform(0.4, 1.0, size=3)
+    strength = gait_rng.uniform(*carrying.strike) * gait_rng.uniform(0.4, 1.0, size=3)
     return blow * strength / np.maximum(np.sqrt(np.mean(accel**2, axis=0)), 1e-9)
 
 
 def _swing(
-    rng: np.random.Generator, own: np.random.Generator, carried: Carrying, steps: Steps
+    rng: np.random.Generator, gait_rng: np.random.Generator, carrying: Carrying, steps: Steps
 ) -> Float[np.ndarray, "n 3"]:
     """Roll, pitch and yaw of the phone relative to the walker, rad."""
-    total = wander(rng, steps.time, 3, rng.uniform(*carried.grip), 0.01, 0.15)
-    for ranges, rate in ((carried.stride_rate, 0.5), (carried.step_rate, 1.0)):
-        speed = np.sqrt(2.0) * np.array([own.uniform(*each) for each in ranges])
+    rotation = wander(rng, steps.time, 3, rng.uniform(*carrying.grip), 0.01, 0.15)
+    for ranges, rate in ((carrying.stride_rate, 0.5), (carrying.step_rate, 1.0)):
+        speed = np.sqrt(2.0) * np.array([gait_rng.uniform(*bounds) for bounds in ranges])
         amplitude = speed / (2.0 * np.pi * _CADENCE * rate)
-        start = own.uniform(0.0, 2.0 * np.pi, size=3)
-        total = total + amplitude * np.sin(steps.phase[:, None] * rate + start) * steps.growth()
-    return total
+        start = gait_rng.uniform(0.0, 2.0 * np.pi, size=3)
+        rotation = (
+            rotation + amplitude * np.sin(steps.phase[:, None] * rate + start) * steps.growth()
+        )
+    return rotation
 
 
 def wander(
@@ -435,19 +441,19 @@ def wander(
 ) -> np.ndarray:
     """Smooth random motion (n, width): eight sinusoids between two frequencies (Hz) with a total
     root mean square of `rms`."""
-    frequency = rng.uniform(low, high, size=(8, width))
-    start = rng.uniform(0.0, 2.0 * np.pi, size=(8, width))
-    result = np.zeros((len(time), width))
-    for f, s in zip(frequency, start, strict=True):
-        result += np.sin(2.0 * np.pi * time[:, None] * f + s)
-    return result * rms * np.sqrt(2.0 / 8.0)
+    frequencies = rng.uniform(low, high, size=(8, width))
+    starts = rng.uniform(0.0, 2.0 * np.pi, size=(8, width))
+    motion = np.zeros((len(time), width))
+    for hertz, start in zip(frequencies, starts, strict=True):
+        motion += np.sin(2.0 * np.pi * time[:, None] * hertz + start)
+    return motion * rms * np.sqrt(2.0 / 8.0)
 
 
 def smooth_steps(values: np.ndarray, seconds: float, dt: float) -> np.ndarray:
     """Steps smoothed to ramps of `seconds` with three continuous derivatives."""
     half = round(seconds / dt / 2)
     kernel = np.hanning(2 * half + 3)[1:-1] ** 2
-    return convolved(np.pad(values, half, mode="edge"), kernel / kernel.sum())
+    return convolve(np.pad(values, half, mode="edge"), kernel / kernel.sum())
 
 
 def integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:

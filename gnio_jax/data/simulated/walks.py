@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.simulated.walker import (
     CARRYING,
     FEW_PEOPLE,
     MANY_PEOPLE,
-    Motion,
+    PhoneMotion,
     draw_motion,
     wander,
 )
@@ -60,13 +60,13 @@ PHONE = SensorErrors(
 
 def pedestrian(
     seed: int,
-    who: int,
+    person: int,
     placement: str = "handheld",
     seconds: float = 120.0,
     rate: float = 200.0,
     imu_errors: bool = True,
 ) -> Sequence:
-    """A walk of person number `who`, for `seconds` at `rate` Hz. Everything except the gait is
+    """A walk of person number `person`, for `seconds` at `rate` Hz. Everything except the gait is
     drawn from `seed`.
 
     It starts with 3 s of standing. Without `imu_errors` the IMU has neither bias nor noise. The
@@ -74,10 +74,12 @@ def pedestrian(
     """
     rng = np.random.default_rng([seed])
     time, dt = np.arange(round(seconds * rate) + 1) / rate, 1.0 / rate
-    walk = draw_motion(rng, FEW_PEOPLE, placement, time, dt, who)
-    about = {"dataset": "synthetic", "placement": placement, "seed": seed}
-    about |= {"subject": f"person {who}", "licence": SYNTHETIC.licence}
-    return walk_sequence(rng, f"synthetic_{seed}_{placement}", walk, dt, PHONE, about, imu_errors)
+    motion = draw_motion(rng, FEW_PEOPLE, placement, time, dt, person)
+    attributes = {"dataset": "synthetic", "placement": placement, "seed": seed}
+    attributes |= {"subject": f"person {person}", "licence": SYNTHETIC.licence}
+    return walk_sequence(
+        rng, f"synthetic_{seed}_{placement}", motion, dt, PHONE, attributes, imu_errors
+    )
 
 
 def random_walk(seed: int, seconds: float = 60.0, rate: float = 100.0) -> Sequence:
@@ -100,16 +102,16 @@ def random_walk(seed: int, seconds: float = 60.0, rate: float = 100.0) -> Sequen
         gyro_bias=(0.0, 0.01),
         accel_bias=(0.0, 0.25),
     )
-    walk = draw_motion(rng, MANY_PEOPLE, placement, np.arange(count + 1) * dt, dt)
-    about = {"dataset": "randomised", "placement": placement, "seed": seed}
-    about |= {"licence": RANDOMISED.licence}
-    return walk_sequence(rng, f"randomised_{seed}", walk, dt, errors, about)
+    motion = draw_motion(rng, MANY_PEOPLE, placement, np.arange(count + 1) * dt, dt)
+    attributes = {"dataset": "randomised", "placement": placement, "seed": seed}
+    attributes |= {"licence": RANDOMISED.licence}
+    return walk_sequence(rng, f"randomised_{seed}", motion, dt, errors, attributes)
 
 
 def walk_sequence(
     rng: np.random.Generator,
     name: str,
-    walk: Motion,
+    motion: PhoneMotion,
     dt: float,
     errors: SensorErrors,
     attributes: dict[str, object],
@@ -117,9 +119,9 @@ def walk_sequence(
 ) -> Sequence:
     """The sequence of a simulated walk. Errors of its IMU are always drawn. The true biases at the
     start are added to the attributes."""
-    gyro = turns_between(walk.attitude) / dt
-    force = np.diff(walk.velocity, axis=0) / dt + np.array([0.0, 0.0, GRAVITY])
-    accel = walk.attitude[:-1].inv().apply(force)
+    gyro = turns_between(motion.attitude) / dt
+    force = np.diff(motion.velocity, axis=0) / dt + np.array([0.0, 0.0, GRAVITY])
+    accel = motion.attitude[:-1].inv().apply(force)
     count = len(gyro)
     gyro_bias, gyro_error = _sensor_error(
         rng, count, dt, errors.gyro_bias, errors.gyro_density, errors.gyro_bias_walk
@@ -127,7 +129,7 @@ def walk_sequence(
     accel_bias, accel_error = _sensor_error(
         rng, count, dt, errors.accel_bias, errors.accel_density, errors.accel_bias_walk
     )
-    device = device_attitude(rng, walk, dt)
+    device = device_attitude(rng, motion, dt)
     attributes = {"device": "simulated phone", "truth": "simulated", **attributes}
     attributes["gyro_density"] = errors.gyro_density * imu_errors
     attributes["accel_density"] = errors.accel_density * imu_errors
@@ -136,12 +138,12 @@ def walk_sequence(
         attributes[f"accel_bias_{letter}"] = float(accel_bias[axis] * imu_errors)
     return Sequence(
         name=name,
-        time=walk.time[:-1],
+        time=motion.time[:-1],
         gyro=gyro + gyro_error if imu_errors else gyro,
         accel=accel + accel_error if imu_errors else accel,
-        orientation=quaternions(walk.attitude[:-1]),
-        position=walk.position[:-1],
-        velocity=walk.velocity[:-1],
+        orientation=quaternions(motion.attitude[:-1]),
+        position=motion.position[:-1],
+        velocity=motion.velocity[:-1],
         valid=np.ones(count, dtype=bool),
         device_orientation=quaternions(device),
         attributes=attributes,
@@ -159,19 +161,19 @@ def _sensor_error(
     """The constant bias (3,), and its sum with random walk and white noise (count, 3)."""
     direction = rng.standard_normal(3)
     bias = direction / np.linalg.norm(direction) * rng.uniform(*length)
-    walked = np.cumsum(rng.standard_normal((count, 3)), axis=0) * walk * np.sqrt(dt)
-    return bias, bias + walked + rng.standard_normal((count, 3)) * density / np.sqrt(dt)
+    bias_drift = np.cumsum(rng.standard_normal((count, 3)), axis=0) * walk * np.sqrt(dt)
+    return bias, bias + bias_drift + rng.standard_normal((count, 3)) * density / np.sqrt(dt)
 
 
-def device_attitude(rng: np.random.Generator, walk: Motion, dt: float) -> Rotation:
+def device_attitude(rng: np.random.Generator, motion: PhoneMotion, dt: float) -> Rotation:
     """The phone's own attitude: an arbitrary yaw that drifts by some degrees, and a tilt error of a
     degree."""
-    count = len(walk.time) - 1
+    count = len(motion.time) - 1
     drift = np.cumsum(rng.standard_normal(count)) * np.radians(0.4) * np.sqrt(dt)
     drift = drift + rng.uniform(-np.pi, np.pi)
-    tilt = wander(rng, walk.time[:-1], 2, np.radians(0.7), 0.01, 0.05)
+    tilt = wander(rng, motion.time[:-1], 2, np.radians(0.7), 0.01, 0.05)
     tilt_error = np.concatenate([tilt, np.zeros((count, 1))], axis=1)
-    return about_z(drift) * Rotation.from_rotvec(tilt_error) * walk.attitude[:-1]
+    return about_z(drift) * Rotation.from_rotvec(tilt_error) * motion.attitude[:-1]
 
 
 # --- the datasets
@@ -187,30 +189,30 @@ _FEW = {
 _MANY = {"train": (100_000, 600, 60.0), "val": (200_000, 40, 60.0), "test": (300_000, 24, 120.0)}
 
 
-def _few_recordings(_: Path | None, split: str) -> list[Recording]:
+def _few_recordings(_: Path | None, split: str) -> list[RecordingSource]:
     """The walks of few people, not yet computed."""
     seed, first_person, people, count, seconds = _FEW[split]
     placements, walks = list(CARRYING), []
     for index in range(count):
-        who = first_person + index % people
+        person = first_person + index % people
         # The placement is shifted by one per round of people, so that nobody carries the phone in
         # one place only.
-        where = placements[(index + index // people) % len(placements)]
-        computed = partial(_alone, pedestrian, seed + index, who, where, seconds)
-        walks.append(Recording(f"synthetic_{seed + index}_{where}", computed))
+        placement = placements[(index + index // people) % len(placements)]
+        compute = partial(_compute_one, pedestrian, seed + index, person, placement, seconds)
+        walks.append(RecordingSource(f"synthetic_{seed + index}_{placement}", compute))
     return walks
 
 
-def _many_recordings(_: Path | None, split: str) -> list[Recording]:
+def _many_recordings(_: Path | None, split: str) -> list[RecordingSource]:
     """The walks of many people, not yet computed."""
     first, count, seconds = _MANY[split]
     return [
-        Recording(f"randomised_{seed}", partial(_alone, random_walk, seed, seconds))
+        RecordingSource(f"randomised_{seed}", partial(_compute_one, random_walk, seed, seconds))
         for seed in range(first, first + count)
     ]
 
 
-def _alone(compute: Any, *arguments: Any) -> list[Sequence]:
+def _compute_one(compute: Any, *arguments: Any) -> list[Sequence]:
     return [compute(*arguments)]
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering
-from gnio_jax.apps.track import tracking_filter
 from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated.walks import pedestrian
+from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.models import Network
 from gnio_jax.numerics import matrix_from_quaternion
 from gnio_jax.training.checkpoint import load_run
@@ -61,7 +61,7 @@ def run(tmp_path_factory):
 def package(run):
     """The odometry of the package over the walk, from a state made of its setup."""
     loaded = load_run(run)
-    setup = tracking_filter(loaded)
+    setup = filter_setup(loaded.config.data, loaded.config.filter)
     network = Network.of(loaded.model, loaded.variables)
 
     def predict(windows):

@@ -17,8 +17,8 @@ from gnio_jax import filtering
 from gnio_jax.apps.onnx import driver
 from gnio_jax.apps.onnx.programs import start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check
-from gnio_jax.apps.track import tracking_filter
 from gnio_jax.commands import app, console
+from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.training.checkpoint import load_run
 from tests.apps.onnx.conftest import BIAS, CONFIG, SECONDS
 
@@ -69,7 +69,8 @@ def test_the_start_has_the_bias_of_a_gyro_at_rest(run, models, walked):
     """So have the starts of `gnio track` and `gnio live`, which those arrays equal."""
     rest = {"gyro": walked.gyro[:REST], "accel": walked.accel[:REST]}
     arrays = driver.run(driver.open_models(models[0]).start, rest)
-    setup = tracking_filter(load_run(run))
+    loaded = load_run(run).config
+    setup = filter_setup(loaded.data, loaded.filter)
     wanted = start_arrays(from_rest(setup, walked), setup)
     assert arrays.keys() == wanted.keys()
     for name, value in wanted.items():

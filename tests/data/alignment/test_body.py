@@ -136,8 +136,8 @@ def test_poses_near_flips_and_jumps_are_dropped():
 
 
 def test_the_jacobians_are_the_differences_of_the_errors():
-    streams, seen = imu(), body._seen(tracked())
-    felt = body._felt(streams)
+    streams, seen = imu(), body._tracker_signals(tracked())
+    felt = body._inertial_signals(streams)
     knots = body.uniform_knots(seen.time, 15.0)
     rows = slice(10, -10, 7)
     seen, hats = seen.rows(rows), body.hat_functions(seen.time, knots)[rows]

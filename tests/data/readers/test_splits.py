@@ -8,7 +8,7 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data.readers import euroc, kitti, oxiod, ronin
-from gnio_jax.data.splits import held_out
+from gnio_jax.data.splits import hold_out
 from gnio_jax.errors import InputError
 
 PEOPLE = [{"subjectID": who, "calibration": "start"} for who in (*range(5), 14)]
@@ -265,7 +265,7 @@ def test_splits_by_names_are_disjoint_and_what_is_unseen_is_of_another_room():
     rooms = {split: {name[:2] for name in names} for split, names in euroc.EUROC_SPLITS.items()}
     assert not rooms.pop("unseen") & set.union(*rooms.values())
     drives = [f"2011_{month:02d}_26_drive_{n:04d}" for month in (9, 10) for n in range(500)]
-    shares = [kitti.share_of(drive) for drive in drives]
+    shares = [kitti.split_of(drive) for drive in drives]
     for split, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
         assert shares.count(split) / len(drives) == pytest.approx(share, abs=0.04)
 
@@ -276,7 +276,7 @@ def test_splits_by_names_are_disjoint_and_what_is_unseen_is_of_another_room():
 def walks(*names):
     """Walks without files, by their "scene/session/number"."""
     parts = [name.split("/") for name in names]
-    return [oxiod.Walk(scene, folder, int(number), {}, "") for scene, folder, number in parts]
+    return [oxiod.WalkFiles(scene, folder, int(number), {}, "") for scene, folder, number in parts]
 
 
 ROOM = walks(
@@ -314,8 +314,8 @@ def test_sessions_are_shared_out_whole_whatever_a_copy_holds(tmp_path):
 def test_who_is_held_out_depends_on_the_names_alone():
     """Whole people; of one person whole recordings; of three recordings none."""
     pairs = {f"p{n // 2}_{n}": f"p{n // 2}" for n in range(20)}
-    held = held_out(pairs)
-    assert held == held_out(dict(reversed(pairs.items())))
+    held = hold_out(pairs)
+    assert held == hold_out(dict(reversed(pairs.items())))
     assert len(held) == 2 and len({pairs[name] for name in held}) == 1
-    assert len(held_out({f"dan_{n}": "dan" for n in range(20)})) == 2
-    assert held_out({"dan_1": "dan", "dan_2": "dan", "hang_1": "hang"}) == set()
+    assert len(hold_out({f"dan_{n}": "dan" for n in range(20)})) == 2
+    assert hold_out({"dan_1": "dan", "dan_2": "dan", "hang_1": "hang"}) == set()

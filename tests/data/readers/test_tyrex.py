@@ -63,8 +63,8 @@ def test_an_accelerometer_that_clips_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(walk, "force", lambda time: np.minimum(2.2 * force(time), 19.55))
     folder = write(tmp_path, seconds=20.0)
     phone = tyrex.read_phone(tyrex.walk_of(folder))
-    share = tyrex.clipped(phone.accel.values)
+    share = tyrex.clipped_share(phone.accel.values)
     felt = np.loadtxt(folder / "accelerometer.txt")[:, 1:]
     assert 0.1 < (felt == 19.55).any(axis=1).mean() <= share < 0.6
-    assert tyrex.clipped(1.2 * phone.accel.values) == 0.0  # of a phone with a wider range
-    assert tyrex.clipped(0.9 * phone.accel.values) == 0.0
+    assert tyrex.clipped_share(1.2 * phone.accel.values) == 0.0  # of a phone with a wider range
+    assert tyrex.clipped_share(0.9 * phone.accel.values) == 0.0

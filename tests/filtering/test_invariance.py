@@ -1,0 +1,246 @@
+"""The filter gains no yaw that nobody measured: Monte Carlo from a wide yaw and a wide velocity,
+behind holes, with fixes and smoothed, and what a turn of the world leaves as it is."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from gnio_jax import filtering
+from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.state import invariant_clones, unroll_clones
+from gnio_jax.filtering.update import Step
+from tests.support.compiling import optimised, quick
+from tests.support.walks import errors, simulate
+from tests.support.whole_covariance import covariance
+
+RUNS, N, CLONES, DT, SIGMA = 100, 5, 10, 0.02, 0.05
+NOISE = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, measurement_scale=1.0)
+WIDE = filtering.InitialStd(velocity=1.0, yaw=0.1)
+YAW, PLACE, SPEED = [2], [6, 7], [3, 4]
+
+
+def config_of(error):
+    return filtering.FilterConfig(DT, N, CLONES, gate_threshold=1e9, history="core", error=error)
+
+
+def monte_carlo(error, std, intervals=120, hole=0, fix_every=0, fix_std=1.0, smoothed=False):
+    """Errors (r, K, 15) and covariances (r, K, 15, 15) of simulated runs whose start is as the
+    filter assumes it. `hole` samples are missing after 10 s; a fix comes every `fix_every`
+    intervals."""
+    config = config_of(error)
+    walks = simulate(1, RUNS, intervals, N, CLONES, DT, NOISE, std, SIGMA)
+    valid = np.ones(intervals * N, bool)
+    valid[500 : 500 + hole] = False
+    displacement = walks.displacement.copy()
+    if hole:
+        # A window in which the filter coasted is no measurement.
+        first = (500 + max(hole, 1)) // N
+        displacement[:, 100 : first + CLONES + 1] = np.nan
+    position = np.full((RUNS, intervals, 3), np.nan)
+    if fix_every:
+        rows = np.arange(fix_every - 1, intervals, fix_every)
+        white = np.random.default_rng(5).normal(size=(RUNS, len(rows), 3))
+        position[:, rows] = walks.position[:, rows] + fix_std * white
+    fix = filtering.Fix(
+        position,
+        np.broadcast_to(fix_std**2 * np.eye(3), (RUNS, intervals, 3, 3)),
+        *np.zeros((2, RUNS, intervals)),
+        np.full((RUNS, intervals), np.inf),
+    )
+
+    def run(rotation, velocity, position, gyro, accel, displacement, fix):
+        state = filtering.initial_state(config, rotation, velocity, position, std=std)
+        spread = jnp.tile(SIGMA**2 * jnp.eye(3)[None], (intervals, 1, 1))
+        signals = state, gyro, accel, displacement, spread, config, NOISE, jnp.asarray(valid)
+        if smoothed:
+            return filtering.smooth(*signals, measurements=(fix,))
+        return filtering.run_filter(*signals, measurements=(fix,))[1]
+
+    history = optimised(jax.vmap(run))(*walks[:5], displacement, fix)
+    return errors(walks, history), np.asarray(history.covariance)
+
+
+def nees(result, index, row):
+    """The mean over the runs, by degree of freedom."""
+    error, spread = result[0][:, row][:, index], result[1][:, row][:, index][:, :, index]
+    solved = np.linalg.solve(spread, error[..., None])[..., 0]
+    return np.mean(np.sum(error * solved, axis=1)) / len(index)
+
+
+@functools.cache
+def wide(error):
+    return monte_carlo(error, WIDE)
+
+
+def test_a_wide_start_stays_as_uncertain_as_it_is():
+    """The mean over 100 runs of the squared error of one yaw has a standard deviation of 0.14."""
+    result = wide("invariant")
+    assert 0.6 < nees(result, YAW, -1) < 1.4
+    assert nees(result, PLACE, -1) < 1.6 and nees(result, SPEED, -1) < 1.6
+    sigma = np.sqrt(result[1][:, -1, 2, 2]).mean()
+    assert 0.9 < sigma / np.sqrt((result[0][:, -1, 2] ** 2).mean()) < 1.1
+    additive = wide("additive")
+    assert nees(additive, YAW, -1) > 5 and nees(additive, PLACE, -1) > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hole, worst_place", [(10, 1.5), (25, 4.0), (45, 4.0)])
+def test_behind_a_hole_the_yaw_stays_uncertain(hole, worst_place):
+    std = filtering.InitialStd(velocity=0.3)
+    result = monte_carlo("invariant", std, 240, hole)
+    assert nees(result, YAW, -1) < 1.2
+    assert nees(result, PLACE, -1) < worst_place
+
+
+@pytest.mark.slow
+def test_fixes_show_the_yaw_and_no_more_than_they_show():
+    std = filtering.InitialStd(velocity=1.0, yaw=0.5, position=10.0)
+    result = monte_carlo("invariant", std, fix_every=10)
+    for row in (19, 59, 119):
+        assert nees(result, YAW, row) < 2.2, row
+        assert nees(result, PLACE, row) < 1.6, row
+    assert nees(monte_carlo("additive", std, fix_every=10), YAW, -1) > 50
+
+
+@pytest.mark.slow
+def test_the_smoother_is_as_uncertain_as_it_may_be():
+    result = monte_carlo("invariant", WIDE, smoothed=True)
+    for row in (20, 60, 119):
+        assert 0.6 < nees(result, YAW, row) < 1.4, row
+        assert nees(result, PLACE, row) < 1.6, row
+
+
+def test_the_smoother_turns_back_through_displacements_and_fixes():
+    """A fix turns the error before its update, a displacement behind it."""
+    std = filtering.InitialStd(velocity=1.0, yaw=0.2, position=10.0)
+    result = monte_carlo("invariant", std, 60, fix_every=10, fix_std=0.3, smoothed=True)
+    for row in (9, 20, 40, 59):
+        assert 0.6 < nees(result, YAW, row) < 1.4, row
+        assert 0.6 < nees(result, PLACE, row) < 1.4, row
+
+
+@functools.cache
+def one_walk():
+    return simulate(3, 1, 40, N, CLONES, DT, NOISE, filtering.InitialStd(yaw=0.4), SIGMA)
+
+
+def run_pieces(error, pieces, turn=0.0):
+    """The final state of one walk, filtered piece by piece, in a world that is turned about z."""
+    walk, config = one_walk(), config_of(error)
+    c, s = np.cos(turn), np.sin(turn)
+    world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    std = filtering.InitialStd(velocity=1.0, yaw=0.4, tilt=0.05)
+    pose = world @ walk.rotation0[0], world @ walk.velocity0[0], world @ walk.position0[0]
+    state = filtering.initial_state(config, *pose, std=std)
+    spread = np.tile(SIGMA**2 * np.eye(3), (40, 1, 1))
+    begin = 0
+    for end in pieces:
+        rows, samples = slice(begin, end), slice(begin * N, end * N)
+        signals = walk.gyro[0, samples], walk.accel[0, samples]
+        state, _ = program(config)(state, *signals, walk.displacement[0, rows], spread[rows])
+        begin = end
+    return state
+
+
+@functools.cache
+def program(config):
+    return quick(
+        lambda state, *signals: filtering.run_filter(state, *signals, config, NOISE, frame="own")
+    )
+
+
+def test_a_run_in_pieces_is_the_run():
+    """Wherever it is cut: the offsets then have another anchor, and the clones another pivot."""
+    whole = run_pieces("invariant", [40])
+    for pieces in ([13, 40], [20, 40], [3, 24, 40]):
+        state = run_pieces("invariant", pieces)
+        for name in ("rotation", "velocity", "position", "gyro_bias", "clone_rotation"):
+            np.testing.assert_allclose(
+                getattr(state, name), getattr(whole, name), atol=1e-10, err_msg=name
+            )
+        np.testing.assert_allclose(covariance(state), covariance(whole), atol=1e-9)
+
+
+def test_a_turned_world_turns_the_estimate():
+    turn = 2.0
+    c, s = np.cos(turn), np.sin(turn)
+    world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    state, turned = run_pieces("invariant", [40]), run_pieces("invariant", [40], turn)
+    np.testing.assert_allclose(turned.rotation, world @ state.rotation, atol=1e-10)
+    np.testing.assert_allclose(turned.position, world @ state.position, atol=1e-9)
+    np.testing.assert_allclose(turned.velocity, world @ state.velocity, atol=1e-9)
+
+
+@quick
+def updated(state, residual, spread):
+    """A run's state before and after an update with a position in the world, or with the velocity
+    in the body, both with additive errors again."""
+    config = config_of("invariant")
+    step = Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), CLONES, 0, config, NOISE)
+    inside, eye, results = invariant_clones(state, config), np.eye(3), []
+    for jacobian, frame in (
+        ({"position": eye}, "world"),
+        ({"velocity": eye, "since_oldest": 0.5 * eye}, "carrier"),
+    ):
+        linear = filtering.linearise(inside, residual, spread, **jacobian)
+        after, _, _ = filtering.measure(inside, linear, step, frame=frame)
+        results.append(unroll_clones(after, 0, config))
+    return results
+
+
+def dense_update(state, rows, residual, spread, world):
+    """The same in the whole error θ, v, p, b_g, b_a | θ_i, p_i, with the exponential of SE(3) by
+    SciPy: mean (rotation, velocity, position, positions of the clones) and covariance."""
+    whole = np.asarray(covariance(state))
+    innovation = rows @ whole @ rows.T + spread
+    error = whole @ rows.T @ np.linalg.solve(innovation, residual)
+    size = len(whole)
+
+    def turned(theta, position, change):
+        block = np.zeros((4, 4))
+        block[:3, :3], block[:3, 3] = np.cross(np.eye(3), theta), change
+        return expm(block)[:3, :3], position + expm(block)[:3, 3]
+
+    poses = [(0, state.velocity, 3), (0, state.position, 6)]
+    clones = np.asarray(state.anchor) + np.asarray(state.clone_offset)
+    poses += [(15 + 6 * i, clone, 18 + 6 * i) for i, clone in enumerate(clones)]
+    new, reset = [], np.eye(size)
+    for theta, value, part in poses:
+        turn, moved = turned(error[theta : theta + 3], value, error[part : part + 3])
+        new.append(moved)
+        lever = -np.cross(np.eye(3), np.asarray(moved - value))  # −hat of the move
+        reset[part : part + 3, theta : theta + 3] = lever
+    turn, _ = turned(error[:3], np.zeros(3), np.zeros(3))
+    if world:
+        whole = reset @ whole @ reset.T
+        innovation = rows @ whole @ rows.T + spread
+    whole = whole - whole @ rows.T @ np.linalg.solve(innovation, rows @ whole)
+    if not world:
+        whole = reset @ whole @ reset.T
+    return turn @ np.asarray(state.rotation), new, whole
+
+
+def test_an_update_is_that_of_the_group():
+    """By large corrections, of which the second order is seen: a position in the world, before
+    which the covariance turns, and a quantity that turns with the carrier, behind which it does."""
+    state = run_pieces("invariant", [24])
+    size = len(covariance(state))
+    position, carrier = np.zeros((3, size)), np.zeros((3, size))
+    position[:, 6:9] = carrier[:, 3:6] = np.eye(3)
+    carrier[:, 6:9], carrier[:, 18:21] = 0.5 * np.eye(3), -0.5 * np.eye(3)
+    residual, spread = np.array([0.8, -0.6, 0.2]), 0.01 * np.eye(3)
+    results = updated(state, residual, spread)
+    for rows, world, after in zip((position, carrier), (True, False), results, strict=True):
+        rotation, (velocity, place, *clones), whole = dense_update(
+            state, rows, residual, spread, world
+        )
+        np.testing.assert_allclose(after.rotation, rotation, atol=1e-10)
+        np.testing.assert_allclose(after.velocity, velocity, atol=1e-10)
+        np.testing.assert_allclose(after.position, place, atol=1e-10)
+        offsets = np.asarray(after.anchor) + np.asarray(after.clone_offset)
+        np.testing.assert_allclose(offsets, clones, atol=1e-10)
+        np.testing.assert_allclose(covariance(after), whole, atol=1e-9)
