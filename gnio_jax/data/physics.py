@@ -38,10 +38,10 @@ SHORTEST, SHORT = 5.0, 8.0
 """Durations of a recording below which nothing is warned of, or proven, s."""
 CLOCKS = (1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3)
 """Wrong clocks: true seconds in a second of the stamps."""
-SCALES = {"deg/s": DEGREE, "rad/s": 1 / DEGREE} | {
-    f"{count:g}/deg/s": 1 / count for count in (131.0, 65.5, 32.8, 16.4)
-}
-"""Units for which another one may have been taken, relative to it: counts are read as deg/s."""
+SCALES = {"deg/s": DEGREE, "rad/s": 1 / DEGREE}
+"""Units for which another one may have been taken, relative to it."""
+COUNTS_OF_DEGREE = (131.0, 65.5, 32.8, 16.4)
+"""Raw counts of usual 16-bit gyros in 1 deg/s, which may have been read as deg/s."""
 LONGEST_HOLD, MOST_HELD, HELD_SHARE, FINE_SHARE = 0.2, 10, 0.3, 0.5
 """A sensor hangs if it repeats its values for this time, s, in so many rows; it is slower than its
 rows if this share repeats; rows may only be called repeated if all axes change in the last share of
@@ -104,9 +104,11 @@ def contradiction(imu: ImuSamples) -> tuple[float, str, str] | None:
         problem = f"by the turning of gravity its samples come {factor:g} times {word} than its"
         remedy = "the clock is wrong: give --time-unit (s per stamp) or --sample-rate (Hz)"
         readings.append((*agreement(imu, clock=clock), f"{problem} stamps say", remedy))
-    for unit, scale in SCALES.items():
-        problem = f"its gyro looks like {unit}, which it does not say (gravity turns so)"
-        remedy = f"state the unit of the gyro: rad/s or deg/s, or --gyro-unit {unit}"
+    looks = {unit: (unit, scale) for unit, scale in SCALES.items()}
+    looks |= {f"raw counts, {n:g} in 1 deg/s,": (f"{n:g}/deg/s", 1 / n) for n in COUNTS_OF_DEGREE}
+    for words, (unit, scale) in looks.items():
+        problem = f"its gyro looks like {words} by the turning of gravity, and not as it was read"
+        remedy = f"state the unit of the gyro, as by --gyro-unit {unit}"
         readings.append((*agreement(imu, scale), problem, remedy))
     errors = _errors(imu, _window(imu), _SIGNED)
     assert errors is not None  # as for the stated reading

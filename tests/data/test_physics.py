@@ -52,7 +52,7 @@ def test_every_other_assignment_of_axes_is_found():
     [
         (180 / np.pi, 1.0, "its gyro looks like deg/s"),
         (np.pi / 180, 1.0, "its gyro looks like rad/s"),
-        (131.0, 1.0, "its gyro looks like 131/deg/s"),
+        (131.0, 1.0, "its gyro looks like raw counts, 131 in 1 deg/s"),
         (1.0, 10.0, "its samples come 10 times faster than its stamps say"),
         (1.0, 0.1, "its samples come 10 times slower"),
     ],

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from gnio_jax.apps.importing import loggers, ros, units
+from gnio_jax.apps.importing.clocks import sensor_of
 from gnio_jax.apps.importing.columns import read_columns, resolved, sensor_named
 from gnio_jax.apps.importing.files import files_of
 from gnio_jax.apps.importing.recording import GAPS as GAPS
@@ -22,7 +23,6 @@ from gnio_jax.apps.importing.recording import (
     RawRecording,
     Track,
     as_sequence,
-    sensor_of,
 )
 from gnio_jax.config import ImportOptions
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
@@ -111,9 +111,9 @@ def _whole(path: Path) -> Path:
         return folder.parent
     if path.name == "metadata.yaml" or path.suffix.lower() not in (".csv", ".txt"):
         return folder if path.name == "metadata.yaml" else path
-    if not path.is_file() or sensor_named(path.stem) is None:
+    if not path.is_file() or sensor_named(path.name) is None:
         return path
-    sensors = {sensor_named(file.stem) for file in folder.glob(f"*{path.suffix}")}
+    sensors = {sensor_named(file.name) for file in folder.glob(f"*{path.suffix}")}
     is_alone = not {*GYRO, *ACCEL} <= set(resolved(files_of(path)[0].layout.labels))
     return folder if is_alone and {"gyro", "accel"} <= sensors else path
 

@@ -8,12 +8,11 @@ ArduPilot, as seen in their files; only what fits once is taken.
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Iterable
 from fractions import Fraction
 from functools import partial
-from itertools import islice, takewhile
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,8 +21,9 @@ import pandas as pd
 from jaxtyping import Float, Num
 
 from gnio_jax.apps.importing import units
+from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.files import LogFile, files_of, listed, log_file
-from gnio_jax.apps.importing.recording import RawRecording, Sensor, Track
+from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.config import ImportOptions
 from gnio_jax.data.parsing import stamps as clocks
 from gnio_jax.data.parsing.tables import Table, shortened
@@ -33,26 +33,28 @@ from gnio_jax.data.reference import SHORTEST_RUN
 from gnio_jax.errors import InputError
 
 AXES = {"gyro": GYRO, "accel": ACCEL}
-POSES = tuple(itertools.chain.from_iterable(REFERENCE.values()))
+POSES = tuple(chain.from_iterable(REFERENCE.values()))
 NAMES = ("time", "accel_time", *GYRO, *ACCEL, *POSES)
 """Our names, which a user may give to columns."""
 FIRST_ROWS, MOST_IMUS = 1000, 8
 """Rows in which sensors that take turns are searched, and their largest number (ours)."""
-_AXIS = r"_?{axis}(_?(axis|cal|value|uncal|data|rad_per_sec|mps2))?"
+_AXIS = r"_?{axis}(_?(axis|cal|value|uncal|data))?"
 _ALIASES = {
     "gyro": (
         r"(gyro|gyr|gyroscope)_?{axis}",
         r"(.*_)?(gyro|gyr|gyroscope)(_.*)?" + _AXIS,
         r"(w|g|omega|rot|w_rs_s)_?{axis}",
         r"(.*_)?(angular_velocity|angular_rate|ang_?vel|rotation_?rate)" + _AXIS,
+        r"{axis}_?(gyro|gyr|gyroscope)",
     ),
     "accel": (
         r"(accel|acc|acce|accelerometer|acceleration)_?{axis}",
         r"(.*_)?accelerometer(_.*)?" + _AXIS,
         r"(g_?f(orce)?|a_rs_s|specific_force|total_acceleration)_?{axis}",
-        r"a_?{axis}",
+        r"[af]_?{axis}",
         r"(.*_)?linear_acceleration_{axis}",  # with gravity, as ROS means it
         r"(?!.*(user|linear|gravity|bias|offset))(.*_)?(accel|acc|acce|acceleration)(_.*)?" + _AXIS,
+        r"{axis}_?(accel|acc|accelerometer)",
     ),
 }
 """Names of the columns of a sensor, as `plain_name` writes them, the surest first."""
@@ -68,15 +70,17 @@ _TIMES = (
     r"seconds_elapsed|elapsed(_time)?(_?s|_?ms)?|millis|micros|nanos|date_?time|ms|us|epoc",
     r"(?!.*(gps|frame|zone)).*time.*",
 )
-_TAGS = {"gyro": r".*(gyr|rotation_?rate)", "accel": r"(?!.*(lin|user|gravity)).*acc"}
+_TAGS = {"gyro": r".*(gyr|rotation_?rate)", "accel": r"(?!.*(lin|user|gravity)).*acc(?!u)"}
 """Names of files, or tags of rows, of one sensor."""
+_ANDROID = {"1": "accelerometer", "4": "gyroscope"}
+"""Types of sensors in a column of that name (developer.android.com, Sensor)."""
 _TICKS = {"sample_time_fine": "1e-4"}
 """Units of clocks that are known by their name."""
 
 
 def plain_name(label: str) -> str:
     """The name of a column without unit, in small letters, with words joined by _."""
-    name = re.sub(r"\s*[\[(][^\[\]]*[\])]\s*$", "", label)
+    name = units.without_unit(label)
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
@@ -108,7 +112,7 @@ def resolved(labels: Iterable[str], alone: str | None = None) -> dict[str, str]:
         pairs = [
             f"{label}+{fraction}"
             for label in fitting(r"(.*_)?secs?")
-            for fraction in fitting(r"(.*_)?(nsecs?|nanosecs?|nanoseconds)")
+            for fraction in fitting(r"(.*_)?(nsecs?|nanosecs?|nanoseconds|usecs?)")
             if plain[label].rpartition("_")[0] == plain[fraction].rpartition("_")[0]
         ]
         stamps = next((columns for columns in map(fitting, _TIMES) if columns), [])
@@ -161,9 +165,8 @@ class _Opened(NamedTuple):
         if column not in kinds and kinds.get(part) == "M":
             dates = pd.to_datetime(self.frame[whole], format="mixed", errors="coerce")
             days = (dates - pd.Timestamp(0)).dt.days.to_numpy()
-            return self.frame[part].astype(
-                np.int64
-            ).to_numpy() % clocks.DAY + days * clocks.DAY, "ns"
+            of_day = self.frame[part].astype(np.int64).to_numpy() % clocks.DAY
+            return of_day + days * clocks.DAY, "ns"
         unit = units.unit_of(plain_name(part).rpartition("_")[2])
         if column not in kinds and unit in clocks.PER_SECOND and kinds.get(part) in ("i", "u"):
             stamps = self.table.stamps(whole).astype(np.int64) * int(clocks.PER_SECOND[unit])
@@ -185,7 +188,7 @@ class _Opened(NamedTuple):
 def _opened(file: LogFile, names: dict[str, str], where: str | None, notes: list[str]) -> _Opened:
     """A table, of which `where` "COLUMN=VALUE" may take some rows. Columns have their places as
     names if `names` has nothing but places."""
-    table, remarks = file.read()
+    (table, remarks), layout = file.read(), file.layout
     frame, rows = pd.DataFrame(table.columns), table.rows
     parts = [part.strip(" -") for name in names.values() for part in name.split("+")]
     is_numbered = parts and all(map(str.isdigit, parts))
@@ -203,16 +206,16 @@ def _opened(file: LogFile, names: dict[str, str], where: str | None, notes: list
             raise InputError(file.path, f"has no row with {where}", f"there are: {values}")
         frame = frame.iloc[chosen].reset_index(drop=True)
         rows = chosen if rows is None else rows[chosen]
-    below = dict(zip(frame.columns, file.layout.below, strict=False))
-    if sum(units.unit_of(text) is not None for text in below.values()) < 2:
-        below = {}
+    subheaders = (dict(zip(layout.labels, cells, strict=True)) for cells in layout.subheaders)
+    below = next((texts for texts in subheaders if units.are_units(texts.values())), {})
     texts = {label: below.get(label) or units.unit_text(label) for label in frame.columns}
-    scales, preamble = {}, file.layout.preamble
-    if preamble and preamble[0].startswith("GYROFLOW"):
+    scales = {}
+    if layout.preamble and layout.preamble[0].startswith("GYROFLOW"):
         # docs.gyroflow.xyz/app/technical-details/gcsv-format: scales to s, rad/s and g
-        lines = (cells_of(line, file.layout.separator) for line in preamble)
-        stated = {"tscale": "1e-3"} | {cells[0]: cells[1] for cells in lines if len(cells) > 1}
-        scales = {"time": stated["tscale"], "gyro": f"{stated.get('gscale', '1')}*rad/s"}
+        lines = (cells_of(line, layout.separator) for line in layout.preamble)
+        stated = {cells[0]: cells[1] for cells in lines if len(cells) > 1}
+        scales = {"time": stated.get("tscale", "1e-3")}
+        scales |= {"gyro": f"{stated.get('gscale', '1')}*rad/s"}
         scales |= {"accel": f"{stated.get('ascale', '1')}*g"}
         remarks = [f"{file.path.name}: gcsv with the units {', '.join(scales.values())}"]
     notes += remarks
@@ -221,18 +224,20 @@ def _opened(file: LogFile, names: dict[str, str], where: str | None, notes: list
 
 
 def rows_by_sensor(file: LogFile) -> list[LogFile]:
-    """A table for each sensor, of a log in which a word in one of the first columns says to which
-    sensor a row belongs; none if it is no such log. A comment that begins with the word is the
-    header of its rows."""
+    """A table for each sensor, of a log in which a word in one column says to which sensor a row
+    belongs; none if it is no such log. A comment that begins with the word is the header of its
+    rows."""
     layout, content = file.layout, file.content()
     head = [cells for _, cells in islice(rows_of(file.path, layout, content), FIRST_LINES)]
-    for place in range(min(3, layout.width)):
+    for place in range(layout.width):
+        label = layout.labels[place] if layout.labels else ""
+        tags = _ANDROID if re.fullmatch("sensor(_?(type|id))?|type", plain_name(label)) else {}
         words = {cells[place] for cells in head if len(cells) > place}
-        if set(AXES) <= {sensor_named(word) for word in words}:
+        if set(AXES) <= {sensor_named(tags.get(word, word)) for word in words}:
             break
     else:
         return []
-    is_shared = layout.labels and sensor_named(layout.labels[place]) is None
+    is_shared = layout.labels and sensor_named(label) is None
     header = [layout.separator.join(layout.labels)] if is_shared else []
     groups: dict[str, list[str]] = {}
     with open_text(file.path, content) as text:
@@ -241,8 +246,9 @@ def rows_by_sensor(file: LogFile) -> list[LogFile]:
             if len(cells) > place and sensor_named(cells[place]):
                 groups[cells[place]] = [layout.separator.join(cells)]
     for _, cells in rows_of(file.path, layout, content):
-        if len(cells) > place and sensor_named(cells[place]):
-            groups.setdefault(cells[place], [*header]).append(layout.separator.join(cells))
+        tag = tags.get(cells[place], cells[place]) if len(cells) > place else ""
+        if sensor_named(tag):
+            groups.setdefault(tag, [*header]).append(layout.separator.join(cells))
     texts = {tag: "\n".join(rows).encode() for tag, rows in groups.items()}
     return [log_file(tag, file.path / tag, partial(bytes, text)) for tag, text in texts.items()]
 
@@ -262,46 +268,50 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
     elif len(files) == 1 or len(whole) == 1:
         groups = {("gyro", "accel"): whole or files}
     else:
-        groups = {
-            (s,): [file for file in files if sensor_named(file.place.stem) == s] for s in AXES
-        }
+        groups = {(sensor,): _tables_of(sensor, files) for sensor in AXES}
     if any(len(tables) != 1 for tables in groups.values()):
         problem = f"has the layout of no known recording (found: {listed(files)})"
         remedy = "known: CSV, Sensor Logger, phyphox, ROS bags, MCAP and EuRoC folders"
         raise InputError(path, problem, f"{remedy}; a CSV of other columns needs --columns")
     notes: list[str] = []
-    sensors = {}
+    sensors: dict[str, Sensor] = {}
+    track = None
     for group, (file,) in groups.items():
         opened = _opened(file, names, options.where, notes)
         columns = _columns(opened, group, names, options.sample_rate is not None, notes)
-        _check_one_imu(opened.frame, columns, file.path)
         for sensor in group:
-            axes = [columns[axis] for axis in AXES[sensor]]
-            stated = options.gyro_unit if sensor == "gyro" else options.accel_unit
-            unit = opened.scales.get(sensor)
-            if not (unit or stated):
-                known = units.GYRO_UNITS if sensor == "gyro" else units.ACCEL_UNITS
-                texts = {axis: opened.texts.get(axis) for axis in axes}
-                if unit := units.common_unit(texts, known, file.path):
-                    notes.append(f"{file.path.name}: {sensor} in {unit}, by its header")
-            values = np.stack([opened.numbers(axis) for axis in axes], axis=1)
-            clock = columns.get("accel_time" if sensor == "accel" else "time", columns.get("time"))
-            if clock is None or options.sample_rate is not None:
-                rate = str(1 / Fraction(str(options.sample_rate)))
-                stamps, second = np.arange(len(values)), rate
-            else:
-                stamps, second = opened.stamps(clock)
-            row = opened.table.row
-            sensors[sensor] = Sensor(sensor, file.path, stamps, values, row, second, unit)
+            sensors[sensor] = _sensor(sensor, opened, columns, options, notes)
         if "gyro" in group:
-            ours = {label: name for name, label in names.items()}
-            table = opened.table.renamed(ours.get(c, c) for c in map(str, opened.table.columns))
-    track = None
-    try:
-        track = _reference(table, sensors["gyro"], options.time_unit)
-    except InputError as error:
-        notes.append(f"no reference is taken: {error}")
+            try:
+                track = _reference(opened.table, names, sensors["gyro"], options.time_unit)
+            except InputError as error:
+                notes.append(f"no reference is taken: {error}")
     return RawRecording(path, sensors["gyro"], sensors["accel"], notes, [], "android", True, track)
+
+
+def _tables_of(sensor: str, files: list[LogFile]) -> list[LogFile]:
+    """The tables of a sensor by their names; without the uncalibrated ones if there are others."""
+    tables = [file for file in files if sensor_named(file.place.name) == sensor]
+    return [file for file in tables if "uncal" not in file.name.lower()] or tables
+
+
+def _sensor(
+    sensor: str, opened: _Opened, columns: dict[str, str], options: ImportOptions, notes: list[str]
+) -> Sensor:
+    """The samples of a sensor in these columns, with the units that the table states."""
+    path, axes = opened.table.path, [columns[axis] for axis in AXES[sensor]]
+    known = units.GYRO_UNITS if sensor == "gyro" else units.ACCEL_UNITS
+    unit = opened.scales.get(sensor)
+    if not (unit or (options.gyro_unit if sensor == "gyro" else options.accel_unit)):
+        if unit := units.common_unit({axis: opened.texts.get(axis) for axis in axes}, known, path):
+            notes.append(f"{path.name}: {sensor} in {unit}, by its header")
+    values = np.stack([opened.numbers(axis) for axis in axes], axis=1)
+    clock = columns.get("accel_time" if sensor == "accel" else "time", columns.get("time"))
+    if clock is None or options.sample_rate is not None:
+        stamps, second = np.arange(len(values)), str(1 / Fraction(str(options.sample_rate)))
+    else:
+        stamps, second = opened.stamps(clock)
+    return Sensor(sensor, path, stamps, values, opened.table.row, second, unit)
 
 
 def _columns(
@@ -319,9 +329,12 @@ def _columns(
     needed = [*([] if has_rate else times), *(axis for sensor in sensors for axis in AXES[sensor])]
     is_numbered = labels == [str(place) for place in range(len(labels))]
     guesses = _by_place(opened.frame, alone) if is_numbered else resolved(labels, alone)
-    labels_of = guesses | names
-    columns = {name: labels_of[name] if name in labels_of else name for name in needed}
-    single = {n: c for n, c in columns.items() if c in labels or not set("+-") & set(c)}
+    dated = [label for label in labels if opened.frame[label].dtype.kind == "M"]
+    labels_of = ({"time": dated[0]} if len(dated) == 1 else {}) | guesses | names
+    columns = {name: labels_of.get(name, name) for name in needed}
+    _check_one_imu(opened.frame, columns, path)
+    of_track = {name: column for name, column in names.items() if name in POSES}
+    single = {n: c for n, c in columns.items() if c in labels or not set("+-") & set(c)} | of_track
     if is_numbered and not names and not set(columns.values()) <= set(labels):
         order = ("time", *GYRO, *ACCEL)[len(labels) < 7 :]
         places = " ".join(f"{name}={place}" for place, name in enumerate(order))
@@ -338,37 +351,45 @@ def _columns(
 
 
 def _by_place(frame: pd.DataFrame, sensor: str | None) -> dict[str, str]:
-    """The columns of a table of one sensor without a header: stamps that increase, three axes."""
-    numbers = [str(column) for column in frame if frame[column].dtype.kind in "iufM"]
-    stamps = list(takewhile(lambda column: frame[column].is_monotonic_increasing, numbers))
-    axes = numbers[len(stamps) : len(stamps) + 3]
+    """The columns of a table of one sensor without a header: stamps that increase, and the first
+    three that do not."""
+    numbers = {str(column): frame[column] for column in frame if frame[column].dtype.kind in "iufM"}
+    stamps = [name for name, column in numbers.items() if column.is_monotonic_increasing]
+    axes = [name for name in numbers if name not in stamps][:3]
+    stamps = [name for name in stamps if numbers[name].iloc[0] < numbers[name].iloc[-1]]
     if sensor is None or not stamps or len(axes) < 3:
         return {}
     return {"time": stamps[-1], **dict(zip(AXES[sensor], axes, strict=True))}
 
 
 def _check_one_imu(frame: pd.DataFrame, columns: dict[str, str], path: Path) -> None:
-    """Raise `InputError` if the rows of several sensors take turns: a column of a few values that
-    is not used changes with most rows."""
-    head = frame.iloc[:FIRST_ROWS]
+    """Raise `InputError` if the rows of several sensors take turns or follow each other: a column
+    of a few values that is not used changes with most rows, or whenever the stamps go back."""
+    clock = frame.get(columns.get("time", ""), pd.Series(0, frame.index))
+    back = (clock < clock.shift()).to_numpy()
     for label in frame.columns.difference(list(columns.values())):
-        values = head[label]
-        changes = (values != values.shift()).mean() if values.notna().all() else 0.0
-        if changes > 0.5 and 2 <= values.nunique() <= MOST_IMUS and len(values) > 10 * MOST_IMUS:
-            words = ", ".join(map(str, values.unique()))
-            problem = f"has rows of several sensors: column '{label}' holds {words} in turn"
-            raise InputError(path, problem, f"choose one: --where {label}={values.iloc[0]}")
+        values = frame[label] if back.any() else frame[label].iloc[:FIRST_ROWS]
+        changes = (values != values.shift()).to_numpy()[1:] & values.notna().all()
+        in_turn = changes[:FIRST_ROWS].mean() > 0.5 and len(values) > 10 * MOST_IMUS
+        if in_turn or (back.any() and changes[back[1:]].all() and changes.any()):
+            if 2 <= values.nunique() <= MOST_IMUS:
+                words = ", ".join(map(str, values.unique()))
+                problem = f"has rows of several sensors: column '{label}' holds {words} in turn"
+                raise InputError(path, problem, f"choose one: --where {label}={values.iloc[0]}")
 
 
-def _reference(table: Table, gyro: Sensor, unit: str | None) -> Track | None:
+def _reference(table: Table, names: dict[str, str], gyro: Sensor, unit: str | None) -> Track | None:
     """The reference in the package's own columns, on the gyro's stamps."""
+    ours = {label: name for name, label in names.items()}
+    table = table.renamed(ours.get(label, label) for label in map(str, table.columns))
     if not {*POSES} & set(table.columns) or not np.isfinite(gyro.stamps).all():
         return None  # without stamps the gyro is refused
     first = gyro.stamps.min().item()
     unit = unit or gyro.second or clocks.time_unit(gyro.stamps - first)[0]
     poses = reference(table, clocks.seconds(gyro.stamps, first, unit)) if unit else None
     if unit is None or poses is None:
-        return None
+        remedy = f"a reference has {', '.join((*REFERENCE['orientation'], *REFERENCE['position']))}"
+        raise InputError(table.path, "has no orientation, or no position", remedy)
     if len(poses.time) < SHORTEST_RUN:
         problem = f"holds {len(poses.time)} poses"
         raise InputError(table.path, problem, f"{SHORTEST_RUN} are the fewest")

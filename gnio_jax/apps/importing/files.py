@@ -33,7 +33,7 @@ LARGEST = 512 * 2**20
 """Largest unpacked size of a table, bytes: six hours of a sensor at 200 Hz are less (ours)."""
 MOST_TABLES = 200
 """Largest number of tables; a logger writes one for each sensor (ours)."""
-_SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".gcsv")
+_SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".gcsv", ".json")
 
 
 class LogFile(NamedTuple):
@@ -114,17 +114,19 @@ def _texts(path: Path, members: dict[str, Path | None]) -> list[LogFile]:
     texts = [n for n, p in places.items() if p.suffix.lower() in _SUFFIXES and p.name[0] != "."]
     if len(texts) > MOST_TABLES:
         raise InputError(path, f"holds {len(texts)} CSV files", "give one recording of a logger")
+    problems: list[InputError] = []
     for name in texts:
-        file, member = members[name], partial(_member, path, name)
+        file = members[name]
         head = _member(path, name, HEAD) if file is None else None
         try:
-            one = (
-                log_file(name, path / name, member, head) if file is None else log_file(name, file)
-            )
-            files.append(one)
-        except InputError:
-            if len(texts) == 1:
-                raise
+            if file is None:
+                files.append(log_file(name, path / name, partial(_member, path, name), head))
+            else:
+                files.append(log_file(name, file))
+        except InputError as error:
+            problems.append(error)
+    if problems and not files:
+        raise problems[0]
     return files
 
 

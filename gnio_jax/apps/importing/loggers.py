@@ -44,9 +44,10 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from gnio_jax.apps.importing.clocks import Sensor, sensor_of
 from gnio_jax.apps.importing.files import LogFile, listed
-from gnio_jax.apps.importing.recording import RawRecording, Sensor, sensor_of
-from gnio_jax.apps.importing.units import named_unit
+from gnio_jax.apps.importing.recording import RawRecording
+from gnio_jax.apps.importing.units import unit_of, unit_text
 from gnio_jax.data.parsing.text import open_text
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
@@ -163,14 +164,14 @@ def _phyphox(path: Path, files: list[LogFile]) -> RawRecording:
 
 
 def _is_time(label: str) -> bool:
-    return named_unit(label) == "s"
+    return unit_of(unit_text(label)) == "s"
 
 
 def _axes_of(labels: Iterable[str]) -> list[tuple[str, str, tuple[str, ...]]]:
     """(name, unit, columns x, y, z) of each sensor in a table."""
     sensors: dict[tuple[str, str], dict[str, str]] = {}
     for label in labels:
-        unit, axis = named_unit(label), _AXIS.search(label)
+        unit, axis = unit_of(unit_text(label)), _AXIS.search(label)
         if unit in (*_TURNS, "m/s2", "g") and axis:
             name = label[: axis.start()].strip().lower()
             sensors.setdefault((name, unit), {}).setdefault(axis[1].lower(), label)

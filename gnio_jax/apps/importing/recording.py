@@ -3,25 +3,24 @@ units and signs, the uniform clock of all recordings (`data.assembly`), the refe
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool
 
 from gnio_jax.apps.importing import units
+from gnio_jax.apps.importing.clocks import Clocked, Sensor, clocked
 from gnio_jax.config import ImportOptions
 from gnio_jax.data import physics
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.parsing.stamps import RATES, few, is_rate, rounded_rate, timeline
-from gnio_jax.data.parsing.tables import Table
+from gnio_jax.data.parsing.stamps import RATES, is_rate, rounded_rate
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.self_check import self_check
-from gnio_jax.data.validation import WINDOW_SECONDS, from_one
+from gnio_jax.data.validation import WINDOW_SECONDS
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import finite_rows, interpolate
+from gnio_jax.numerics import interpolate
 from gnio_jax.types import Sequence
 
 GAPS = "lacks samples"
@@ -29,31 +28,6 @@ GAPS = "lacks samples"
 SLOW = 50.0
 """Rate below which the impacts of steps are lost, Hz; networks are trained on 100 Hz and more
 (ours)."""
-MOST_BLANK = 0.4
-"""Share of rows without a stamp from which these are packets (ours)."""
-
-
-class Sensor(NamedTuple):
-    """A sensor's samples as in its file: rows in any order, in the file's units."""
-
-    name: str
-    """gyro or accel, for messages."""
-    file: Path
-    stamps: Num[np.ndarray, " n"]
-    values: Float[np.ndarray, "n 3"]
-    row: Callable[[int], int] = from_one
-    """A function from a sample to its row in the file, for messages."""
-    second: str | None = None
-    """Unit of the stamps; None: it is detected."""
-    unit: str | None = None
-    """Unit of the values (`units.scale_of`); None: it is detected."""
-
-    def where(self, rows: Bool[np.ndarray, " n"]) -> Sensor:
-        """The samples in these rows."""
-        numbers, stamps, values = np.flatnonzero(rows), self.stamps[rows], self.values[rows]
-        return self._replace(
-            stamps=stamps, values=values, row=lambda index: self.row(int(numbers[index]))
-        )
 
 
 class Track(NamedTuple):
@@ -99,17 +73,6 @@ class Imported(NamedTuple):
     """Warnings about problems that may make all results wrong, one sentence each."""
 
 
-def sensor_of(
-    name: str, table: Table, second: str, unit: str | None, time: str, *axes: str
-) -> Sensor:
-    """The samples in the columns `time` and `axes` (x, y, z) of a table, with their units."""
-    is_whole = time in table.columns and table.columns[time].dtype.kind in "iu"
-    # Columns that are shorter than others end with NaN, which is no sample.
-    stamps = table.stamps(time) if is_whole else table.take(time, gaps=True)
-    values = table.take(*axes, gaps=True)
-    return Sensor(name, table.path, stamps, values, table.row, second, unit)
-
-
 # --- from the samples of both sensors to a sequence
 
 
@@ -118,8 +81,8 @@ def as_sequence(
 ) -> Imported:
     """The sequence of a recording in any format; units in `options` override those of the format.
     Raises `InputError`."""
-    notes = raw.notes
-    gyro, accel = (_clocked(sensor, raw, options.time_unit) for sensor in (raw.gyro, raw.accel))
+    notes, sensors = raw.notes, (raw.gyro, raw.accel)
+    gyro, accel = (clocked(one, options.time_unit, notes, raw.warnings) for one in sensors)
     accel = accel._replace(time=accel.time + float(accel.start - gyro.start))
     gyro, accel = _in_si(raw, options, gyro, accel)
     if not np.array_equal(gyro.time, accel.time):
@@ -151,58 +114,12 @@ def as_sequence(
     return Imported(sequence, tuple(notes), tuple(dict.fromkeys(raw.warnings)))
 
 
-class _Clocked(NamedTuple):
-    """One sensor's samples in order."""
-
-    time: Float[np.ndarray, " n"]
-    """s since `start`."""
-    values: Float[np.ndarray, "n 3"]
-    start: Fraction
-    """The exact first stamp, s."""
-    is_doubtful: bool
-    """Whether the unit of the stamps is in doubt (`stamps.EDGES`)."""
-
-
-def _clocked(sensor: Sensor, raw: RawRecording, unit: str | None) -> _Clocked:
-    """The samples in order. `unit` is that of the stamps; None: the sensor's own, or it is
-    detected."""
-    name, file, notes, warnings = sensor.name, sensor.file, [], []
-    empty = np.isnan(sensor.values).all(axis=1)
-    if empty.any() and not empty.all():
-        # Loggers that write all sensors into one table leave the columns of the others empty.
-        problem = f"{empty.sum()} of {len(empty)} rows have no value of {name}"
-        notes.append(f"{problem} and are left out for it")
-        sensor = sensor.where(~empty)
-    missing = np.isnan(sensor.stamps)
-    if missing.mean() > MOST_BLANK and not missing[0]:  # only a packet's first row has one
-        last = np.maximum.accumulate(np.where(missing, 0, np.arange(len(missing))))
-        sensor = sensor._replace(stamps=sensor.stamps[last])
-        notes.append(f"{missing.sum()} rows of {name} without a stamp share the last one")
-    valid = finite_rows(sensor.values) & np.isfinite(sensor.stamps)
-    if lost := int((~valid).sum()):
-        row = sensor.row(int(np.argmin(valid)))
-        problem = f"a stamp or a value of field '{name}' is NaN or Inf in {lost} rows, first in row"
-        if lost > few(len(valid)):
-            raise InputError(file, f"{problem} {row}", "repair or cut the recording there")
-        notes.append(f"{problem} {row}: they are left out")
-        sensor = sensor.where(valid)
-    unit = unit or sensor.second
-    order = timeline(sensor.stamps, sensor.values, unit, file, name, sensor.row, notes, warnings)
-    raw.notes.extend(f"{file.name}: {note}" for note in notes)
-    raw.warnings.extend(f"clock: {file.name}: {warning}" for warning in warnings)
-    return _Clocked(order.time, sensor.values[order.rows], order.start, order.is_doubtful)
-
-
 def _without_repeats(
-    samples: _Clocked,
-    rows: Bool[np.ndarray, " n"],
-    is_slower: bool,
-    sensor: Sensor,
-    raw: RawRecording,
-) -> _Clocked:
+    samples: Clocked, rows: Bool[np.ndarray, " n"], is_slower: bool, raw: RawRecording
+) -> Clocked:
     """The samples without `rows` that repeat the one before: the sensor is slower than its rows, or
     it hung. Holes are noted. Raises `InputError` if it hung for longer than a window."""
-    name, file = sensor.name, sensor.file
+    name, file = samples.name, samples.file
     samples = samples._replace(time=samples.time[~rows], values=samples.values[~rows])
     rate, gaps = rounded_rate(samples.time), np.diff(samples.time)
     problem = f"{file.name}: {name} repeats the same values in {rows.sum()} of {len(rows)} rows"
@@ -225,11 +142,11 @@ def _without_repeats(
 
 
 def _in_si(
-    raw: RawRecording, options: ImportOptions, gyro: _Clocked, accel: _Clocked
-) -> tuple[_Clocked, _Clocked]:
+    raw: RawRecording, options: ImportOptions, gyro: Clocked, accel: Clocked
+) -> tuple[Clocked, Clocked]:
     """Gyro in rad/s and accel in m/s² with Android's sign, each on its own stamps, without repeated
     rows. Raises `InputError` if a sensor is dead, or if both contradict each other."""
-    gyro_file, accel_file, notes, warnings = raw.gyro.file, raw.accel.file, raw.notes, raw.warnings
+    gyro_file, accel_file, notes, warnings = gyro.file, accel.file, raw.notes, raw.warnings
     warnings += physics.check_alive(gyro.values, "gyro", gyro_file)
     warnings += physics.check_alive(accel.values, "accel", accel_file)
     unit = options.accel_unit or raw.accel.unit
@@ -238,8 +155,8 @@ def _in_si(
     rows, is_slower = physics.repeats(gyro.time, gyro.values)
     force = interpolate(gyro.time, accel.time, accel.values)
     rows &= ~physics.resting(physics.ImuSamples(gyro.time, gyro.values, force), rows)
-    gyro = _without_repeats(gyro, rows, is_slower, raw.gyro, raw)
-    accel = _without_repeats(accel, *physics.repeats(accel.time, accel.values), raw.accel, raw)
+    gyro = _without_repeats(gyro, rows, is_slower, raw)
+    accel = _without_repeats(accel, *physics.repeats(accel.time, accel.values), raw)
     first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
     if last - first < WINDOW_SECONDS:
         problem = f"both sensors were recorded for {max(last - first, 0.0):.2f} s, less than the"
@@ -249,7 +166,8 @@ def _in_si(
     time = gyro.time[inside]
     force = interpolate(time, accel.time, accel.values)
     imu = physics.ImuSamples(time, gyro.values[inside], force)
-    scale = units.gyro_scale(imu, options.gyro_unit or raw.gyro.unit, gyro_file, notes)
+    unit = options.gyro_unit or raw.gyro.unit
+    scale = units.gyro_scale(imu, unit, gyro_file, notes, warnings)
     imu = imu._replace(gyro=imu.gyro * scale)
     warnings += physics.check_turning(imu, gyro_file)
     if gyro.is_doubtful or accel.is_doubtful:

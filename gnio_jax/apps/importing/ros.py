@@ -25,7 +25,8 @@ import numpy as np
 import yaml
 from jaxtyping import Float, Int
 
-from gnio_jax.apps.importing.recording import RawRecording, Sensor, Track
+from gnio_jax.apps.importing.clocks import Sensor
+from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.data.parsing.stamps import seconds
 from gnio_jax.data.parsing.tables import parsed_as, shortened
 from gnio_jax.data.readers.euroc import SensorPose, moved_to

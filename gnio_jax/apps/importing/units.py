@@ -4,14 +4,13 @@ ambiguous is refused."""
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.data.physics import DEGREE, agreement, check_turning, is_supported
-from gnio_jax.data.physics import ImuSamples as Motion
+from gnio_jax.data.physics import DEGREE, ImuSamples, agreement, is_supported
 from gnio_jax.errors import InputError
 from gnio_jax.types import GRAVITY, STANDARD_G
 
@@ -23,23 +22,28 @@ ACCEL_UNITS = TO_METRES_PER_SECOND_SQUARED | {"cm/s2": 1e-2, "mm/s2": 1e-3}
 SIGNS = ("android", "ios", "detect")
 
 _SPELLINGS = {
-    "rad/s": ("rad/s", "rads^-1", "rads-1", "radian/s", "radians/s", "rad/sec", "rps"),
-    "deg/s": ("deg/s", "degs^-1", "degree/s", "degrees/s", "°/s", "º/s", "dps", "deg/sec"),
-    "mdps": ("mdps", "mdeg/s", "millidps"),
-    "mrad/s": ("mrad/s",),
-    "m/s2": ("m/s2", "m/s^2", "m/s²", "m/s/s", "ms^-2", "ms-2", "m/sec^2", "m/(s^2)", "m/(sec^2)"),
-    "cm/s2": ("cm/s2", "cm/s^2", "cm/s²"),
-    "mm/s2": ("mm/s2", "mm/s^2", "mm/s²"),
-    "g": ("g", "gs", "g's"),
-    "mg": ("mg", "milli-g", "millig"),
-    "s": ("s", "sec", "secs", "second", "seconds"),
-    "ms": ("ms", "msec", "msecs", "millis", "millisec", "milliseconds", "msecond"),
-    "us": ("us", "µs", "μs", "usec", "usecs", "micros", "microsec", "microseconds"),
-    "ns": ("ns", "nsec", "nsecs", "nanosecs", "nanos", "nanosec", "nanoseconds"),
+    "rad/s": "rad/s rads-1 rad/sec radian/s radians/s radps rps rads radpersec",
+    "deg/s": "deg/s degs-1 deg/sec degree/s degrees/s °/s º/s dps degs degpersec",
+    "mdps": "mdps mdeg/s millidps",
+    "mrad/s": "mrad/s",
+    "m/s2": "m/s2 m/s/s ms-2 ms2 mps2 m/sec2 m/(s2) m/(sec2)",
+    "cm/s2": "cm/s2 cms2",
+    "mm/s2": "mm/s2 mms2",
+    "g": "g gs g's",
+    "mg": "mg milli-g millig",
+    "s": "s sec secs second seconds",
+    "ms": "ms msec msecs millis millisec milliseconds msecond",
+    "us": "us µs μs usec usecs micros microsec microseconds",
+    "ns": "ns nsec nsecs nanosecs nanos nanosec nanoseconds",
 }
-"""Our names of units, and their names in headers, without blanks and in small letters."""
-_NAMED = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
-_BRACKETS = re.compile(r"[(\[]([^\[\]]*)[)\]]\s*$")
+"""Our names of units, and their names in headers as `_spelling` writes them."""
+_NAMED = {name: unit for unit, names in _SPELLINGS.items() for name in names.split()}
+_BRACKETS = re.compile(r"\s*[(\[]([^\[\]]*)[)\]]\s*$")
+_TAIL = re.compile(
+    r"(?<=[xyz])[_ .]?((rad|deg)[/_]?(s|sec|per_?sec)|[cm]?m[/_]?(s|sec)\^?2|m?dps|mps2|m?g)$",
+    re.IGNORECASE,
+)
+"""A unit behind the axis, as in gyro_x_dps."""
 
 GRAVITY_RANGES = {"m/s2": (7.0, 13.0), "g": (0.7, 1.3), "mg": (700.0, 1300.0)}
 """Ranges of the accelerometer's median magnitude, by which its unit is recognised."""
@@ -55,22 +59,32 @@ STEPS = 1.0
 """Standard deviation of the magnitude of the specific force, m/s², which steps exceed."""
 
 
+def _spelling(text: str) -> str:
+    """A unit in small letters, without blanks and signs of products and powers."""
+    text = re.sub(r"^[(\[](.*)[)\]]$", r"\1", text.strip()).translate(str.maketrans("²⁻¹", "2-1"))
+    return re.sub(r"[\s*·^_]", "", text).lower()
+
+
 def unit_text(label: str) -> str | None:
-    """The text in round or square brackets at the end of a column's header; None if there is
-    none."""
-    inside = _BRACKETS.search(label)
-    return inside[1].strip() if inside else None
+    """The text in round or square brackets at the end of a column's header, or a known unit behind
+    the axis; None if there is none."""
+    match = _BRACKETS.search(label) or _TAIL.search(label)
+    return match[1].strip() if match else None
+
+
+def without_unit(label: str) -> str:
+    """A column's header without its `unit_text`."""
+    return _TAIL.sub("", _BRACKETS.sub("", label))
 
 
 def unit_of(text: str | None) -> str | None:
     """Our name of a unit, such as "rad/s" for "rad s^-1"; None if it is no known unit."""
-    return None if text is None else _NAMED.get(re.sub(r"[\s*·]", "", text).lower())
+    return _NAMED.get(_spelling(text or ""))
 
 
-def named_unit(label: str) -> str | None:
-    """The unit at the end of a column's header, in round or square brackets, such as "rad/s" in
-    "Gyroscope x (rad/s)"; None if it names no known unit."""
-    return unit_of(unit_text(label))
+def are_units(cells: Iterable[str]) -> bool:
+    """Whether a line of a header names units: two of its cells do."""
+    return sum(unit_of(cell) is not None for cell in cells) > 1
 
 
 def common_unit(
@@ -132,19 +146,25 @@ def accel_scale(
     return ACCEL_UNITS[fitting[0]]
 
 
-def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> float:
+def gyro_scale(
+    imu: ImuSamples, unit: str | None, path: Path, notes: list[str], warnings: list[str]
+) -> float:
     """Value of one unit in rad/s; the unit None is detected. `imu.accel` is in m/s².
 
     Beyond `GYRO_RANGE` it is deg/s. Otherwise the turning of gravity decides, if it supports a
     unit. Otherwise, if the recording has steps and never exceeds `CARRIED_TURN`, it is rad/s.
     Raises `InputError` if it is ambiguous.
     """
-    if unit is not None:
-        return scale_of(unit, GYRO_UNITS, "gyro_unit")
     peak = float(np.percentile(np.linalg.norm(imu.gyro, axis=1), 99.9))
+    is_shaken = float(np.linalg.norm(imu.accel, axis=1).std()) > STEPS
+    if unit is not None:
+        scale = scale_of(unit, GYRO_UNITS, "gyro_unit")
+        if is_shaken and peak * scale < CARRIED_TURN * DEGREE:
+            problem = f"the gyro never exceeds {peak * scale / DEGREE:.2g} deg/s, and a carried"
+            warnings.append(f"sensors: {problem} phone does: check its unit, {unit}")
+        return scale
     agreements = {name: agreement(imu, scale) for name, scale in TO_RAD_PER_SECOND.items()}
     contrasts = {name: one[1] for name, one in agreements.items() if is_supported(*one)}
-    is_shaken = float(np.linalg.norm(imu.accel, axis=1).std()) > STEPS
     if peak > WIDEST_RANGE:
         problem = f"field 'gyro' reaches {peak:.3g}, beyond any gyro's range in rad/s and deg/s"
         raise InputError(path, problem, "state its unit: mdps, or raw counts as 131/deg/s")
@@ -161,12 +181,6 @@ def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> f
         raise InputError(path, problem, "state it: rad/s or deg/s")
     notes.append(f"{path.name}: gyro taken as {unit} ({reason})")
     return TO_RAD_PER_SECOND[unit]
-
-
-def check_rad_per_second(imu: Motion, path: Path) -> None:
-    """Raise `InputError` if gravity certainly turns otherwise than the gyro says: its unit, sign,
-    axes or clock is wrong. `imu` is in SI units."""
-    check_turning(imu, path)
 
 
 def signed(

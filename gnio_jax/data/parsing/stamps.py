@@ -1,12 +1,8 @@
-"""Stamps in files: unit, rate, order, and what clocks of boards and phones do: they count samples,
-wrap, start again, jump, stamp a packet when it arrives, and write the time of day. All limits are
-ours."""
+"""Stamps in files: unit, rate, order, and times of day. All limits are ours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from fractions import Fraction
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -36,27 +32,8 @@ CROWDED = 0.5
 """Samples that follow faster than this share of the mean step come in bursts (ours)."""
 DAY = 86400 * 10**9
 """ns."""
-PERIODS = sorted(
-    [2.0**bits * scale for bits in (8, 16, 24, 32) for scale in (1.0, 1e-3, 1e-6)]
-    + [86400 * count for count in PER_SECOND.values()]
-)
-"""Values at which clocks wrap: whole bits of a counter, and midnight."""
-LONGEST_WRAP, LONGEST_PAUSE = 20.0, 100.0
-"""Largest step over a wrap, and to rows that still belong to the recording, in usual steps."""
 FEW_ROWS, FEW_SHARE = 5, 0.01
 """Number and share of damaged rows that are left out; more are an error."""
-MOST_LOST = 0.2
-"""Share of rows of another start of the clock from which a recording is refused."""
-NEAR, SHUFFLED = 0.4, 0.1
-"""Rows of two pieces of a file closer than this share of a step are of two clocks, unless so many
-steps go back that the rows are only out of order."""
-COUNTED, MOST_COUNTED = 0.8, 2.0
-"""Share of steps of 1, and largest mean step, of stamps that count samples of which few are
-lost."""
-LEAST_GRAIN = 0.05
-"""Rounding of stamps that matters, in steps."""
-EDGES = (12.0, 800.0)
-"""Detected rates beyond these are believed only if gravity turns as the gyro says, Hz."""
 
 
 def seconds_of(unit: str) -> Fraction:
@@ -190,20 +167,7 @@ def in_order(
     return order[~again], {name: count for name, count in counts.items() if count}
 
 
-# --- the clock of a log
-
-
-class Timeline(NamedTuple):
-    """The samples of a sensor in the order of their clock."""
-
-    rows: Int[np.ndarray, " n"]
-    """Their rows in the file."""
-    time: Float[np.ndarray, " n"]
-    """s since `start`."""
-    start: Fraction
-    """The exact first stamp, s, because unix time in a float is good to a quarter of a µs."""
-    is_doubtful: bool
-    """Whether the unit was detected by a rate beyond `EDGES`."""
+# --- damaged rows, the time of day
 
 
 def few(count: int) -> float:
@@ -211,210 +175,27 @@ def few(count: int) -> float:
     return max(float(FEW_ROWS), FEW_SHARE * count)
 
 
-def timeline(
-    stamps: Real[np.ndarray, " n"],
-    values: Float[np.ndarray, "n 3"],
-    unit: str | None,
-    source: object,
-    name: str,
-    row: Callable[[int], int],
-    notes: list[str],
-    warnings: list[str],
-) -> Timeline:
-    """Samples in order and in seconds. `unit` is that of the stamps; None: it is detected. `name`
-    is that of the sensor, and `row` gives the row of a sample in the file. Raises `InputError`."""
-    stamps, wraps = _unwrapped(stamps)
-    if wraps:
-        notes.append(f"the clock of {name} wrapped {wraps} times and is continued")
-    rows = _without_strays(stamps)
-    if strays := len(stamps) - len(rows):
-        notes.append(f"{strays} rows of {name} are left out, whose stamps are far from all others")
-    mixed = _mixed(stamps[rows], values[rows])
-    if lost := int(mixed.sum()):
-        place = row(int(rows[np.argmax(mixed)]))
-        problem = f"the clock of {name} starts again or was set back near row {place}: {lost} rows"
-        if lost > MOST_LOST * len(rows):
-            raise InputError(source, f"{problem} overlap others", "cut the recording there")
-        target = notes if lost <= few(len(rows)) else warnings
-        target.append(f"{problem} of the shorter part are left out")
-    rows = rows[~mixed]
-    if backward := int((np.diff(stamps[rows]) < 0).sum()):
-        notes.append(f"{name} had {backward} steps back in time; its rows were sorted")
-    rows = rows[np.argsort(stamps[rows], kind="stable")]
-    again = np.concatenate([[False], _is_same(stamps[rows], values[rows])])[: len(rows)]
-    if again.any():
-        notes.append(f"{again.sum()} rows of {name} repeat a stamp and were dropped")
-        rows = rows[~again]
-    stamps = stamps[rows]
-    if len(stamps) < 2:
-        raise InputError(source, f"holds {len(stamps)} samples of field '{name}'", "record longer")
-    if stamps[0] == stamps[-1]:
-        problem = f"all {len(stamps)} rows of field '{name}' have the same stamp {stamps[0]:.6g}"
-        remedy = "a spreadsheet may have cut its digits: take the file as the logger wrote it"
-        raise InputError(source, problem, remedy)
-    is_detected = unit is None
-    unit = unit or _detected_unit(stamps, source, name, notes)
-    rate = 1.0 / (usual_step(stamps) * float(seconds_of(unit)))
-    if not is_rate(rate):
-        problem = f"field 'time' makes {name} run at {rate:.3g} Hz with the unit {unit}"
-        raise InputError(source, problem, f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz")
-    first = first_stamp(stamps, unit, source)
-    time = _even(seconds(stamps, first, unit), name, notes)
-    is_doubtful = is_detected and not EDGES[0] < rate < EDGES[1]
-    return Timeline(rows, time, Fraction(first) * seconds_of(unit), is_doubtful)
-
-
-def _is_same(
-    stamps: Real[np.ndarray, " n"], values: Float[np.ndarray, "n 3"]
-) -> Bool[np.ndarray, " m"]:
-    """Which rows have the stamp and the values of the row before, from the second one on."""
-    return (np.diff(stamps) == 0) & (values[1:] == values[:-1]).all(axis=1)
-
-
-def _detected_unit(
-    stamps: Real[np.ndarray, " n"], source: object, name: str, notes: list[str]
-) -> str:
-    steps = np.diff(stamps)
-    steps = steps[steps > 0]
-    if (steps == 1).mean() > COUNTED and steps.mean() < MOST_COUNTED:
-        remedy = "give --sample-rate (Hz), or --time-unit if these are stamps"
-        raise InputError(source, "field 'time' counts samples: its steps are 1", remedy)
-    unit, rate = time_unit(stamps - stamps.min())
-    if unit is None:
-        problem = f"the unit of field 'time' is ambiguous (in seconds {name} would run at"
-        remedy = "state it: s, ms, us, ns, or the seconds of one stamp, by --time-unit"
-        raise InputError(source, f"{problem} {rate:.3g} Hz)", remedy)
-    rate *= PER_SECOND[unit]
-    notes.append(f"time of {name} taken as {unit}, by which it runs at {rate:.4g} Hz")
-    return unit
-
-
-# --- wraps, rows of other times, new starts
-
-
-def _unwrapped(stamps: Real[np.ndarray, " n"]) -> tuple[Real[np.ndarray, " n"], int]:
-    """Stamps that go on where a clock wrapped, and the number of wraps."""
-    steps = np.diff(stamps)
-    if not (steps < 0).any():
-        return stamps, 0
-    largest = LONGEST_WRAP * usual_step(np.cumsum(np.maximum(steps, 0)))
-    top = float(stamps.max()) - min(float(stamps.min()), 0.0)
-    for period in PERIODS:
-        after = steps + period
-        wraps = (steps < -period / 2) & (after >= 0) & (after <= largest)
-        if wraps.any() and period - largest <= top < period:
-            turns = np.concatenate([[0], np.cumsum(wraps)])
-            is_whole = stamps.dtype.kind in "iu" and period == round(period)
-            return stamps + turns * (int(period) if is_whole else period), int(wraps.sum())
-    return stamps, 0
-
-
-def _without_strays(stamps: Real[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
-    """Rows of the recording without a `few` whose stamps are far before or after: the first one,
-    before the clock was set, or what was buffered before."""
-    longest = LONGEST_PAUSE * usual_step(stamps)
-    if np.abs(np.diff(stamps)).max(initial=0) <= longest:
-        return np.arange(len(stamps))
-    order = np.argsort(stamps, kind="stable")
-    far = np.diff(stamps[order]).astype(np.float64) > longest
-    cluster = np.concatenate([[0], np.cumsum(far)])[: len(stamps)]
-    counts = np.bincount(cluster, minlength=1)
-    if len(stamps) - counts.max() > few(len(stamps)):
-        return np.arange(len(stamps))
-    return np.sort(order[cluster == counts.argmax()])
-
-
-def _mixed(
-    stamps: Real[np.ndarray, " n"], values: Float[np.ndarray, "n 3"]
-) -> Bool[np.ndarray, " n"]:
-    """Rows of pieces of the file that lie between the samples of a longer piece: the clock started
-    again. Blocks and single rows out of order fill holes, and are not meant."""
-    steps = np.diff(stamps).astype(np.float64)
-    if not (steps < 0).any() or (steps < 0).mean() > SHUFFLED:
-        return np.zeros(len(stamps), dtype=bool)
-    usual = float(np.median(steps[steps > 0]))
-    piece = np.concatenate([[0], np.cumsum((steps < 0) | (steps > 5 * usual))])
-    counts = np.bincount(piece)
-    length = counts - np.arange(len(counts)) / len(counts)  # of two equal ones the first is longer
-    order = np.argsort(stamps, kind="stable")
-    left, right = order[:-1], order[1:]
-    near = (piece[left] != piece[right]) & (np.diff(stamps[order]) < NEAR * usual)
-    near &= ~_is_same(stamps[order], values[order])
-    shorter = np.where(length[piece[left]] < length[piece[right]], left, right)[near]
-    hits = np.bincount(piece[np.unique(shorter)], minlength=len(counts))
-    return ((hits > 0.5 * counts) | (hits > FEW_ROWS))[piece]
-
-
-# --- bursts and rounded stamps
-
-
-def _even(time: Float[np.ndarray, " n"], name: str, notes: list[str]) -> Float[np.ndarray, " n"]:
-    """Time of samples that are evenly apart where stamps are rounded, shared, or those of the
-    arrival of a packet."""
-    steps, mean, grain = np.diff(time), usual_step(time), _grain(time)
-    usual, shared = float(np.median(steps)), int((steps == 0).sum())
-    odd = (np.abs(steps - usual) > 0.5 * grain).mean()  # one lost sample is no rounding
-    if grain > LEAST_GRAIN * mean and odd > SAME_RATE:
-        step, first = np.polyfit(np.arange(len(time)), time, 1)
-        line = step * np.arange(len(time))
-        if np.abs(time - first - line).max() <= grain:
-            problem = f"stamps of {name} are rounded to {grain:.3g} s and {shared} are the same"
-            notes.append(f"{problem}: its samples are spread evenly at {1 / step:.4g} Hz")
-            return line
-    crowded = steps < CROWDED * mean
-    if crowded.mean() <= SAME_RATE:
-        crowded = steps == 0
-    if crowded.any():
-        starts = np.flatnonzero(np.concatenate([[True], ~crowded]))
-        sizes = np.diff(np.append(starts, len(time)))
-        lengths = np.append(np.diff(time[starts]), np.inf) / sizes
-        lengths[-1] = np.median(lengths[:-1]) if len(lengths) > 1 else mean
-        lengths = np.where(sizes > 1, np.minimum(lengths, 1.5 * mean), lengths)
-        place = np.arange(len(time)) - np.repeat(starts, sizes)
-        time = np.repeat(time[starts], sizes) + place * np.repeat(lengths, sizes)
-        problem = f"{crowded.sum()} samples of {name} share the stamp of a burst or follow at once"
-        problem += f" ({shared} have the same stamp): they are spread evenly up to the next one"
-        notes.append(f"{problem}, {1 / usual_step(time):.4g} Hz by all samples")
-    elif abs(usual / mean - 1.0) > SAME_RATE:
-        problem = f"{name} has {1 / mean:.4g} samples a second, but its usual step is that of"
-        notes.append(f"{problem} {1 / usual:.4g} Hz: samples are missing")
-    return time
-
-
-def _grain(time: Float[np.ndarray, " n"]) -> float:
-    """Unit to which stamps are rounded, s; 0 if it is less than a microsecond."""
-    for digits in range(7):
-        whole = np.round(time * 10**digits)
-        if np.abs(time * 10**digits - whole).max() < 1e-2:
-            return float(np.gcd.reduce(whole.astype(np.int64))) / 10**digits
-    return 0.0
-
-
-# --- the time of day
-
-
 def parsed_times(cells: pd.Series) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Stamps of times of day, and which cells are one: ns since 1970, or since midnight if there is
     no date, in UTC if there is no zone. Examples are 2024-05-03 09:15:02.250, 09:15:02:250,
-    15:02.250 and 5/3/2024 9:15:02 AM. After midnight a time without a date is of the next day."""
-    text = (
-        cells.astype(str).str.strip(" \"'").str.replace(r"(:\d+)[:,](\d{3,})", r"\1.\2", regex=True)
-    )
-    is_clock = text.str.fullmatch(r"(\d+:)?\d+:\d+(\.\d+)?")
-    if is_clock.mean() > 0.5:
-        spans = text.where(is_clock).where(text.str.count(":") > 1, "00:" + text)
-        stamps = pd.to_timedelta(spans, errors="coerce")
-        valid = stamps.notna().to_numpy()
-        filled = stamps.fillna(pd.Timedelta(0)).to_numpy()
-        clock = np.array(filled.astype("timedelta64[ns]"), dtype=np.int64)
-        times = clock[valid]
-        clock[valid] += (
-            DAY * np.cumsum(np.r_[False, times[1:] - times[:-1] < -DAY // 2])[: len(times)]
-        )
-        return clock, valid
+    15:02.250 and 5/3/2024 9:15:02 AM. A time without a date that is earlier by half a day than the
+    one before is of the next day, and minutes without an hour are of the next hour."""
+    text = cells.astype(str).str.strip(" \"'[]")
+    text = text.str.replace(r"(:\d+)[:, ]((?:\d{3})+)(?!\d)", r"\1.\2", regex=True)
+    text = text.str.replace(r"^(\d{4}-?\d\d-?\d\d)[_T-](?=\d\d)", r"\1 ", regex=True)
+    clock = text.str.extract(r"^((?:\d+:)?\d+:\d+(?:\.\d+)?) ?([AaPp][Mm])?$")
+    if clock[0].notna().mean() > 0.5:
+        has_hours = bool((clock[0].str.count(":") > 1).any())
+        spans = pd.to_timedelta(clock[0] if has_hours else "00:" + clock[0], errors="coerce")
+        valid = spans.notna().to_numpy()
+        stamps = spans.fillna(pd.Timedelta(0)).to_numpy().astype("timedelta64[ns]").astype(np.int64)
+        half = clock[1].str.lower().map({"am": 0, "pm": 1}).to_numpy(np.float64)
+        stamps = np.where(np.isnan(half), stamps, stamps % (DAY // 2) + (half == 1) * (DAY // 2))
+        turn = DAY if has_hours else DAY // 24
+        stamps[valid] += turn * np.cumsum(np.diff(stamps[valid], prepend=0) < -turn // 2)
+        return stamps, valid
     dated = text.where(text.str.contains(r"\d:\d\d"))
     is_dotted = bool(text.str.match(r"\d{1,2}\.\d").any())
-    stamps = pd.to_datetime(dated, format="mixed", dayfirst=is_dotted, utc=True, errors="coerce")
-    valid = stamps.notna().to_numpy()
-    moments = stamps.dt.tz_localize(None).fillna(pd.Timestamp(0)).to_numpy()
-    return moments.astype("datetime64[ns]").astype(np.int64), valid
+    dates = pd.to_datetime(dated, format="mixed", dayfirst=is_dotted, utc=True, errors="coerce")
+    moments = dates.dt.tz_localize(None).fillna(pd.Timestamp(0)).to_numpy()
+    return moments.astype("datetime64[ns]").astype(np.int64), dates.notna().to_numpy()

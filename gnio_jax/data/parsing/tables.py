@@ -244,9 +244,10 @@ def read_text(
     if widths and frame.shape[1] not in widths:
         problem = f"has {frame.shape[1]} columns, expected {' or '.join(map(str, widths))}"
         raise InputError(path, problem, "take the file as published")
-    words = [*layout.below[:1], *(line for line in layout.preamble if is_row(line))]
+    subheaders = (layout.separator.join(cells) for cells in layout.subheaders)
+    words = [line for line in (*layout.preamble, *subheaders) if is_row(line)]
     if header and words:
-        problem = f"has a line with '{shortened(words[-1], 60)}' above its rows of {layout.width}"
+        problem = f"has a line with '{shortened(words[0], 60)}' above its rows of {layout.width}"
         raise InputError(path, f"{problem} numbers", "gnio data import reads such a table")
     if header and layout.labels:
         frame.columns = list(layout.labels)

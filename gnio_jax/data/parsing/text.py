@@ -7,6 +7,7 @@ what is not in it; `tolerant_frame` leaves out damaged rows and names them. Limi
 from __future__ import annotations
 
 import codecs
+import contextlib
 import csv
 import io
 import re
@@ -31,20 +32,21 @@ NUMERIC_SHARE = 0.9
 SEPARATORS = (",", ";", "\t", "|", " ")
 """Separators of cells; " " means any run of blanks."""
 _MARK = re.compile(r"^\s*(#|//|%|@|!)+\s*")
-_DIGITS = r"[+-]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
+_DIGITS = r"[+\-\u2212]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
 _NUMBER = re.compile(_DIGITS, re.IGNORECASE)
 
 
 class Layout(NamedTuple):
     """The shape of a table of text."""
 
+    encoding: str
     separator: str
     decimal: str
     """Decimal mark: a point or a comma."""
     labels: tuple[str, ...]
     """Names of the columns; none if there is no header."""
-    below: tuple[str, ...]
-    """Cells of a line between the header and the rows, such as units; none if there is none."""
+    subheaders: tuple[tuple[str, ...], ...]
+    """Cells of other lines of names above the rows, such as units; those nearest to them first."""
     before: int
     """Number of lines before the first row."""
     width: int
@@ -145,47 +147,43 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
     number and the most names. Raises `InputError` if it is no text or too wide."""
     head = head_of(path, content)
     check_kind(path, head)
-    lines = head.decode(encoding_of(path, head), errors="replace").splitlines()[:FIRST_LINES]
+    encoding = encoding_of(path, head)
+    lines = head.decode(encoding, errors="replace").splitlines()
     lines = lines[:-1] if len(head) == HEAD and len(lines) > 1 else lines  # it may be cut
     stated = re.match(r'\W*sep=(.)"?\s*$', lines[0], re.IGNORECASE) if lines else None
     marks = [separator] if separator else [stated[1]] if stated else SEPARATORS
-    tables = {mark: [cells_of(line, mark) for line in lines] for mark in marks}
-    scores = {mark: _score(rows) for mark, rows in tables.items()}
-    mark = max(marks, key=lambda one: scores[one][0])
-    (score, width), rows = scores[mark], tables[mark]
-    if score == 0:  # a header without rows, or a table of words
+    mark, rows, score, width = marks[0], [], 0, 0
+    for most in sorted({min(FIRST_LINES, len(lines)), len(lines)}):
+        tables = {mark: [cells_of(line, mark) for line in lines[:most]] for mark in marks}
+        scores = {mark: _score(rows) for mark, rows in tables.items()}
+        mark = max(marks, key=lambda mark: scores[mark][0])
+        rows, (score, width) = tables[mark], scores[mark]
+        if score:
+            break
+    else:  # a header without rows, or a table of words
         first = next((n for n, line in enumerate(lines) if is_row(line)), len(lines) - 1)
         line = lines[first] if lines else ""
         mark = separator or max(SEPARATORS[:-1], key=line.count)
         labels = tuple(cells_of(line, mark if mark in line else " "))
-        return Layout(mark, ".", labels, (), first + 1, len(labels), ())
+        return Layout(encoding, mark, ".", labels, (), first + 1, len(labels), ())
     if width > MOST_COLUMNS:
         raise InputError(path, f"has {width} columns", f"{MOST_COLUMNS} are the most")
     data = [n for n, cells in enumerate(rows) if len(cells) == width and _is_data(cells)]
-    ends = all(rows[n][-1] == "" for n in data)
-    headers: list[tuple[int, list[str]]] = []
+    filled = max(n + 1 for row in data for n, cell in enumerate(rows[row]) if cell)
+    headers: dict[int, tuple[str, ...]] = {}
     for number in range(data[0] - 1, -1, -1):
         cells = cells_of(without_mark(lines[number]), mark)
-        is_whole = len(cells) == width or (len(cells) == width + 1 and not cells[-1])
-        is_whole |= ends and len(cells) == width - 1
+        is_whole = filled <= len(cells) <= width or (len(cells) == width + 1 and not cells[-1])
         if is_whole and any(cells) and not any(_NUMBER.fullmatch(cell) for cell in cells):
-            headers.insert(0, (number, [*cells, ""][:width]))
+            headers[number] = (*cells, *[""] * width)[:width]
         elif headers and lines[number].strip():
             break
-    header = max(headers, key=lambda one: len(set(one[1]) - {""}), default=(-1, []))
-    below = [cells for number, cells in headers if number > header[0]]
-    names = {number for number, _ in headers}
-    preamble = [lines[n] for n in range(data[0]) if n not in names and lines[n].strip()]
+    preamble = [lines[n] for n in range(data[0]) if n not in headers and lines[n].strip()]
+    header = max(headers, key=lambda number: len(set(headers[number]) - {""}), default=None)
+    labels = headers.pop(header, ())
     is_comma = any(re.search(r"\d,\d", cell) for n in data for cell in rows[n])
-    return Layout(
-        mark,
-        "," if is_comma else ".",
-        tuple(header[1]),
-        tuple(below[-1]) if below else (),
-        data[0],
-        width,
-        tuple(preamble),
-    )
+    others, decimal = tuple(headers.values()), "," if is_comma else "."
+    return Layout(encoding, mark, decimal, labels, others, data[0], width, tuple(preamble))
 
 
 def _is_data(cells: list[str]) -> bool:
@@ -217,7 +215,7 @@ def _parsed(path: Path, layout: Layout, content: bytes | None) -> pd.DataFrame:
             skip_blank_lines=True,
             low_memory=False,
             decimal=layout.decimal,
-            encoding=encoding_of(path, head_of(path, content)),
+            encoding=layout.encoding,
             compression=None,
         )
     except pd.errors.EmptyDataError:
@@ -225,18 +223,19 @@ def _parsed(path: Path, layout: Layout, content: bytes | None) -> pd.DataFrame:
 
 
 def strict_frame(path: Path, layout: Layout, content: bytes | None = None) -> pd.DataFrame:
-    """The rows of a table. Raises `InputError` naming a row that is too long."""
+    """The rows of a table. Raises `InputError` naming a row with another number of cells."""
+    problem = "is no table of text"
     try:
-        return _parsed(path, layout, content)
-    except InputError:
-        raise
-    except (UnicodeDecodeError, pd.errors.ParserError, ValueError) as error:
-        problem = f"is no table of text ({shortened(error, 200)})"
-        for number, cells in rows_of(path, layout, content):
-            if len(cells) > layout.width:
-                problem = f"row {number} has {len(cells)} cells, expected {layout.width}"
-                break
-        raise InputError(path, problem, "correct that, or take the file as published") from None
+        frame = _parsed(path, layout, content)
+        if frame.shape[1] == (layout.width or frame.shape[1]):
+            return frame
+    except (UnicodeDecodeError, pd.errors.ParserError) as error:
+        problem = f"{problem} ({shortened(error, 200)})"
+    for number, cells in rows_of(path, layout, content):
+        if len(cells) != layout.width:
+            problem = f"row {number} has {len(cells)} cells, expected {layout.width}"
+            break
+    raise InputError(path, problem, "correct that, or take the file as published")
 
 
 def tolerant_frame(
@@ -246,28 +245,30 @@ def tolerant_frame(
     numbers among the rows of the file, from 0. Columns of numbers are numbers, times of day are
     datetime64 in ns, others remain as they are. Raises `InputError` if more are damaged."""
     frame, is_mixed, width = None, False, layout.width
-    try:
+    with contextlib.suppress(UnicodeDecodeError, pd.errors.ParserError):
         frame = _parsed(path, layout, content)
-    except (UnicodeDecodeError, pd.errors.ParserError):
-        pass  # rows of other lengths, or bytes of another encoding
     if frame is not None and frame.iloc[:, -1].isna().any():  # the parser fills short rows
-        is_open = layout.separator == " " or not _has_separators(path, layout, content, len(frame))
-        frame = None if is_open else frame
+        text = path.read_bytes() if content is None else content
+        count = text.split(b"\n", layout.before)[-1].count(layout.separator.encode())
+        frame = frame if count == len(frame) * (width - 1) else None
     damaged = np.zeros(0 if frame is None else len(frame), dtype=bool)
     if frame is None or frame.shape[1] != width:
         rows = [cells for _, cells in rows_of(path, layout, content)]
         rows = [cells if any(cells[width:]) else cells[:width] for cells in rows]
         missing = width - np.array([len(cells) for cells in rows])
-        is_open = bool(layout.labels) and layout.labels[-1] == ""  # a separator ends some rows
-        damaged = (missing != 0) & ~(is_open & (missing == 1))
+        unnamed = width - max(
+            (n for n, label in enumerate(layout.labels, 1) if label), default=width
+        )
+        damaged = (missing < 0) | (missing > unnamed)  # separators end some rows
         wider = [len(cells) for cells in rows if len(cells) > width and _is_data(cells)]
         is_mixed = len(wider) > 1 and len(set(wider)) == 1  # rows of another kind are no damage
         frame = pd.DataFrame([[*cells, *[""] * width][:width] for cells in rows])
         frame = frame.replace("", np.nan)
-    forms = {}
-    for place in (place for place in frame if frame[place].dtype.kind == "O"):
-        forms[place], valid = _form(frame[place], damaged)
-        damaged = damaged | ~valid
+    columns = {place: frame[place] for place in frame}
+    for place, column in columns.items():
+        if column.dtype.kind == "O":
+            columns[place], valid = _typed(column, damaged)
+            damaged = damaged | ~valid
     if damaged.any():
         number, cells = next(islice(rows_of(path, layout, content), int(np.argmax(damaged)), None))
         problem = f"row {number} is no row of {width} numbers: it has {len(cells)} cells"
@@ -276,41 +277,21 @@ def tolerant_frame(
             problem += f", as {damaged.sum() - 1} others"
             raise InputError(path, problem, "give a table whose rows have the same columns")
         notes.append(f"{path.name}: {problem}; {damaged.sum()} such rows are left out")
-    frame = frame[~damaged].reset_index(drop=True)
-    columns = {place: frame[place] for place in frame}
-    for place, form in forms.items():
-        text = pd.Series(frame[place]).astype(str).str.strip(" \"'\0")
-        if form == "number":
-            columns[place] = _as_numbers(text)
-        elif form == "time":
-            columns[place] = pd.Series(parsed_times(text)[0].astype("datetime64[ns]"))
-    return pd.DataFrame(columns), np.flatnonzero(~damaged)
+    return pd.DataFrame(columns)[~damaged].reset_index(drop=True), np.flatnonzero(~damaged)
 
 
-def _as_numbers(text: pd.Series) -> pd.Series:
-    return pd.Series(pd.to_numeric(text.str.replace(",", "."), errors="coerce"))
-
-
-def _has_separators(path: Path, layout: Layout, content: bytes | None, rows: int) -> bool:
-    """Whether a text has as many separators as whole rows have."""
-    count = 0
-    with path.open("rb") if content is None else io.BytesIO(content) as file:
-        for _ in range(layout.before):
-            file.readline()
-        while block := file.read(1 << 20):
-            count += block.count(layout.separator.encode())
-    return count == rows * (layout.width - 1)
-
-
-def _form(column: pd.Series, damaged: Bool[np.ndarray, " n"]) -> tuple[str, Bool[np.ndarray, " n"]]:
-    """Whether most cells of a column are numbers, times or words, and which of them are."""
-    text = column.astype(str).str.strip(" \"'\0")
+def _typed(
+    column: pd.Series, damaged: Bool[np.ndarray, " n"]
+) -> tuple[pd.Series, Bool[np.ndarray, " n"]]:
+    """A column of cells as numbers or times, if most are that, and which of them are."""
+    text = column.astype(str).str.strip(" \"'\0").str.replace("\u2212", "-")
     blank = column.isna().to_numpy() | text.str.lower().isin(["", "nan"]).to_numpy()
-    rest = ~blank & ~damaged
-    numbers = _as_numbers(text).notna().to_numpy()
-    if numbers[rest].sum() >= NUMERIC_SHARE * max(rest.sum(), 1):
-        return "number", numbers | blank
-    times = parsed_times(text)[1]
-    if times[rest].sum() >= NUMERIC_SHARE * max(rest.sum(), 1):
-        return "time", times
-    return "word", np.ones(len(column), dtype=bool)
+    least = NUMERIC_SHARE * max((~blank & ~damaged).sum(), 1)
+    numbers = pd.Series(pd.to_numeric(text.str.replace(",", "."), errors="coerce"))
+    valid = numbers.notna().to_numpy()
+    if (valid & ~blank & ~damaged).sum() >= least:
+        return numbers, valid | blank
+    stamps, valid = parsed_times(text)
+    if (valid & ~blank & ~damaged).sum() >= least:
+        return pd.Series(stamps.astype("datetime64[ns]")), valid
+    return column, np.ones(len(column), dtype=bool)

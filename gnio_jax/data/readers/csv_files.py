@@ -185,7 +185,7 @@ _LIKE = {
 def _guess(field: str, names: list[str]) -> str:
     """The column that is probably meant, or a placeholder."""
     sensor, _, axis = field.partition("_")
-    pattern = _LIKE[field] if field in _LIKE else _LIKE[sensor] + axis
+    pattern = _LIKE.get(field, _LIKE.get(sensor, "") + axis)
     for name in names:
         if re.fullmatch(pattern, re.sub(r"\s*[\[(].*", "", name).strip().lower()):
             return f"'{name}'" if " " in name else name

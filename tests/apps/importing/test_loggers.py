@@ -131,7 +131,7 @@ def test_degrees_where_the_format_says_radians_are_refused(tmp_path):
     members = {"TotalAcceleration.csv": sensor_table(time, force)}
     degrees = members | {"Gyroscope.csv": sensor_table(time, np.degrees(turning))}
     path = zipped(tmp_path / "walk.zip", degrees)
-    refused(path, "its gyro looks like deg/s, which it does not say .* state the unit")
+    refused(path, "its gyro looks like deg/s by the turning .* state the unit")
     sequence, _ = import_recording(path, gyro_unit="deg/s")
     np.testing.assert_allclose(sequence.gyro, turning, atol=1e-6)
     members["Gyroscope.csv"] = sensor_table(time, turning)

@@ -537,8 +537,8 @@ def test_rows_that_name_their_sensor(tmp_path):
     check(put(tmp_path, lines("% LogFile", header, *both), "ipin.txt"))
     stamps = [(str(n // 10**6), str(n)) for n in NS]
     header = [
-        f"# Uncal{n},utcTimeMillis,elapsedRealtimeNanos,Uncal{n}XMps2,Uncal{n}YMps2,Uncal{n}ZMps2"
-        for n in ("Accel", "Gyro")
+        f"# Uncal{n},utcTimeMillis,elapsedRealtimeNanos,Uncal{n}X{u},Uncal{n}Y{u},Uncal{n}Z{u}"
+        for n, u in (("Accel", "Mps2"), ("Gyro", "RadPerSec"))
     ]
     both = interleaved(by_sensor("UncalAccel", stamps, accel), by_sensor("UncalGyro", stamps, gyro))
     check(
