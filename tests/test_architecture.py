@@ -51,8 +51,8 @@ LIBRARIES = {
 REFUSED = set("found own each given there known place seen about asked kept told here both".split())
 REFUSED |= set("these those wanted taken laid made left rest apart since late".split())
 """Words that do not say what a variable holds."""
-OLD_NAMES = ("apps/importing", "apps/live", "apps/track", "calibration", "commands/calibrate")
-OLD_NAMES += ("config", "data/parsing", "evaluation", "filtering", "training")
+OLD_NAMES = ("apps/live", "apps/track", "calibration", "commands/calibrate")
+OLD_NAMES += ("config", "evaluation", "filtering", "training")
 """Rooms and modules whose variables still have such names."""
 TWO_MEANINGS = {"Estimate", "Inputs", "Outcome", "Recording", "Run", "Source", "Summary"}
 """Names that two classes of these rooms still share."""

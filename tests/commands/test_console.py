@@ -13,7 +13,6 @@ from rich.table import Table
 from gnio_jax.commands import console
 from gnio_jax.errors import InputError
 
-
 ROOT = Path(__file__).parents[2]
 
 

@@ -11,28 +11,21 @@ import os
 from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
-
 from gnio_jax.apps.importing import loggers, ros, units
 from gnio_jax.apps.importing.clocks import sensor_of
-from gnio_jax.apps.importing.columns import read_columns, resolved, sensor_named
+from gnio_jax.apps.importing.columns import read_columns
 from gnio_jax.apps.importing.files import files_of
 from gnio_jax.apps.importing.recording import GAPS as GAPS
 from gnio_jax.apps.importing.recording import Imported as Imported
-from gnio_jax.apps.importing.recording import (
-    RawRecording,
-    Track,
-    as_sequence,
-)
+from gnio_jax.apps.importing.recording import RawRecording, Track, as_sequence
 from gnio_jax.config import ImportOptions
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
+from gnio_jax.data.labels import ACCEL, GYRO, resolved, sensor_named
 from gnio_jax.data.parsing.stamps import RATES, seconds_of
 from gnio_jax.data.parsing.text import head_of
 from gnio_jax.data.readers import euroc
-from gnio_jax.data.readers.csv_files import ACCEL, GYRO
 from gnio_jax.errors import InputError
 from gnio_jax.files import HDF5
-from gnio_jax.types import Sequence
 
 NOTHING_STATED = ImportOptions()
 _MAGIC = {
@@ -54,23 +47,17 @@ def import_recording(
 ) -> Imported:
     """A recording as a `Sequence` on a uniform clock.
 
-    `path`
-        A zip, folder or workbook of Sensor Logger or phyphox, a bag or MCAP, a folder of EuRoC's
-        layout, or a table of text, packed or not, with any preamble, separator and encoding.
-    `options`
-        Properties that the recording does not state. Columns that `options.columns` leaves out are
-        found by their names. Damaged rows are left out and named if they are few.
-    `rate`
-        Rate of the result, Hz; None keeps that of the faster sensor.
-    `name`
-        Name of the sequence; None takes that of the file.
-
-    Two sensors with stamps of their own are put on one clock over the time that both cover, by
-    cubic splines. Raises `InputError` naming file, field and remedy.
+    `path` is a zip, folder or workbook of Sensor Logger or phyphox, a bag or MCAP, a folder of
+    EuRoC's layout, or a table of text, packed or not, with any preamble, separator and encoding.
+    `options` say what the recording does not state; columns that they leave out are found by their
+    names. The result has the `rate`, Hz, or that of the faster sensor, and the `name`, or that of
+    the file. Damaged rows are left out and named if they are few. Two sensors with stamps of their
+    own are put on one clock over the time that both cover, by cubic splines. Raises `InputError`
+    naming file, field and remedy.
     """
     seconds_of(options.time_unit or "s")
-    units.scale_of(options.gyro_unit or "rad/s", units.GYRO_UNITS, "gyro_unit")
-    units.scale_of(options.accel_unit or "g", units.ACCEL_UNITS, "accel_unit")
+    units.scale_of(options.gyro_unit or "rad/s", "gyro")
+    units.scale_of(options.accel_unit or "g", "accel")
     if options.accel_sign not in (None, *units.SIGNS):
         remedy = f"known: {', '.join(units.SIGNS)}"
         raise InputError("accel_sign", f"unknown value '{options.accel_sign}'", remedy)
@@ -90,14 +77,13 @@ def _read(path: Path, options: ImportOptions) -> RawRecording:
     is_named = any((options.columns, options.accel_path, options.where, options.sample_rate))
     path = path if is_named else _whole(path)
     kind = "tables" if is_named else _recognised(path)
-    topics = ros.Topics(options.imu_topic, options.accel_topic, options.reference_topic)
     if kind in ros.KINDS:
-        return ros.read_bag(path, kind, topics)
-    if any(topics):
+        return ros.read_bag(path, kind, options)
+    if any((options.imu_topic, options.accel_topic, options.reference_topic)):
         remedy = "--imu-topic and the like are for ROS bags and MCAP"
         raise InputError(path, "has no topics", remedy)
     if kind == "euroc":
-        return _read_euroc(path)
+        return _euroc(path)
     files = files_of(path)
     recording = None if is_named else loggers.read_logger(path, files)
     return recording or read_columns(path, files, options)
@@ -133,12 +119,8 @@ def _recognised(path: Path) -> str:
     return kind
 
 
-# --- a folder of EuRoC's layout
-
-
-def _read_euroc(path: Path) -> RawRecording:
-    """Read the folder `mav0`, or the one that contains it, at any rate, with or without a
-    reference."""
+def _euroc(path: Path) -> RawRecording:
+    """The folder `mav0`, or the one that contains it, at any rate, with or without a reference."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     table = euroc.read_table(mav / "imu0" / "data.csv")
     gyro = sensor_of("gyro", table, "ns", "rad/s", euroc.STAMP, *euroc.GYRO)
@@ -152,16 +134,11 @@ def _read_euroc(path: Path) -> RawRecording:
     return RawRecording(path, gyro, accel, notes, [], "android", track=track)
 
 
-# --- a recording that is kept
-
-
 def write_imported(path: str | os.PathLike[str], recording: Imported) -> None:
     """Write the sequence as `write_hdf5` does, with its notes and warnings."""
     sequence = recording.sequence
     lines = {_NOTES: recording.notes, _WARNINGS: recording.warnings}
-    texts = {
-        name: "\n".join(" ".join(t.split()) for t in one) for name, one in lines.items() if one
-    }
+    texts = {n: "\n".join(" ".join(line.split()) for line in ls) for n, ls in lines.items() if ls}
     write_hdf5(path, sequence._replace(attributes=sequence.attributes | texts))
 
 
@@ -174,21 +151,3 @@ def read_imported(path: Path, options: ImportOptions = NOTHING_STATED) -> Import
     attributes = dict(sequence.attributes)
     lines = (tuple(str(attributes.pop(k, "")).splitlines()) for k in (_NOTES, _WARNINGS))
     return Imported(sequence._replace(attributes=attributes), *lines)
-
-
-def impressions(sequence: Sequence) -> list[str]:
-    """Lines that a person can compare with the recording: length, magnitudes, rest."""
-    time = sequence.time
-    step = float(np.median(np.diff(time)))
-    accel, gyro = (np.linalg.norm(field, axis=1) for field in (sequence.accel, sequence.gyro))
-    lines = [
-        f"{time[-1] - time[0]:.1f} s at {1.0 / step:.4g} Hz",
-        f"|accel| {np.median(accel):.2f} m/s² in the median, up to {accel.max():.2f}",
-        f"|gyro| {np.median(gyro):.2f} rad/s in the median, up to {gyro.max():.2f}",
-    ]
-    span = max(round(0.5 / step), 1)
-    if count := len(accel) // span:
-        accel, gyro = (norm[: count * span].reshape(count, span) for norm in (accel, gyro))
-        still = (accel.std(axis=1) < 0.2) & (gyro.mean(axis=1) < 0.1)
-        lines.append(f"it rests {still.mean():.0%} of the time")
-    return lines

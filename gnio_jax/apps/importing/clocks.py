@@ -21,17 +21,16 @@ from gnio_jax.data.validation import from_one
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows
 
-MOST_BLANK = 0.4
-"""Share of rows without a stamp from which these are packets."""
 PERIODS = sorted(
     [2.0**bits * scale for bits in (8, 10, 12, 16, 24, 32) for scale in (1.0, 1e-3, 1e-6)]
-    + [turn * count for turn in (60, 3600, 86400) for count in parsing.PER_SECOND.values()]
+    + [turn * count for turn in (1, 60, 3600, 86400) for count in parsing.PER_SECOND.values()]
 )
-"""Values at which clocks wrap: whole bits of a counter, a minute, an hour and midnight."""
+"""Values at which clocks wrap: whole bits of a counter, and a second, minute, hour and day."""
 LONGEST_WRAP, LONGEST_PAUSE = 20.0, 100.0
 """Largest step over a wrap, and to rows that still belong to the recording, in usual steps."""
-MOST_LOST = 0.2
-"""Share of rows of another start of the clock from which a recording is refused."""
+MOST_BLANK, MOST_LOST = 0.4, 0.2
+"""Shares of rows: from the first one without a stamp, these are packets; from the second one of
+another start of the clock, a recording is refused."""
 NEAR, NEAR_ROW, SHUFFLED = 0.6, 0.4, 0.1
 """Rows of two pieces of a file closer than the first share of a step, or a single row closer than
 the second one, are of two clocks, unless so many steps go back that rows are only out of order."""
@@ -40,10 +39,9 @@ COUNTED, MOST_COUNTED, SHORTEST_TICKS = 0.8, 2.0, 4
 most stamps between samples that may be a counter too."""
 LEAST_GRAIN, DRIFT_SAMPLES = 0.05, 1000
 """Rounding of stamps that matters, in steps, and samples over which a clock does not drift."""
-EDGES = (12.0, 800.0)
-"""Detected rates beyond these are believed only if gravity turns as the gyro says, Hz."""
-EPOCHS = (1.0e9, 2.2e9)
-"""Times from 2001 to 2039, s since 1970."""
+EDGES, EPOCHS = (12.0, 800.0), (1.0e9, 2.2e9)
+"""Detected rates beyond the first ones, Hz, are believed only if gravity turns as the gyro says;
+the others are the times from 2001 to 2039, s since 1970."""
 
 
 class Sensor(NamedTuple):
@@ -64,11 +62,8 @@ class Sensor(NamedTuple):
     def where(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> Sensor:
         """The samples in these rows."""
         numbers, row = np.arange(len(self.stamps))[rows], self.row
-        return self._replace(
-            stamps=self.stamps[rows],
-            values=self.values[rows],
-            row=lambda index: row(int(numbers[index])),
-        )
+        stamps, values = self.stamps[rows], self.values[rows]
+        return self._replace(stamps=stamps, values=values, row=lambda n: row(int(numbers[n])))
 
 
 class Clocked(NamedTuple):
@@ -124,22 +119,17 @@ def clocked(sensor: Sensor, unit: str | None, notes: list[str], warnings: list[s
         remarks.append(f"the clock of {name} wrapped {wraps} times and is continued")
         sensor = sensor._replace(stamps=stamps)
     strays = _strays(sensor.stamps)
-    if strays.any():
-        remarks.append(
-            f"{strays.sum()} rows of {name} are left out, whose stamps are far from others"
-        )
+    if lost := int(strays.sum()):
+        remarks.append(f"{lost} rows of {name} are left out, whose stamps are far from all others")
         sensor = sensor.where(~strays)
     mixed = _mixed(sensor)
     if lost := int(mixed.sum()):
-        place = sensor.row(int(np.argmax(mixed)))
-        problem = f"the clock of {name} starts again or was set back near row {place}: {lost} rows"
+        row = sensor.row(int(np.argmax(mixed)))
+        problem = f"the clock of {name} starts again or was set back near row {row}: {lost} rows"
         if lost > MOST_LOST * len(mixed):
             raise InputError(file, f"{problem} overlap others", "cut the recording there")
-        problem += " of the shorter part are left out"
-        if lost <= few(len(mixed)):
-            remarks.append(problem)
-        else:
-            warnings.append(f"clock: {file.name}: {problem}")
+        problem = f"{file.name}: {problem} of the shorter part are left out"
+        (notes if lost <= few(len(mixed)) else warnings).append(problem)
         sensor = sensor.where(~mixed)
     if backward := int((np.diff(sensor.stamps) < 0).sum()):
         remarks.append(f"{name} had {backward} steps back in time; its rows were sorted")
@@ -171,16 +161,14 @@ def clocked(sensor: Sensor, unit: str | None, notes: list[str], warnings: list[s
 
 def _is_same(sensor: Sensor) -> Bool[np.ndarray, " m"]:
     """Which rows have the stamp and the values of the row before, from the second one on."""
-    values = sensor.values
-    return (np.diff(sensor.stamps) == 0) & (values[1:] == values[:-1]).all(axis=1)
+    return (np.diff(sensor.stamps) == 0) & (np.diff(sensor.values, axis=0) == 0).all(axis=1)
 
 
 def _detected_unit(sensor: Sensor, notes: list[str]) -> tuple[str, bool]:
     """The unit of sorted stamps, and whether it is in doubt. Raises `InputError` for a counter."""
     stamps, name = sensor.stamps, sensor.name
     unit, rate = parsing.time_unit(stamps - stamps[0])
-    steps = np.diff(stamps)
-    steps = steps[steps > 0]
+    steps = (gaps := np.diff(stamps))[gaps > 0]
     is_date = unit and EPOCHS[0] < stamps[0] / parsing.PER_SECOND[unit] < EPOCHS[1]
     ticks = float(np.median(steps))
     is_counter = bool((steps == ticks).mean() > COUNTED) and ticks in range(1, SHORTEST_TICKS + 1)
@@ -204,16 +192,20 @@ def _unwrapped(stamps: Real[np.ndarray, " n"]) -> tuple[Real[np.ndarray, " n"], 
     steps = np.diff(stamps)
     if not (steps < 0).any():
         return stamps, 0
-    largest = LONGEST_WRAP * usual_step(np.cumsum(np.maximum(steps, 0)))
-    top = float(stamps.max()) - min(float(stamps.min()), 0.0)
+    usual = usual_step(np.cumsum(np.maximum(steps, 0)))
+    top, misfits = float(stamps.max()) - min(float(stamps.min()), 0.0), dict[float, float]()
     for period in PERIODS:
-        after = steps + period
-        wraps = (steps < -period / 2) & (after >= 0) & (after <= largest)
-        if wraps.any() and period - largest <= top < period:
-            turns = np.concatenate([[0], np.cumsum(wraps)])
-            is_whole = stamps.dtype.kind in "iu" and period == round(period)
-            return stamps + turns * (int(period) if is_whole else period), int(wraps.sum())
-    return stamps, 0
+        after = steps[steps < -period / 2] + period
+        after = after[(after >= 0) & (after <= LONGEST_WRAP * usual)]
+        if len(after) and period - LONGEST_WRAP * usual <= top < period:
+            misfits[period] = abs(float(np.median(after)) - usual)
+    if not misfits:
+        return stamps, 0
+    period = min(misfits, key=lambda period: misfits[period])
+    wraps = (steps < -period / 2) & (steps >= -period) & (steps + period <= LONGEST_WRAP * usual)
+    turns = np.concatenate([[0], np.cumsum(wraps)])
+    is_whole = stamps.dtype.kind in "iu" and period == round(period)
+    return stamps + turns * (int(period) if is_whole else period), int(wraps.sum())
 
 
 def _strays(stamps: Real[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
@@ -240,10 +232,11 @@ def _mixed(sensor: Sensor) -> Bool[np.ndarray, " n"]:
     counts = np.bincount(piece)
     length = counts - np.arange(len(counts)) / len(counts)  # of two equal ones the first is longer
     order = np.argsort(sensor.stamps, kind="stable")
-    left, right = order[:-1], order[1:]
-    shorter = np.where(length[piece[left]] < length[piece[right]], left, right)
+    former, latter = order[:-1], order[1:]
+    is_former = length[piece[former]] < length[piece[latter]]
+    shorter = np.where(is_former, former, latter)
     limit = np.where(counts[piece[shorter]] > 1, NEAR, NEAR_ROW) * usual
-    near = (piece[left] != piece[right]) & (np.diff(sensor.stamps[order]) < limit)
+    near = (piece[former] != piece[latter]) & (np.diff(sensor.stamps[order]) < limit)
     near &= ~_is_same(sensor.where(order))
     hits = np.bincount(piece[np.unique(shorter[near])], minlength=len(counts))
     return ((hits > 0.5 * counts) | (hits > FEW_ROWS))[piece]
@@ -280,8 +273,8 @@ def _even(time: Float[np.ndarray, " n"], name: str, notes: list[str]) -> Float[n
         lengths = np.append(np.diff(time[starts]), np.inf) / sizes
         lengths[-1] = np.median(lengths[:-1]) if len(lengths) > 1 else mean
         lengths = np.where(sizes > 1, np.minimum(lengths, 1.5 * mean), lengths)
-        place = np.arange(len(time)) - np.repeat(starts, sizes)
-        time = np.repeat(time[starts], sizes) + place * np.repeat(lengths, sizes)
+        index = np.arange(len(time)) - np.repeat(starts, sizes)
+        time = np.repeat(time[starts], sizes) + index * np.repeat(lengths, sizes)
         problem = f"{crowded.sum()} samples of {name} share the stamp of a burst or follow at once"
         problem += f" ({shared} have the same stamp): they are spread evenly up to the next one"
         notes.append(f"{problem}, {1 / usual_step(time):.4g} Hz by all samples")

@@ -15,16 +15,8 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from gnio_jax.data.parsing import text as parsing
 from gnio_jax.data.parsing.tables import Table, parsed_as
-from gnio_jax.data.parsing.text import (
-    HEAD,
-    Layout,
-    head_of,
-    is_row,
-    layout_of,
-    shortened,
-    tolerant_frame,
-)
 from gnio_jax.errors import InputError, require_packages
 
 XLS_MAGIC, GZIP_MAGIC = b"\xd0\xcf\x11\xe0", b"\x1f\x8b"
@@ -36,6 +28,10 @@ MOST_TABLES = 200
 _SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".gcsv", ".json")
 
 
+_Content = Callable[[], bytes | None]
+"""A function that gives the text of a table; None: it is that of the file at its path."""
+
+
 class LogFile(NamedTuple):
     """A table of a log, not yet read."""
 
@@ -43,34 +39,30 @@ class LogFile(NamedTuple):
     """Name within a zip, folder or workbook, such as "meta/time.csv"."""
     path: Path
     """Path for messages."""
-    layout: Layout
-    content: Callable[[], bytes | None]
-    """A function that gives its text; None: `path` is the file."""
+    layout: parsing.Layout
+    content: _Content
     read: Callable[[], tuple[Table, list[str]]]
     """A function that gives the table, and notes about what is left out of it."""
 
     @property
-    def place(self) -> PurePosixPath:
+    def location(self) -> PurePosixPath:
         """Its folder and name."""
         return PurePosixPath(self.name)
 
 
 def log_file(
-    name: str,
-    path: Path,
-    content: Callable[[], bytes | None] = lambda: None,
-    head: bytes | None = None,
+    name: str, path: Path, content: _Content = lambda: None, head: bytes | None = None
 ) -> LogFile:
     """A table with the shape that its first bytes `head` have (None: those of `content`)."""
-    layout = layout_of(path, content() if head is None else head)
+    layout = parsing.layout_of(path, content() if head is None else head)
 
     @functools.cache
     def read() -> tuple[Table, list[str]]:
         notes: list[str] = []
-        frame, rows = tolerant_frame(path, layout, content(), notes)
-        if words := [line for line in layout.preamble if is_row(line)]:
+        frame, rows = parsing.tolerant_frame(path, layout, content(), notes)
+        if words := [line for line in layout.preamble if parsing.is_row(line)]:
             problem = f"{len(words)} lines above the header are no rows"
-            notes.append(f"{path.name}: {problem} ('{shortened(words[0], 40)}')")
+            notes.append(f"{path.name}: {problem} ('{parsing.shortened(words[0], 40)}')")
         frame.columns = list(layout.labels or map(str, frame.columns))
         return Table(path, frame, before=layout.before, content=content(), rows=rows), notes
 
@@ -79,7 +71,7 @@ def log_file(
 
 def listed(files: list[LogFile]) -> str:
     """Names of files, for messages."""
-    return shortened(", ".join(file.name for file in files) or "no CSV file", 200)
+    return parsing.shortened(", ".join(file.name for file in files) or "no CSV file", 200)
 
 
 def files_of(path: Path) -> list[LogFile]:
@@ -88,7 +80,7 @@ def files_of(path: Path) -> list[LogFile]:
     if path.is_dir():
         files = sorted(file for file in (*path.glob("*"), *path.glob("*/*")) if file.is_file())
         return _texts(path, {file.relative_to(path).as_posix(): file for file in files})
-    magic = head_of(path)[:4]
+    magic = parsing.head_of(path)[:4]
     if magic == XLS_MAGIC:
         return _sheets(path, "xlrd")
     if magic.startswith(GZIP_MAGIC):
@@ -108,21 +100,18 @@ def files_of(path: Path) -> list[LogFile]:
 
 def _texts(path: Path, members: dict[str, Path | None]) -> list[LogFile]:
     """The tables among the files of a zip (name → None) or folder (name → file)."""
-    files: list[LogFile] = []
-    places = {name: PurePosixPath(name) for name in members}
+    files, problems = list[LogFile](), list[InputError]()
     # macOS adds a file "._Gyroscope.csv" to each Gyroscope.csv.
-    texts = [n for n, p in places.items() if p.suffix.lower() in _SUFFIXES and p.name[0] != "."]
+    hidden = {name for name in members if PurePosixPath(name).name.startswith(".")}
+    texts = [name for name in members if name.lower().endswith(_SUFFIXES) and name not in hidden]
     if len(texts) > MOST_TABLES:
         raise InputError(path, f"holds {len(texts)} CSV files", "give one recording of a logger")
-    problems: list[InputError] = []
     for name in texts:
-        file = members[name]
-        head = _member(path, name, HEAD) if file is None else None
+        file, member = members[name], partial(_member, path, name)
+        head = member(parsing.HEAD) if file is None else None
         try:
-            if file is None:
-                files.append(log_file(name, path / name, partial(_member, path, name), head))
-            else:
-                files.append(log_file(name, file))
+            one = log_file(name, file) if file else log_file(name, path / name, member, head)
+            files.append(one)
         except InputError as error:
             problems.append(error)
     if problems and not files:
@@ -138,10 +127,10 @@ def _member(path: Path, name: str, most: int = -1) -> bytes:
             return file.read(most)
 
 
-def _check_size(size: int, place: Path) -> None:
+def _check_size(size: int, file: Path) -> None:
     if size > LARGEST:
         problem = f"unpacks to {size / 2**20:.0f} MiB"
-        raise InputError(place, problem, f"no table may exceed {LARGEST / 2**20:.0f} MiB")
+        raise InputError(file, problem, f"no table may exceed {LARGEST / 2**20:.0f} MiB")
 
 
 def _sheets(path: Path, engine: str) -> list[LogFile]:

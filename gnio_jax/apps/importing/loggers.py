@@ -13,8 +13,7 @@ Facts of Sensor Logger (Kelvin Choi; Android and iOS), from its documentation
 - All accelerations of iOS have the other sign, unless that setting is on (CROSSPLATFORM.md).
 - `Metadata.csv` says `platform`, ios or android (seen in exports of releases 1.10 and 1.28), and
   since 1.29 `standardisation`, false where that setting is off (seen), true where it is on
-  (assumed). If the file is missing, `TotalAcceleration` shows that it is Android. Otherwise the
-  sign must be stated.
+  (assumed). Without the file, `TotalAcceleration` means Android; else the sign must be stated.
 
 Facts of phyphox (RWTH Aachen; Android and iOS), from its sources (github.com/phyphox):
 
@@ -47,13 +46,12 @@ import pandas as pd
 from gnio_jax.apps.importing.clocks import Sensor, sensor_of
 from gnio_jax.apps.importing.files import LogFile, listed
 from gnio_jax.apps.importing.recording import RawRecording
-from gnio_jax.apps.importing.units import unit_of, unit_text
+from gnio_jax.data.labels import unit_of, unit_text
 from gnio_jax.data.parsing.text import open_text
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
 
 _AXIS = re.compile(r"\b([xyz])\b", re.IGNORECASE)
-_KINDS = ("gyro", "accel", "linear", "gravity", "raw")
 _TURNS = ("rad/s", "deg/s")
 _SENSORS = {
     "Gyroscope": ("gyro", "rad/s"),
@@ -88,15 +86,14 @@ class _Set(NamedTuple):
 def read_logger(path: Path, files: list[LogFile]) -> RawRecording | None:
     """Read a recording exported by either app; None if it is from neither. Raises `InputError` if a
     sensor is missing, or if there is only acceleration without gravity."""
-    stems = {
-        file.place.stem for file in files if {"time", "x", "y", "z"} <= set(file.layout.labels)
-    }
-    if any("seconds_elapsed" in file.layout.labels for file in files) or "Gyroscope" in stems:
+    gyros = [file.layout.labels for file in files if file.location.stem == "Gyroscope"]
+    headers = [file.layout.labels for file in files]
+    if any({"time", "x", "y", "z"} <= set(labels) for labels in gyros) or any(
+        "seconds_elapsed" in labels for labels in headers
+    ):
         return _sensor_logger(path, files)
     # A time in s, and three axes in units of an IMU.
-    if any(
-        any(map(_is_time, file.layout.labels)) and _axes_of(file.layout.labels) for file in files
-    ):
+    if any(any(map(_is_time, labels)) and _axes_of(labels) for labels in headers):
         return _phyphox(path, files)
     return None
 
@@ -105,39 +102,32 @@ def read_logger(path: Path, files: list[LogFile]) -> RawRecording | None:
 
 
 def _sensor_logger(path: Path, files: list[LogFile]) -> RawRecording:
-    parts = [file for file in files if file.place.stem in (*_SENSORS, "Metadata")]
-    folders = sorted({str(part.place.parent) for part in parts if part.place.stem in _SENSORS})
+    parts = [file for file in files if file.location.stem in (*_SENSORS, "Metadata")]
+    sensors = [part for part in parts if part.location.stem in _SENSORS]
+    folders = sorted({str(part.location.parent) for part in sensors})
     if len(folders) > 1:
         raise InputError(path, f"holds {len(folders)} recordings: {', '.join(folders)}", "give one")
-    parts = [part for part in parts if str(part.place.parent) in folders]
-    tables = {part.place.stem: part for part in parts}
+    parts = [part for part in parts if str(part.location.parent) in folders]
+    tables = {part.location.stem: part for part in parts}
     if len(tables) < len(parts):
         raise InputError(path, f"holds a sensor twice ({listed(parts)})", "leave one of them")
     if "Gyroscope" in tables:
         tables.pop("GyroscopeUncalibrated", None)
-    sets = [
-        _Set(kind, unit, tables[name], _clock(tables[name]), ("x", "y", "z"))
-        for name, (kind, unit) in _SENSORS.items()
-        if name in tables
-    ]
-    platform, standard = None, None
+    sets = []
+    for name in [name for name in _SENSORS if name in tables]:
+        clock = "time" if "time" in tables[name].layout.labels else "seconds_elapsed"
+        sets.append(_Set(*_SENSORS[name], tables[name], clock, ("x", "y", "z")))
+    row = {"platform": "android"} if "TotalAcceleration" in tables else {}
     if "Metadata" in tables:
         file = tables["Metadata"]
         with open_text(file.path, file.content()) as text:
             row = next(csv.DictReader(text), {})
-        platform = str(row.get("platform")).strip().lower()
-        setting = str(row.get("standardisation", "false")).strip().lower()
-        standard = {"true": "android", "false": "ios"}.get(setting)
-    elif "TotalAcceleration" in tables:
-        platform = "android"
-    system, sign = {"android": ("Android", "android"), "ios": ("iOS", standard)}.get(
-        platform or "", ("unknown system", None)
-    )
+    setting = str(row.get("standardisation", "false")).strip().lower()
+    standard = {"true": "android", "false": "ios"}.get(setting)
+    systems = {"android": ("Android", "android"), "ios": ("iOS", standard)}
+    platform = str(row.get("platform")).strip().lower()
+    system, sign = systems.get(platform, ("unknown system", None))
     return _recording(path, f"Sensor Logger ({system})", files, sets, sign)
-
-
-def _clock(file: LogFile) -> str:
-    return "time" if "time" in file.layout.labels else "seconds_elapsed"
 
 
 # --- phyphox
@@ -155,11 +145,9 @@ def _phyphox(path: Path, files: list[LogFile]) -> RawRecording:
             raise InputError(path, problem, "export it again")
         for name, unit, axes in sensors:
             # Earlier releases name the sensor by the file alone.
-            names = (name, file.place.stem.lower())
-            kind = next(
-                (k for k in ("linear", "gravity") for n in names if n.startswith(k)), "accel"
-            )
-            sets.append(_Set("gyro" if unit in _TURNS else kind, unit, file, str(time), axes))
+            match = re.search(r"(?:^|\n)(linear|gravity)", f"{name}\n{file.location.stem.lower()}")
+            kind = "gyro" if unit in _TURNS else match[1] if match else "accel"
+            sets.append(_Set(kind, unit, file, str(time), axes))
     return _recording(path, "phyphox", files, sets, "android")
 
 
@@ -175,11 +163,8 @@ def _axes_of(labels: Iterable[str]) -> list[tuple[str, str, tuple[str, ...]]]:
         if unit in (*_TURNS, "m/s2", "g") and axis:
             name = label[: axis.start()].strip().lower()
             sensors.setdefault((name, unit), {}).setdefault(axis[1].lower(), label)
-    return [
-        (name, unit, tuple(axes[axis] for axis in "xyz"))
-        for (name, unit), axes in sensors.items()
-        if len(axes) == 3
-    ]
+    whole = {sensor: axes for sensor, axes in sensors.items() if len(axes) == 3}
+    return [(*sensor, tuple(axes[axis] for axis in "xyz")) for sensor, axes in whole.items()]
 
 
 def _check_pauses(file: LogFile, path: Path) -> None:
@@ -206,19 +191,19 @@ def _recording(
 ) -> RawRecording:
     """The gyro, and the accelerometer with gravity: from a set of its own, or as the sum of the set
     without gravity and that of gravity."""
-    kinds = {kind: [one for one in sets if one.kind == kind] for kind in _KINDS}
-    for sensor, needed in (("gyro", ("gyro",)), ("accelerometer", ("accel", "linear", "raw"))):
-        if not any(kinds[kind] for kind in needed):
+    kinds = {one.kind for one in sets}
+    for sensor, needed in (("gyro", {"gyro"}), ("accelerometer", {"accel", "linear", "raw"})):
+        if not kinds & needed:
             raise InputError(path, f"has no {sensor} (found: {listed(files)})", _REMEDY)
-    (gyro,) = _only("gyro", kinds, path)
-    if kinds["accel"]:
-        parts = _only("accel", kinds, path)
-    elif kinds["linear"] and kinds["gravity"]:
-        parts = _only("linear", kinds, path) + _only("gravity", kinds, path)
-    elif kinds["raw"]:
-        parts = kinds["raw"]
+    gyro = _only("gyro", sets, path)
+    if "accel" in kinds:
+        parts = [_only("accel", sets, path)]
+    elif {"linear", "gravity"} <= kinds:
+        parts = [_only(kind, sets, path) for kind in ("linear", "gravity")]
+    elif "raw" in kinds:
+        parts = [_only("raw", sets, path)]
     else:
-        name = kinds["linear"][0].file.name
+        name = next(one.file.name for one in sets if one.kind == "linear")
         raise InputError(path, f"holds acceleration without gravity ({name})", _REMEDY)
     accel = parts[0].sensor("accel")
     if len(parts) > 1:
@@ -228,20 +213,20 @@ def _recording(
     note = f"{path.name}: {app}; time in {clock}, {gyro.file.name} in {gyro.unit}, {of_accel}"
     remarks = [remark for one in (gyro, *parts) for remark in one.file.read()[1]]
     notes = [note, *dict.fromkeys(remarks)]
-    is_raw = gyro.file.place.stem == "GyroscopeUncalibrated"
+    is_raw = gyro.file.location.stem == "GyroscopeUncalibrated"
     return RawRecording(path, gyro.sensor("gyro"), accel, notes, [], sign, raw_gyro=is_raw)
 
 
-def _only(kind: str, kinds: dict[str, list[_Set]], path: Path) -> list[_Set]:
+def _only(kind: str, sets: list[_Set], path: Path) -> _Set:
     """The only set of a kind. Raises `InputError` if there are several."""
-    sets = kinds[kind]
+    sets = [one for one in sets if one.kind == kind]
     if len(sets) > 1:
         names = ", ".join(f"{one.file.name} ({one.axes[0]})" for one in sets)
         remedy = "leave the table of one of them in it, or export that one alone"
         if path.name == sets[0].file.name:
             remedy = "name the columns of one by --columns"
         raise InputError(path, f"holds {len(sets)} sets of a sensor: {names}", remedy)
-    return sets
+    return sets[0]
 
 
 def _added(motion: Sensor, gravity: Sensor) -> Sensor:

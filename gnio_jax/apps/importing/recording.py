@@ -63,17 +63,12 @@ class RawRecording(NamedTuple):
 
 
 class Imported(NamedTuple):
-    """A recording on a uniform clock."""
+    """A recording on a uniform clock, with a reference if it has one, and its notes and warnings
+    for the user."""
 
     sequence: Sequence
-    """The sequence, with a reference if the recording has one."""
     notes: tuple[str, ...]
-    """Notes for the user about what was detected, assumed or repaired, one sentence each."""
     warnings: tuple[str, ...] = ()
-    """Warnings about problems that may make all results wrong, one sentence each."""
-
-
-# --- from the samples of both sensors to a sequence
 
 
 def as_sequence(
@@ -87,31 +82,67 @@ def as_sequence(
     gyro, accel = _in_si(raw, options, gyro, accel)
     if not np.array_equal(gyro.time, accel.time):
         lost = sum(abs(gyro.time[row] - accel.time[row]) for row in (0, -1))
-        notes.append(
-            "gyro and accel have different stamps: both are interpolated to one clock, and "
-            f"{lost:.2f} s that only one of them covers are cut off"
-        )
+        problem = "gyro and accel have different stamps: both are interpolated to one clock, and"
+        notes.append(f"{problem} {lost:.2f} s that only one of them covers are cut off")
     recorded = max(rounded_rate(gyro.time), rounded_rate(accel.time))
     notes.append(f"put on a uniform clock of {rate or recorded:g} Hz")
     if recorded < SLOW:
-        notes.append(
-            f"it was recorded at {recorded:g} Hz, which is slow: steps need {SLOW:g} Hz, and the "
-            "networks were trained on 100 Hz and more"
-        )
-    about = {"dataset": "csv", "group": name, "truth": "none"}
-    about |= {"imu_compensated": "no"} if raw.raw_gyro else {}
-    streams = Streams(
-        name,
-        str(raw.path),
-        Samples(gyro.time, gyro.values, str(raw.gyro.file)),
-        Samples(accel.time, accel.values, str(raw.accel.file)),
-        about,
-        float(gyro.start),
-    )
+        problem = f"it was recorded at {recorded:g} Hz, which is slow: steps need {SLOW:g} Hz, and"
+        notes.append(f"{problem} the networks were trained on 100 Hz and more")
+    attributes = {"dataset": "csv", "group": name, "truth": "none"}
+    attributes |= {"imu_compensated": "no"} if raw.raw_gyro else {}
+    samples = (Samples(one.time, one.values, str(one.file)) for one in (gyro, accel))
+    streams = Streams(name, str(raw.path), *samples, attributes, float(gyro.start))
     sequence = raw.track and _with_track(streams, rate, raw.track, gyro.start, notes)
     if sequence is None:
         (sequence,) = assemble(streams, rate, whole=True)
     return Imported(sequence, tuple(notes), tuple(dict.fromkeys(raw.warnings)))
+
+
+def _in_si(
+    raw: RawRecording, options: ImportOptions, gyro: Clocked, accel: Clocked
+) -> tuple[Clocked, Clocked]:
+    """Gyro in rad/s and accel in m/s² with Android's sign, each on its own stamps, without repeated
+    rows. Raises `InputError` if a sensor is dead, or if both contradict each other."""
+    notes, warnings = raw.notes, raw.warnings
+    warnings += physics.check_alive(gyro.values, "gyro", gyro.file)
+    warnings += physics.check_alive(accel.values, "accel", accel.file)
+    unit = options.accel_unit or raw.accel.unit
+    scale, doubts = units.accel_scale(accel.values, unit, accel.file, notes)
+    accel = accel._replace(values=accel.values * scale)
+    rows, is_slower = physics.repeats(gyro.time, gyro.values)
+    force = interpolate(gyro.time, accel.time, accel.values)
+    rows &= ~physics.resting(physics.ImuSamples(gyro.time, gyro.values, force), rows)
+    gyro = _without_repeats(gyro, rows, is_slower, raw)
+    accel = _without_repeats(accel, *physics.repeats(accel.time, accel.values), raw)
+    first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
+    if last - first < WINDOW_SECONDS:
+        problem = f"both sensors were recorded for {max(last - first, 0.0):.2f} s, less than the"
+        problem += f" network's window of {WINDOW_SECONDS:g} s"
+        raise InputError(raw.path, problem, "record for longer, both by one clock")
+    inside = (gyro.time >= first) & (gyro.time <= last)
+    force = interpolate(gyro.time[inside], accel.time, accel.values)
+    imu = physics.ImuSamples(gyro.time[inside], gyro.values[inside], force)
+    unit = options.gyro_unit or raw.gyro.unit
+    scale, slowness = units.gyro_scale(imu, unit, gyro.file, notes)
+    imu = imu._replace(gyro=imu.gyro * scale)
+    warnings += doubts + slowness + physics.check_turning(imu, gyro.file)
+    is_doubtful = gyro.is_doubtful or accel.is_doubtful
+    if is_doubtful and not physics.is_supported(*physics.agreement(imu)):
+        problem = f"field 'time' makes it run at {rounded_rate(imu.time):g} Hz, which may be wrong"
+        remedy = "if that is right, state its unit by --time-unit, or give --sample-rate (Hz)"
+        raise InputError(gyro.file, problem, remedy)
+    sign = options.accel_sign or raw.sign
+    if sign is None:
+        problem = "the sign of field 'accel' depends on the phone's system, which is not known here"
+        raise InputError(accel.file, problem, "state it: android, ios or detect")
+    force = units.signed(accel.values, sign, accel.file, notes)
+    upward = units.note_gravity(accel.time, force, accel.file, notes)
+    if upward == "-z" and options.accel_sign is None and raw.sign_is_assumed:
+        problem = f"gravity reads on -z in {accel.file.name}: the screen points down, or this is"
+        remedy = "compare with --accel-sign ios"
+        warnings.append(f"sign: {problem} iOS's sign and the track is wrong: {remedy}")
+    return gyro._replace(values=gyro.values * scale), accel._replace(values=force)
 
 
 def _without_repeats(
@@ -129,8 +160,8 @@ def _without_repeats(
         remedy = f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz"
         raise InputError(file, f"{name} runs at {rate:.3g} Hz without repeated values", remedy)
     elif rows.any() and gaps.max() > WINDOW_SECONDS:
-        place = f"{gaps.max():.2f} s after {samples.time[np.argmax(gaps)]:.2f} s"
-        problem = f"{name} repeats the same values for {place}: it was stuck"
+        problem = f"{name} repeats the same values for {gaps.max():.2f} s after"
+        problem += f" {samples.time[np.argmax(gaps)]:.2f} s: it was stuck"
         raise InputError(file, problem, "cut the recording there")
     elif rows.any():
         raw.warnings.append(f"sensors: {problem}: it was stuck, and they are left out")
@@ -141,63 +172,16 @@ def _without_repeats(
     return samples
 
 
-def _in_si(
-    raw: RawRecording, options: ImportOptions, gyro: Clocked, accel: Clocked
-) -> tuple[Clocked, Clocked]:
-    """Gyro in rad/s and accel in m/s² with Android's sign, each on its own stamps, without repeated
-    rows. Raises `InputError` if a sensor is dead, or if both contradict each other."""
-    gyro_file, accel_file, notes, warnings = gyro.file, accel.file, raw.notes, raw.warnings
-    warnings += physics.check_alive(gyro.values, "gyro", gyro_file)
-    warnings += physics.check_alive(accel.values, "accel", accel_file)
-    unit = options.accel_unit or raw.accel.unit
-    scale = units.accel_scale(accel.values, unit, accel_file, notes, warnings)
-    accel = accel._replace(values=accel.values * scale)
-    rows, is_slower = physics.repeats(gyro.time, gyro.values)
-    force = interpolate(gyro.time, accel.time, accel.values)
-    rows &= ~physics.resting(physics.ImuSamples(gyro.time, gyro.values, force), rows)
-    gyro = _without_repeats(gyro, rows, is_slower, raw)
-    accel = _without_repeats(accel, *physics.repeats(accel.time, accel.values), raw)
-    first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
-    if last - first < WINDOW_SECONDS:
-        problem = f"both sensors were recorded for {max(last - first, 0.0):.2f} s, less than the"
-        problem += f" network's window of {WINDOW_SECONDS:g} s"
-        raise InputError(raw.path, problem, "record for longer, both by one clock")
-    inside = (gyro.time >= first) & (gyro.time <= last)
-    time = gyro.time[inside]
-    force = interpolate(time, accel.time, accel.values)
-    imu = physics.ImuSamples(time, gyro.values[inside], force)
-    unit = options.gyro_unit or raw.gyro.unit
-    scale = units.gyro_scale(imu, unit, gyro_file, notes, warnings)
-    imu = imu._replace(gyro=imu.gyro * scale)
-    warnings += physics.check_turning(imu, gyro_file)
-    if gyro.is_doubtful or accel.is_doubtful:
-        if not physics.is_supported(*physics.agreement(imu)):
-            problem = f"field 'time' makes it run at {rounded_rate(time):g} Hz, which may be wrong"
-            remedy = "if that is right, state its unit by --time-unit, or give --sample-rate (Hz)"
-            raise InputError(gyro_file, problem, remedy)
-    sign = options.accel_sign or raw.sign
-    if sign is None:
-        problem = "the sign of field 'accel' depends on the phone's system, which is not known here"
-        raise InputError(accel_file, problem, "state it: android, ios or detect")
-    force = units.signed(accel.values, sign, accel_file, notes)
-    upward = units.note_gravity(accel.time, force, accel_file, notes)
-    if upward == "-z" and options.accel_sign is None and raw.sign_is_assumed:
-        warnings.append(
-            f"sign: gravity reads on -z in {accel_file.name}: the screen points down, or this "
-            "is iOS's sign and the track is wrong: compare with --accel-sign ios"
-        )
-    return gyro._replace(values=gyro.values * scale), accel._replace(values=force)
-
-
 def _with_track(
     streams: Streams, rate: float | None, track: Track, start: Fraction, notes: list[str]
 ) -> Sequence | None:
     """The recording with the reference; None if that is no valid reference, or does not describe
     the motion of the IMU."""
     poses = track.poses._replace(time=track.poses.time + float(track.start - start))
-    about = streams.attributes | {"truth": track.name}
+    attributes = streams.attributes | {"truth": track.name}
+    streams = streams._replace(poses=poses, attributes=attributes)
     try:
-        (sequence,) = assemble(streams._replace(poses=poses, attributes=about), rate, whole=True)
+        (sequence,) = assemble(streams, rate, whole=True)
         # A reference that fails the self-check is not used.
         if failures := self_check(sequence, pedestrian=False).failures:
             problem = f"the reference {track.name} does not fit the IMU ({'; '.join(failures)})"

@@ -15,6 +15,7 @@ bag.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
@@ -22,11 +23,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from jaxtyping import Float, Int
 
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.recording import RawRecording, Track
+from gnio_jax.config import ImportOptions
 from gnio_jax.data.parsing.stamps import seconds
 from gnio_jax.data.parsing.tables import parsed_as, shortened
 from gnio_jax.data.readers.euroc import SensorPose, moved_to
@@ -51,32 +52,22 @@ _GEOMETRY = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamp
 POSES = (*(f"geometry_msgs/msg/{name}" for name in _GEOMETRY), "nav_msgs/msg/Odometry")
 
 
-class Topics(NamedTuple):
-    """Topics that the user names; None takes the only one."""
-
-    imu: str | None = None
-    accel: str | None = None
-    """Topic of sensor_msgs/Imu of the accelerometer, if it is another one."""
-    reference: str | None = None
-    """Topic of poses; "/tf:CHILD_FRAME" for transforms."""
-
-
-def read_bag(path: Path, kind: str, topics: Topics) -> RawRecording:
+def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
     """The IMU of a bag of one of `KINDS`, and its reference if there is one. Of several topics of
-    `sensor_msgs/Imu` one must be named, and of several topics of poses none is taken that is not.
-    Raises `InputError` that names the existing topics."""
-    notes: list[str] = []
+    `sensor_msgs/Imu` one must be named, and of several topics of poses none is taken that is not;
+    "/tf:CHILD_FRAME" names transforms. Raises `InputError` that names the existing topics."""
+    notes, warnings = list[str](), list[str]()
     with _opened(path, kind) as bag:
-        imu = _imu_topic(bag, topics.imu)
-        other = imu if topics.accel is None else _imu_topic(bag, topics.accel)
-        reference, child = _reference_topic(bag, topics.reference, notes)
+        imu = _imu_topic(bag, options.imu_topic)
+        other = _imu_topic(bag, options.accel_topic) if options.accel_topic else imu
+        reference = _reference_topic(bag, options.reference_topic, notes)
         samples, poses, mounts = _collected(bag, {imu.name, other.name}, reference)
     of_gyro, of_accel = samples[imu.name], samples[other.name]
     gyro, accel = of_gyro.sensor("gyro", imu.name, path), of_accel.sensor("accel", other.name, path)
     if of_gyro.by_headers != of_accel.by_headers:
         problem = f"topics {imu.name} and {other.name} are stamped by different clocks"
         raise InputError(path, problem, "name other topics")
-    clock, warnings = "headers" if of_gyro.by_headers else "bag: its headers have no time", []
+    clock = "headers" if of_gyro.by_headers else "bag: its headers have no time"
     if not of_gyro.by_headers and of_gyro.headers.all():
         clock, problem = "bag", f"the headers of {imu.name} run {of_gyro.pace:.3g} times as fast as"
         warnings.append(f"clock: {path.name}: {problem} the bag's clock, whose stamps are taken")
@@ -86,10 +77,11 @@ def read_bag(path: Path, kind: str, topics: Topics) -> RawRecording:
     track = None
     if reference is not None:
         try:
-            track = _track(poses, mounts, reference.name, child, of_gyro, path, notes)
-            track = track._replace(named=topics.reference is not None)
+            name = options.reference_topic or reference.name
+            track = _track(name, poses, mounts, of_gyro, path, notes)
+            track = track._replace(named=options.reference_topic is not None)
         except InputError as error:
-            if topics.reference is not None:
+            if options.reference_topic is not None:
                 raise
             notes.append(f"{path.name}: no reference is taken: {error}")
     return RawRecording(path, gyro, accel, notes, warnings, "android", track=track)
@@ -100,8 +92,7 @@ def read_bag(path: Path, kind: str, topics: Topics) -> RawRecording:
 
 class _Topic(NamedTuple):
     name: str
-    type: str
-    """Type, as in ROS 2: sensor_msgs/msg/Imu."""
+    type: str  # as in ROS 2: sensor_msgs/msg/Imu
     count: int
 
 
@@ -144,7 +135,12 @@ def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
     from rosbags import rosbag1, rosbag2
 
     if kind == "rosbag2" and path.is_dir():
-        _check_compression(path)
+        text = (path / "metadata.yaml").read_text(encoding="utf-8")
+        if re.search(r"\bcompression_mode:\s*['\"]?file\b", text, re.IGNORECASE):
+            # The library would unpack its files to the disk, at any size. (It unpacks single
+            # messages in memory, one by one.)
+            remedy = "unpack its file (zstd -d FILE.zstd) and import that"
+            raise InputError(path, "is compressed as a whole (compression_mode FILE)", remedy)
     elif kind == "rosbag2" and set("%?#") & set(path.name):  # SQLite would open another file
         raise InputError(path, "has %, ? or # in its name", "rename it")
     reader = stack.enter_context((rosbag1 if kind == "rosbag1" else rosbag2).Reader(path))
@@ -158,17 +154,6 @@ def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
 
     connections = ((one.topic, one.msgtype, one.msgcount) for one in reader.connections)
     return _Bag(path, _joined(connections), messages)
-
-
-def _check_compression(path: Path) -> None:
-    """Raise `InputError` for a bag whose files are compressed as a whole: the library would unpack
-    them to the disk, at any size. (It unpacks single messages in memory, one by one.)"""
-    node = yaml.safe_load((path / "metadata.yaml").read_text(encoding="utf-8"))
-    for key in ("rosbag2_bagfile_information", "compression_mode"):
-        node = node.get(key) if isinstance(node, dict) else None
-    if str(node).lower() == "file":
-        remedy = "unpack its file (zstd -d FILE.zstd) and import that"
-        raise InputError(path, "is compressed as a whole (compression_mode FILE)", remedy)
 
 
 def _mcap(path: Path, stack: ExitStack) -> _Bag:
@@ -213,8 +198,7 @@ def _joined(connections: Iterable[tuple[str, str, int]]) -> dict[str, _Topic]:
     several."""
     topics: dict[str, _Topic] = {}
     for topic, kind, count in connections:
-        package, _, rest = kind.partition("/")
-        kind = f"{package}/msg/{rest}" if rest and "/" not in rest else kind
+        kind = re.sub("^([^/]+)/([^/]+)$", r"\1/msg/\2", kind)
         count += topics[topic].count if topic in topics else 0
         topics[topic] = _Topic(topic, kind, count)
     return topics
@@ -232,9 +216,7 @@ def _decoder(encoding: str) -> Callable[[bytes, str], Any]:
 
 
 def _imu_topic(bag: _Bag, name: str | None) -> _Topic:
-    if name is not None:
-        return _named(bag, name, (IMU,), "IMU")
-    topics = _of_types(bag, (IMU,))
+    topics = _topics(bag, name, (IMU,), "IMU")
     if not topics:
         remedy = f"its topics: {_listed(bag.topics.values())}"
         raise InputError(bag.path, "has no topic of sensor_msgs/Imu", remedy)
@@ -244,34 +226,29 @@ def _imu_topic(bag: _Bag, name: str | None) -> _Topic:
     return topics[0]
 
 
-def _reference_topic(bag: _Bag, name: str | None, notes: list[str]) -> tuple[_Topic | None, str]:
-    """The topic, and the requested child frame ("" for any)."""
-    if name is not None:
-        topic, _, child = name.partition(":")
-        return _named(bag, topic, (*POSES, *TRANSFORMS), "pose"), child
-    poses, topics = _of_types(bag, POSES), _of_types(bag, (*POSES, *TRANSFORMS))
-    if len(poses) == 1:
-        return poses[0], ""
-    if topics:
+def _reference_topic(bag: _Bag, name: str | None, notes: list[str]) -> _Topic | None:
+    """The topic of a reference, or of "topic:frame"; None if there is none, or none is chosen."""
+    topic = name.partition(":")[0] if name else None
+    topics = _topics(bag, topic, (*POSES, *TRANSFORMS), "pose")
+    poses = topics if topic else [topic for topic in topics if topic.type in POSES]
+    if topics and len(poses) != 1:
         remedy = f"--reference-topic may be {_listed(topics)}"
         notes.append(f"{bag.path.name}: no reference is taken; {remedy}")
-    return None, ""
+    return poses[0] if len(poses) == 1 else None
 
 
-def _of_types(bag: _Bag, types: tuple[str, ...]) -> list[_Topic]:
-    return [topic for topic in bag.topics.values() if topic.type in types and topic.count]
-
-
-def _named(bag: _Bag, name: str, types: tuple[str, ...], what: str) -> _Topic:
-    """The topic of this name, which must be of one of the types."""
+def _topics(bag: _Bag, name: str | None, types: tuple[str, ...], what: str) -> list[_Topic]:
+    """The topics of these types that have messages, or the one of this name."""
+    topics = [topic for topic in bag.topics.values() if topic.type in types and topic.count]
+    if name is None:
+        return topics
     if name not in bag.topics:
         remedy = f"its topics: {_listed(bag.topics.values())}"
         raise InputError(bag.path, f"has no topic '{name}'", remedy)
-    chosen = bag.topics[name]
-    if chosen.type not in types:
-        remedy = f"{what} topics: {_listed(_of_types(bag, types))}"
-        raise InputError(bag.path, f"topic {name} is {chosen.type}, no {what}", remedy)
-    return chosen
+    if bag.topics[name].type not in types:
+        problem = f"topic {name} is {bag.topics[name].type}, no {what}"
+        raise InputError(bag.path, problem, f"{what} topics: {_listed(topics)}")
+    return [bag.topics[name]]
 
 
 def _listed(topics: Iterable[_Topic]) -> str:
@@ -285,25 +262,19 @@ def _listed(topics: Iterable[_Topic]) -> str:
 class _Pose(NamedTuple):
     """One pose of a message, whose frame of the body is "" if the message does not name it."""
 
-    stamp: int
-    """Stamp of the message, ns; 0 if it has none."""
-    logged: int
-    """Stamp of the bag, ns."""
+    stamp: int  # of the message, ns; 0 if it has none
+    logged: int  # the bag's, ns
     parent: str
     child: str
-    values: tuple[float, ...]
-    """Position m, quaternion wxyz."""
+    values: tuple[float, ...]  # position m, quaternion wxyz
 
 
 class _Imu(NamedTuple):
     """An IMU topic as arrays of numbers, because a decoded message takes a kilobyte."""
 
-    first: Any
-    """Its first message."""
-    headers: Int[np.ndarray, " n"]
-    """Stamps of the headers, ns."""
-    logged: Int[np.ndarray, " n"]
-    """Stamps of the bag, ns."""
+    first: Any  # its first message
+    headers: Int[np.ndarray, " n"]  # stamps of the headers, ns
+    logged: Int[np.ndarray, " n"]  # stamps of the bag, ns
     values: Float[np.ndarray, "n 6"]
 
     @property
@@ -315,8 +286,8 @@ class _Imu(NamedTuple):
     @property
     def by_headers(self) -> bool:
         """Whether the headers have stamps that run as the bag's; otherwise these are used."""
-        late = abs(self.pace - 1.0) * np.ptp(self.logged) / 1e9
-        is_same = abs(self.pace - 1.0) < SAME_PACE or late < DELAY
+        drift = abs(self.pace - 1.0)
+        is_same = drift < SAME_PACE or drift * np.ptp(self.logged) / 1e9 < DELAY
         return bool(self.headers.all() and is_same)
 
     def sensor(self, name: str, topic: str, path: Path) -> Sensor:
@@ -384,10 +355,9 @@ def _poses(message: Any, logged: int) -> Iterator[_Pose]:
     pose = message
     while hasattr(pose, "pose"):  # stamped, with covariance, or both
         pose = pose.pose
-    if hasattr(pose, "transform"):
-        point, turn = pose.transform.translation, pose.transform.rotation
-    else:
-        point, turn = pose.position, pose.orientation
+    pose = getattr(pose, "transform", pose)
+    point = pose.translation if hasattr(pose, "translation") else pose.position
+    turn = pose.rotation if hasattr(pose, "rotation") else pose.orientation
     values = point.x, point.y, point.z, turn.w, turn.x, turn.y, turn.z
     yield _Pose(_stamp(message), logged, parent, child, values)
 
@@ -396,15 +366,10 @@ def _poses(message: Any, logged: int) -> Iterator[_Pose]:
 
 
 def _track(
-    poses: list[_Pose],
-    mounts: _Mounts,
-    topic: str,
-    child: str,
-    imu: _Imu,
-    path: Path,
-    notes: list[str],
+    name: str, poses: list[_Pose], mounts: _Mounts, imu: _Imu, path: Path, notes: list[str]
 ) -> Track:
-    """The poses of a topic, or of its frame `child`, converted to those of the IMU's frame."""
+    """The poses of a "topic", or of a "topic:frame", converted to those of the IMU's frame."""
+    topic, _, child = name.partition(":")
     rows = [pose for pose in poses if child in ("", pose.child)]
     children = sorted({pose.child for pose in poses})
     if not rows or (len(children) > 1 and not child):
@@ -413,11 +378,11 @@ def _track(
     is_stamped = imu.by_headers and all(pose.stamp for pose in rows)
     stamps = np.array([pose.stamp if is_stamped else pose.logged for pose in rows], dtype=np.int64)
     if imu.by_headers and not is_stamped:
-        notes.append(
-            f"{path.name}: {topic} has no stamps in its headers, so those of the bag are taken. "
-            "The IMU has its own. The reference is off by the delay between both clocks"
+        problem = (
+            f"{path.name}: {topic} has no stamps in its headers, so those of the bag are taken"
         )
-    name = f"{topic}:{child}" if child else topic
+        delay = "The reference is off by the delay between both clocks"
+        notes.append(f"{problem}. The IMU has its own. {delay}")
     source, start = f"{path}: topic {name}", int(stamps.min())
     values = np.array([pose.values for pose in rows], dtype=np.float64)
     valid = finite_rows(values)
@@ -434,10 +399,8 @@ def _track(
     body, frame = rows[0].child, imu.first.header.frame_id
     mount = _mount(body.lstrip("/"), frame.lstrip("/"), mounts)
     if mount is None:
-        notes.append(
-            f"{path.name}: {name} gives the poses of '{body or 'an unnamed frame'}', the IMU is in "
-            f"'{frame}', and no static transform joins them: taken as one"
-        )
+        problem = f"{path.name}: {name} gives the poses of '{body or 'an unnamed frame'}', the IMU"
+        notes.append(f"{problem} is in '{frame}', and no static transform joins them: taken as one")
     elif body != frame:
         notes.append(f"{path.name}: {name} moved from '{body}' to '{frame}' by /tf_static")
     return Track(name, moved_to(mount or SensorPose(), track), Fraction(start, 10**9))

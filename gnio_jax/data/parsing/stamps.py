@@ -24,8 +24,7 @@ MOST_APART = 10
 """Number of neighbours in time that are not neighbours in the file, per step back in time, above
 which samples of two clocks are mixed (ours). A block of rows in the wrong place has three."""
 LONGEST_STEP = 60.0
-"""Steps longer than this many mean steps between different stamps are holes, and no part of the
-rate (ours)."""
+"""Steps longer than so many mean steps between different stamps are holes, not part of a rate."""
 SAME_RATE = 0.02
 """Largest difference of the rates by the mean and by the median step (ours)."""
 CROWDED = 0.5

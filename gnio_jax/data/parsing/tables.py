@@ -20,14 +20,7 @@ from jaxtyping import Bool, Float, Int, Num
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
-from gnio_jax.data.parsing.text import (
-    check_kind,
-    head_of,
-    is_row,
-    layout_of,
-    open_text,
-    strict_frame,
-)
+from gnio_jax.data.parsing.text import head_of, is_row, layout_of, open_text, strict_frame
 from gnio_jax.data.parsing.text import shortened as shortened
 from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, check_increasing
 from gnio_jax.errors import InputError, require_packages
@@ -38,8 +31,6 @@ if TYPE_CHECKING:
 
 LARGEST_RATIO = 100
 """Largest ratio of the size of a compressed field of HDF5 in memory to that in the file."""
-OURS = (AssertionError, NameError, ImportError)
-"""Errors that no damaged file causes in a parser: they are ours, or those of the installation."""
 
 
 def damaged(path: object, problem: str) -> InputError:
@@ -53,14 +44,14 @@ def parsed_as(path: Path, kind: str) -> Iterator[None]:
     because otherwise our own errors would be reported as damage of the file."""
     try:
         yield
-    except (InputError, *OURS):
-        raise
+    except (InputError, AssertionError, NameError, ImportError):
+        raise  # no damaged file causes these: they are ours, or those of the installation
     except MemoryError:
         problem = f"does not fit into memory as {kind}"
         raise InputError(path, problem, "if it should be smaller, copy it again") from None
     except Exception as error:  # a damaged file may cause any other error in a parser
         if path.is_file():
-            check_kind(path, head_of(path))
+            head_of(path)
         reason = f"it may be cut short ({shortened(error, 200)})"
         raise damaged(path, f"cannot be read as {kind}, {reason}") from None
 
@@ -101,8 +92,8 @@ class Table(NamedTuple):
         values = np.stack(parts, axis=1) if len(parts) > 1 else parts[0]
         finite = np.isfinite(values)
         if not gaps and not finite.all():
-            row, *place = np.argwhere(~finite)[0].tolist()
-            name = names[place[0] if len(names) > 1 else 0]
+            row, *axis = np.argwhere(~finite)[0].tolist()
+            name = names[axis[0] if len(names) > 1 else 0]
             count = (~finite.reshape(len(finite), -1)).any(axis=1).sum()
             problem = f"is NaN or Inf in {count} rows, first in row {self.row(row)}"
             remedy = "repair or cut the recording there"
@@ -210,11 +201,9 @@ class Table(NamedTuple):
 
 def text_of(path: Path) -> str:
     """The content of a text file, without a byte order mark."""
-    check_kind(path, head_of(path))
+    head_of(path)
     try:
         return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
         raise damaged(path, f"is no text ({shortened(error)})") from None
 
@@ -313,10 +302,8 @@ def read_npy(path: Path, names: Mapping[str, slice], width: int) -> Table:
     if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
         problem = f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})"
         raise damaged(path, problem)
-    columns = {name: np.asarray(table[:, place]) for name, place in names.items()}
-    fields = {
-        name: field[:, 0] if field.shape[1] == 1 else field for name, field in columns.items()
-    }
+    fields = {name: np.asarray(table[:, columns]) for name, columns in names.items()}
+    fields = {n: field[:, 0] if field.shape[1] == 1 else field for n, field in fields.items()}
     return Table(path, fields, "field")
 
 

@@ -34,6 +34,7 @@ SEPARATORS = (",", ";", "\t", "|", " ")
 _MARK = re.compile(r"^\s*(#|//|%|@|!)+\s*")
 _DIGITS = r"[+\-\u2212]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
 _NUMBER = re.compile(_DIGITS, re.IGNORECASE)
+_THOUSANDS = r"[+-]?[1-9]\d{0,2}(\.\d{3})+(,\d*)?"
 
 
 class Layout(NamedTuple):
@@ -65,17 +66,6 @@ def shortened(text: object, most: int = 80) -> str:
 # --- from bytes to lines
 
 
-def check_kind(path: object, head: bytes) -> None:
-    """Raise `InputError` for a file that begins as no recording does."""
-    start = head[:512].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
-    if start.startswith(b"version https://git-lfs"):
-        raise InputError(path, "is a pointer of Git LFS, not the data", "get it by git lfs pull")
-    if start.startswith(b"<"):
-        raise InputError(path, "is a web page or XML, not the data", "download the file itself")
-    if re.match(rb'[\[{]\s*["\[{\]}]', start):
-        raise InputError(path, "is JSON", "export the recording as CSV")
-
-
 def encoding_of(path: object, head: bytes) -> str:
     """The encoding of a text by its first bytes: UTF-8 or UTF-16, else the code page of Windows.
     Raises `InputError` if it is no text."""
@@ -94,14 +84,21 @@ def encoding_of(path: object, head: bytes) -> str:
 
 
 def head_of(path: Path, content: bytes | None = None) -> bytes:
-    """The first bytes of a file, or of `content` instead. Raises `InputError`."""
-    if content is not None:
-        return content[:HEAD]
+    """The first bytes of a file, or of `content` instead. Raises `InputError`, also for a file that
+    begins as no recording does."""
     try:
-        with path.open("rb") as file:
-            return file.read(HEAD)
+        with path.open("rb") if content is None else io.BytesIO(content) as file:
+            head = file.read(HEAD)
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
+    start = head[:512].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    if start.startswith(b"version https://git-lfs"):
+        raise InputError(path, "is a pointer of Git LFS, not the data", "get it by git lfs pull")
+    if start.startswith(b"<"):
+        raise InputError(path, "is a web page or XML, not the data", "download the file itself")
+    if re.match(rb'[\[{]\s*["\[{\]}]', start):
+        raise InputError(path, "is JSON", "export the recording as CSV")
+    return head
 
 
 def open_text(path: Path, content: bytes | None = None) -> io.TextIOWrapper:
@@ -146,19 +143,18 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
     numbers in rows of the same length; the header is the line above the rows with as many cells, no
     number and the most names. Raises `InputError` if it is no text or too wide."""
     head = head_of(path, content)
-    check_kind(path, head)
     encoding = encoding_of(path, head)
     lines = head.decode(encoding, errors="replace").splitlines()
     lines = lines[:-1] if len(head) == HEAD and len(lines) > 1 else lines  # it may be cut
     stated = re.match(r'\W*sep=(.)"?\s*$', lines[0], re.IGNORECASE) if lines else None
     marks = [separator] if separator else [stated[1]] if stated else SEPARATORS
-    mark, rows, score, width = marks[0], [], 0, 0
+    mark, rows, data = marks[0], list[list[str]](), list[int]()
     for most in sorted({min(FIRST_LINES, len(lines)), len(lines)}):
         tables = {mark: [cells_of(line, mark) for line in lines[:most]] for mark in marks}
         scores = {mark: _score(rows) for mark, rows in tables.items()}
         mark = max(marks, key=lambda mark: scores[mark][0])
-        rows, (score, width) = tables[mark], scores[mark]
-        if score:
+        rows, data = tables[mark], scores[mark][1]
+        if data:
             break
     else:  # a header without rows, or a table of words
         first = next((n for n, line in enumerate(lines) if is_row(line)), len(lines) - 1)
@@ -166,9 +162,8 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
         mark = separator or max(SEPARATORS[:-1], key=line.count)
         labels = tuple(cells_of(line, mark if mark in line else " "))
         return Layout(encoding, mark, ".", labels, (), first + 1, len(labels), ())
-    if width > MOST_COLUMNS:
+    if (width := len(rows[data[0]])) > MOST_COLUMNS:
         raise InputError(path, f"has {width} columns", f"{MOST_COLUMNS} are the most")
-    data = [n for n, cells in enumerate(rows) if len(cells) == width and _is_data(cells)]
     filled = max(n + 1 for row in data for n, cell in enumerate(rows[row]) if cell)
     headers: dict[int, tuple[str, ...]] = {}
     for number in range(data[0] - 1, -1, -1):
@@ -186,18 +181,18 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
     return Layout(encoding, mark, decimal, labels, others, data[0], width, tuple(preamble))
 
 
-def _is_data(cells: list[str]) -> bool:
-    """Whether most of the cells of a line are numbers."""
-    numbers = sum(bool(_NUMBER.fullmatch(cell)) for cell in cells)
-    return len(cells) > 1 and 2 * numbers > sum(map(bool, cells))
+def _count_numbers(cells: list[str]) -> int:
+    """Number of numbers in a line, if most of its cells are that; otherwise 0."""
+    count = sum(bool(_NUMBER.fullmatch(cell)) for cell in cells)
+    return count if len(cells) > 1 and 2 * count > sum(map(bool, cells)) else 0
 
 
-def _score(rows: list[list[str]]) -> tuple[int, int]:
-    """Number of numbers in rows of the usual width, and this width."""
-    rows = [cells for cells in rows if _is_data(cells)]
-    width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
-    cells = (cell for row in rows if len(row) == width for cell in row)
-    return sum(bool(_NUMBER.fullmatch(cell)) for cell in cells), width
+def _score(rows: list[list[str]]) -> tuple[int, list[int]]:
+    """Number of numbers in the rows of the usual width, and these rows."""
+    counts = [_count_numbers(cells) for cells in rows]
+    widths = Counter(len(cells) for cells, n in zip(rows, counts, strict=True) if n).most_common(1)
+    data = [n for n, cells in enumerate(rows) if counts[n] and len(cells) == widths[0][0]]
+    return sum(counts[n] for n in data), data
 
 
 # --- from the shape to columns
@@ -260,14 +255,14 @@ def tolerant_frame(
             (n for n, label in enumerate(layout.labels, 1) if label), default=width
         )
         damaged = (missing < 0) | (missing > unnamed)  # separators end some rows
-        wider = [len(cells) for cells in rows if len(cells) > width and _is_data(cells)]
+        wider = [len(cells) for cells in rows if len(cells) > width and _count_numbers(cells)]
         is_mixed = len(wider) > 1 and len(set(wider)) == 1  # rows of another kind are no damage
         frame = pd.DataFrame([[*cells, *[""] * width][:width] for cells in rows])
         frame = frame.replace("", np.nan)
-    columns = {place: frame[place] for place in frame}
-    for place, column in columns.items():
+    columns = {index: frame[index] for index in frame}
+    for index, column in columns.items():
         if column.dtype.kind == "O":
-            columns[place], valid = _typed(column, damaged)
+            columns[index], valid = _typed(column, damaged, layout.decimal)
             damaged = damaged | ~valid
     if damaged.any():
         number, cells = next(islice(rows_of(path, layout, content), int(np.argmax(damaged)), None))
@@ -281,10 +276,12 @@ def tolerant_frame(
 
 
 def _typed(
-    column: pd.Series, damaged: Bool[np.ndarray, " n"]
+    column: pd.Series, damaged: Bool[np.ndarray, " n"], decimal: str
 ) -> tuple[pd.Series, Bool[np.ndarray, " n"]]:
     """A column of cells as numbers or times, if most are that, and which of them are."""
     text = column.astype(str).str.strip(" \"'\0").str.replace("\u2212", "-")
+    if decimal == "," and text[text.str.contains(".", regex=False)].str.fullmatch(_THOUSANDS).all():
+        text = text.str.replace(".", "")
     blank = column.isna().to_numpy() | text.str.lower().isin(["", "nan"]).to_numpy()
     least = NUMERIC_SHARE * max((~blank & ~damaged).sum(), 1)
     numbers = pd.Series(pd.to_numeric(text.str.replace(",", "."), errors="coerce"))

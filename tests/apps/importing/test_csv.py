@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.apps.importing import read_imported, write_imported
-from gnio_jax.apps.importing.units import unit_of, unit_text
+from gnio_jax.data.labels import unit_of, unit_text
 from gnio_jax.data.readers import csv_files
 from tests.support import known_walk
 from tests.support.csv_writers import AXES, SECONDS, compare_imu, imu, write, write_native

@@ -10,7 +10,7 @@ import openpyxl
 import pytest
 
 from gnio_jax.apps.importing import units
-from gnio_jax.apps.importing.columns import resolved
+from gnio_jax.data.labels import resolved
 from gnio_jax.errors import InputError
 from tests.support.csv_writers import AXES, compare_imu
 from tests.support.importing import import_recording, imported, refused
@@ -495,7 +495,7 @@ def test_units_of_a_header_and_counts(tmp_path):
     check(put(tmp_path, table(header=("time [s]", *names), gyro=DEGREES * 1e3, accel=100.0)))
     names = [f"g_{a} (deg/s)" for a in "xyz"] + [f"a_{a} (LSB)" for a in "xyz"]
     path = put(tmp_path, table(header=("time", *names), gyro=DEGREES, accel=16384 / G))
-    refused(path, "column 'a_x .LSB.' is in 'LSB', .* raw counts as in 131/deg/s or 16384/g")
+    refused(path, "column 'a_x .LSB.' is in 'LSB', .* raw counts: --accel-unit 16384/g")
     check(path, options={"accel_unit": "16384/g"})
     path = put(tmp_path, table(gyro=DEGREES * 131, accel=16384 / G, digits=0))
     refused(path, "raw counts. 16384 per g is the scale of ±2 g: --accel-unit 16384/g$")
@@ -518,10 +518,10 @@ def test_a_scale_is_a_unit_counts_in_it_or_the_size_of_one():
         ("131/deg/s", np.pi / 180 / 131),
         ("0.07*deg/s", 0.07 * np.pi / 180),
     ):
-        assert units.scale_of(text, units.GYRO_UNITS, "gyro_unit") == pytest.approx(value)
+        assert units.scale_of(text, "gyro") == pytest.approx(value)
     for text in ("", "deg", "131", "-1/deg/s", "1e400*deg/s", "nan*deg/s"):
         with pytest.raises(InputError, match="gyro_unit: unknown value"):
-            units.scale_of(text, units.GYRO_UNITS, "gyro_unit")
+            units.scale_of(text, "gyro")
 
 
 # --- rows of several sensors
