@@ -239,7 +239,8 @@ def _columns(
         remedy = f"if it has no column of time, give --sample-rate HZ; {remedy}"
     check_columns(path, headings, single, remedy)
     if words := [f"{n}={c}" for n, c in columns.items() if c != names.get(n, n)]:
-        notes.append(f"{path.name}: columns taken by their names: {' '.join(words)}")
+        key = "places" if is_numbered else "names"
+        notes.append(f"{path.name}: columns taken by their {key}: {' '.join(words)}")
     return columns
 
 
@@ -258,14 +259,14 @@ def _by_place(frame: pd.DataFrame, sensor: str | None) -> dict[str, str]:
 def _check_one_imu(frame: pd.DataFrame, columns: dict[str, str], path: Path) -> None:
     """Raise `InputError` if the rows of several sensors take turns or follow each other: a column
     of a few values that is not used changes with most rows, or whenever the stamps go back."""
-    clock = frame.get(columns.get("time", ""), pd.Series(0, frame.index))
-    back = (clock < clock.shift()).to_numpy()
+    stamps = frame.get(columns.get("time", ""))
+    back = np.zeros(len(frame), bool) if stamps is None else (stamps < stamps.shift()).to_numpy()
     for label in frame.columns.difference(list(columns.values())):
         values = frame[label] if back.any() else frame[label].iloc[:FIRST_ROWS]
-        changes = (values != values.shift()).to_numpy()[1:] & values.notna().all()
-        in_turn = changes[:FIRST_ROWS].mean() > 0.5 and len(values) > 10 * MOST_IMUS
-        in_turn |= back.any() and changes[back[1:]].all() and changes.any()
-        if in_turn and 2 <= values.nunique() <= MOST_IMUS:
+        changes = np.asarray(values != values.shift())[1:] & bool(values.notna().all())
+        in_turn = bool(changes[:FIRST_ROWS].mean() > 0.5) and len(values) > 10 * MOST_IMUS
+        follow = bool(back.any() and changes[back[1:]].all() and changes.any())
+        if (in_turn or follow) and 2 <= len(values.unique()) <= MOST_IMUS:
             words = ", ".join(map(str, values.unique()))
             problem = f"has rows of several sensors: column '{label}' holds {words} in turn"
             raise InputError(path, problem, f"choose one: --where {label}={values.iloc[0]}")

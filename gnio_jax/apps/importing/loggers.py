@@ -62,10 +62,8 @@ _SENSORS = {
     "AccelerometerUncalibrated": ("raw", None),
 }
 """Sensor Logger's files: the kind and the unit of each."""
-_REMEDY = (
-    "record the gyroscope and the accelerometer with gravity "
-    "(Sensor Logger: switch on Accelerometer and Gravity)"
-)
+_REMEDY = "record the gyroscope and the accelerometer with gravity"
+_REMEDY += " (Sensor Logger: switch on Accelerometer and Gravity)"
 
 
 class _Set(NamedTuple):
@@ -116,7 +114,8 @@ def _sensor_logger(path: Path, files: list[LogFile]) -> RawRecording:
     sets = []
     for name in [name for name in _SENSORS if name in tables]:
         clock = "time" if "time" in tables[name].layout.labels else "seconds_elapsed"
-        sets.append(_Set(*_SENSORS[name], tables[name], clock, ("x", "y", "z")))
+        kind, unit = _SENSORS[name]
+        sets.append(_Set(kind, unit, tables[name], clock, ("x", "y", "z")))
     row = {"platform": "android"} if "TotalAcceleration" in tables else {}
     if "Metadata" in tables:
         file = tables["Metadata"]

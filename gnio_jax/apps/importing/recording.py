@@ -91,8 +91,8 @@ def as_sequence(
         notes.append(f"{problem} the networks were trained on 100 Hz and more")
     attributes = {"dataset": "csv", "group": name, "truth": "none"}
     attributes |= {"imu_compensated": "no"} if raw.raw_gyro else {}
-    samples = (Samples(one.time, one.values, str(one.file)) for one in (gyro, accel))
-    streams = Streams(name, str(raw.path), *samples, attributes, float(gyro.start))
+    samples = [Samples(one.time, one.values, str(one.file)) for one in (gyro, accel)]
+    streams = Streams(name, str(raw.path), samples[0], samples[1], attributes, float(gyro.start))
     sequence = raw.track and _with_track(streams, rate, raw.track, gyro.start, notes)
     if sequence is None:
         (sequence,) = assemble(streams, rate, whole=True)

@@ -174,7 +174,7 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
         elif headers and lines[number].strip():
             break
     preamble = [lines[n] for n in range(data[0]) if n not in headers and lines[n].strip()]
-    header = max(headers, key=lambda number: len(set(headers[number]) - {""}), default=None)
+    header = max(headers, key=lambda number: len(set(headers[number]) - {""}), default=-1)
     labels = headers.pop(header, ())
     is_comma = any(re.search(r"\d,\d", cell) for n in data for cell in rows[n])
     others, decimal = tuple(headers.values()), "," if is_comma else "."
@@ -272,7 +272,7 @@ def tolerant_frame(
             problem += f", as {damaged.sum() - 1} others"
             raise InputError(path, problem, "give a table whose rows have the same columns")
         notes.append(f"{path.name}: {problem}; {damaged.sum()} such rows are left out")
-    return pd.DataFrame(columns)[~damaged].reset_index(drop=True), np.flatnonzero(~damaged)
+    return pd.DataFrame(columns).loc[~damaged].reset_index(drop=True), np.flatnonzero(~damaged)
 
 
 def _typed(
