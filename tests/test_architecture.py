@@ -53,9 +53,8 @@ LIBRARIES = {
 REFUSED = set("found own each given there known place seen about asked kept told here both".split())
 REFUSED |= set("these those wanted taken laid made left rest apart since late".split())
 """Words that do not say what a variable holds."""
-OLD_NAMES = ("apps/importing", "apps/live", "apps/track", "config")
-OLD_NAMES += ("data/parsing", "filtering", "training", "evaluation/estimate.py")
-OLD_NAMES += ("evaluation/evaluate.py", "evaluation/prepare.py")
+OLD_NAMES = ("apps/live", "apps/track", "config", "filtering", "training")
+OLD_NAMES += ("evaluation/estimate.py", "evaluation/evaluate.py", "evaluation/prepare.py")
 """Rooms and modules whose variables still have such names."""
 TWO_MEANINGS = {"Outcome"}
 """Names that two classes of these rooms still share."""
