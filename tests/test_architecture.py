@@ -34,7 +34,7 @@ LIBRARIES = {
     "bokeh": {"evaluation.page"},
     "flax": {"models", "training", "evaluation", "interop"},
     "jax2onnx": {"apps.onnx.conversion"},
-    "loky": {"data.loading"},
+    "loky": {"data.workers"},
     "mcap": {"apps.importing.ros", "apps.export"},
     "matplotlib": {"drawing", "data.pictures", "evaluation.plots", "tables.plots"},
     "onnx": ONNX,

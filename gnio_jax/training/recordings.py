@@ -22,7 +22,7 @@ from gnio_jax import config as configuration
 from gnio_jax import data, filtering, models, parallel
 from gnio_jax.config import NoiseModel, TrainConfig
 from gnio_jax.data.hdf5 import Reading, cache_entry, read_reading, write_reading
-from gnio_jax.data.loading import FEW, in_processes
+from gnio_jax.data.workers import FEW, in_processes
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.network import Predict
 from gnio_jax.models import Network
