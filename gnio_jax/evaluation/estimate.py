@@ -196,13 +196,13 @@ def _batches(strides: list[int], batch_size: int) -> list[Batch]:
     recording times powers of 0.8), and none is padded by more than a quarter."""
     count = max(1, math.ceil(len(strides) / batch_size))
 
-    def padded(longest: int) -> int:
+    def pad(longest: int) -> int:
         length = max(strides)
         while 0.8 * length >= longest and length > SHORTEST:
             length = math.ceil(0.8 * length)
         return length
 
-    return batches(strides, max(1, math.ceil(len(strides) / count)), padded)
+    return batches(strides, max(1, math.ceil(len(strides) / count)), pad)
 
 
 def filter_inputs(
@@ -255,11 +255,11 @@ def _run(
         if ekf.considered is not None:
             displacement, covariance = history.given(ekf.noise)
 
-            def repeated(state: FilterState, displacement: Array) -> FilterHistory:
+            def repeat_run(state: FilterState, displacement: Array) -> FilterHistory:
                 rows = displacement, covariance, valid, frame
                 return run_filter(ekf, state, *signals, *rows)[1]
 
-            derivatives = sensitivity(repeated, state, displacement)
+            derivatives = sensitivity(repeat_run, state, displacement)
             axis = jnp.tile(inputs.start.raw_axis[None], (len(derivatives), 1))
             added = considered_covariance(derivatives, ekf.considered, axis)
             diagonal = diagonal + jnp.diagonal(added, axis1=1, axis2=2)

@@ -137,7 +137,7 @@ def evaluate(
     compared = {"never_moves": never_moves(estimates), "perfect_displacements": floor}
 
     report = Report(
-        {**_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
+        {**_describe_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
         score(estimates, config.alignment),
         {row: score(of, config.alignment) for row, of in compared.items() if of},
         {recording.name: recording.group for recording in recordings},
@@ -253,7 +253,7 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     return "_".join(map(str, parts))
 
 
-def _settings(
+def _describe_settings(
     config: EvaluateConfig, run: TrainConfig, sequences: list[Sequence]
 ) -> dict[str, Any]:
     """The settings that define the meaning of the figures and their subject."""

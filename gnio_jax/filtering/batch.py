@@ -86,7 +86,7 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
     operations are too small for XLA to split each among cores: call `cores_as_devices` first.
     """
 
-    def batched(*arguments: object) -> T:
+    def run_batch(*arguments: object) -> T:
         sequences = arguments[shared:]
         if jax.tree.leaves(sequences)[0].shape[0] > 1:
             in_axes = (None,) * shared + (0,) * len(sequences)
@@ -97,20 +97,20 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
         result = function(*arguments[:shared], *only)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], result)
 
-    def mapped(*arguments: object) -> T:
+    def run_shared(*arguments: object) -> T:
         sequences = arguments[shared:]
         count = jax.tree.leaves(sequences)[0].shape[0]
         # Every process takes part, even if there are fewer sequences than devices.
         devices = jax.devices() if jax.process_count() > 1 else jax.devices()[:count]
         if len(devices) == 1:
-            return batched(*arguments)
+            return run_batch(*arguments)
         times = -count % len(devices)
         filled = jax.tree.map(
             lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[-1:], times, axis=0)]), sequences
         )
         everywhere, shared_out = PartitionSpec(), PartitionSpec("sequence")
         spread = jax.shard_map(
-            batched,
+            run_batch,
             mesh=Mesh(np.array(devices), ("sequence",)),
             in_specs=(everywhere,) * shared + (shared_out,) * len(sequences),
             out_specs=shared_out,
@@ -118,7 +118,7 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
         )
         return jax.tree.map(lambda leaf: leaf[:count], spread(*arguments[:shared], *filled))
 
-    return mapped
+    return run_shared
 
 
 def cores_as_devices() -> None:

@@ -94,17 +94,19 @@ def sensitivity(
     cut its gradient (`FilterConfig.truncate_every`), because S is the derivative of the whole run.
     """
 
-    def means(c: Float[Array, "6"]) -> tuple[Mean, Array]:
+    def run_disturbed(c: Float[Array, "6"]) -> tuple[Mean, Array]:
         start = state._replace(gyro_bias=state.gyro_bias + c[OF_BIAS])
         history = run(start, disturb(displacement, c))
         return Mean(*(getattr(history, name) for name in Mean._fields)), history.rotation
 
     nothing = jnp.zeros(ENTRIES, state.offset.dtype)
-    derivatives, rotation = jax.jacfwd(means, has_aux=True)(nothing)
-    return _of_error(rotation, derivatives)
+    derivatives, rotation = jax.jacfwd(run_disturbed, has_aux=True)(nothing)
+    return _assemble_sensitivity(rotation, derivatives)
 
 
-def _of_error(rotation: Float[Array, "k 3 3"], derivatives: Mean) -> Float[jax.Array, "k 15 6"]:
+def _assemble_sensitivity(
+    rotation: Float[Array, "k 3 3"], derivatives: Mean
+) -> Float[jax.Array, "k 15 6"]:
     """S of θ, v, p, b_g, b_a from the derivatives of the estimates by c, whose 6 entries are the
     last axis. `rotation` has the estimated rotations."""
     of_rotation, *others = derivatives
@@ -125,7 +127,7 @@ None for all other arrays (counters, decisions, memories)."""
 def start_tangents(state: FilterState) -> Tangents:
     """The tangents at the start, where only the gyro's bias depends on c."""
     zeros = jax.tree.map(
-        lambda leaf: jnp.zeros((ENTRIES, *leaf.shape), leaf.dtype), _floating(state)
+        lambda leaf: jnp.zeros((ENTRIES, *leaf.shape), leaf.dtype), _select_floating(state)
     )
     return zeros._replace(gyro_bias=jnp.eye(ENTRIES, dtype=state.gyro_bias.dtype)[:, OF_BIAS])
 
@@ -158,10 +160,10 @@ def step_with_tangents(
             is_leaf=lambda part: part is None,
         )
         after, result = step(whole, measure_disturbed)
-        return _floating(after), (after, result)
+        return _select_floating(after), (after, result)
 
     every_entry = jnp.eye(ENTRIES, dtype=state.offset.dtype)
-    point = _floating(state), jnp.zeros_like(every_entry[0])
+    point = _select_floating(state), jnp.zeros_like(every_entry[0])
 
     def push_forward(tangent: Tangents, direction: Float[Array, "6"]) -> tuple:
         _, after, result = jax.jvp(run_step, point, (tangent, direction), has_aux=True)
@@ -176,10 +178,10 @@ def step_with_tangents(
 def core_sensitivity(mean: Mean, tangents: Tangents) -> Float[jax.Array, "15 6"]:
     """S of θ, v, p, b_g, b_a."""
     last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[None], tangents.mean)
-    return _of_error(mean.rotation[None], last)[0]
+    return _assemble_sensitivity(mean.rotation[None], last)[0]
 
 
-def _floating(state: FilterState) -> Any:
+def _select_floating(state: FilterState) -> Any:
     """The state without its arrays that are not floating-point."""
     return jax.tree.map(
         lambda leaf: leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else None, state

@@ -179,13 +179,13 @@ def fixes_on_intervals(
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     weight = present.sum(axis=1) / np.where(present, variance, 0.0).sum(axis=1)
 
-    def shares(weights: np.ndarray) -> np.ndarray:
+    def normalise(weights: np.ndarray) -> np.ndarray:
         """The weights, each divided by the sum of those of its row."""
         sums = np.bincount(row, weights, intervals)[row]
         return np.divide(weights, sums, out=np.zeros_like(weights), where=weights > 0)
 
-    share = shares(weight)
-    component_share = np.stack([shares(weight * column) for column in present.T], axis=1)
+    share = normalise(weight)
+    component_share = np.stack([normalise(weight * column) for column in present.T], axis=1)
     fix = Fix(
         position=np.zeros((intervals, axes)),
         covariance=np.zeros((intervals, axes, axes)),

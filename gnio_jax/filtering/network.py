@@ -40,7 +40,7 @@ def network_measurement(
     def predict_one(window: Float[Array, "1 n 6"]) -> Prediction:
         prediction = predict(window)
         _check(prediction)
-        return jax.tree.map(lambda leaf: _as_floating(leaf[0]), prediction)
+        return jax.tree.map(lambda leaf: _make_floating(leaf[0]), prediction)
 
     shapes = jax.eval_shape(predict_one, jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32))
 
@@ -102,5 +102,5 @@ def network_window(
     return window[None].astype(jnp.float32)
 
 
-def _as_floating(value: Any) -> Any:
+def _make_floating(value: Any) -> Any:
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.float32)

@@ -119,7 +119,7 @@ def grid_rows(
         inside = (begin <= centres) & (centres <= end)
         if not inside.any():
             continue
-        fine = _curve(time, samples[run], np.arange(low, high + 1) * step, grid, slack)
+        fine = _evaluate_curve(time, samples[run], np.arange(low, high + 1) * step, grid, slack)
         if begin == 0:  # the stream's start, as far as samples can be reflected
             reflected = min(low - lowest, high - low)
             fine = np.concatenate([2 * fine[0] - fine[reflected:0:-1], fine])
@@ -135,7 +135,7 @@ def grid_rows(
     return rows
 
 
-def _curve(
+def _evaluate_curve(
     time: np.ndarray, samples: np.ndarray, points: np.ndarray, grid: Grid, slack: float
 ) -> np.ndarray:
     """A run evaluated at some points: by lines, and before a low-pass by a spline where samples are

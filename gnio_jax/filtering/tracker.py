@@ -169,7 +169,7 @@ class Tracker:
         so much faster than `imu_rate` that it would alias, and for a rest without gravity, whose
         samples are left out.
         """
-        self._stream.push(*_checked_sample(time, gyro, accel))
+        self._stream.push(*_check_sample(time, gyro, accel))
         if self._core is None:
             self._start_from_rest()
         n, stepped = self._ekf.config.samples_per_clone, False
@@ -178,7 +178,7 @@ class Tracker:
             self._stream.take(n)
             self._core, estimate = self._advance(self._core, rows)
             self._ahead, stepped = (0, estimate, self._core.filter.imu), True
-        return self._as_pose() if stepped else None
+        return self._read_pose() if stepped else None
 
     def pose(self) -> Pose | None:
         """The pose after the newest grid sample; between clone steps the samples since the last
@@ -194,7 +194,7 @@ class Tracker:
         for row in self._stream.rows(ready)[done:].astype(self._core.window.dtype):
             estimate, memory = self._look_ahead(estimate, memory, row)
         self._ahead = ready, estimate, memory
-        return self._as_pose()
+        return self._read_pose()
 
     def filter_state(self) -> FilterState | None:
         """The filter after the last clone step, as `run_odometry` would return it; None while there
@@ -246,7 +246,7 @@ class Tracker:
         """Number of ready samples that `pose` has integrated, and the result."""
         return core
 
-    def _as_pose(self) -> Pose:
+    def _read_pose(self) -> Pose:
         """The newest estimate on the host, at the end of the interval of its last sample."""
         ahead, estimate, _ = self._ahead
         mean, covariance, numbers = jax.tree.map(np.array, estimate)
@@ -351,16 +351,18 @@ def device_pose(
     return DevicePose(state.mean, covariance, flags)
 
 
-def _checked_sample(time: Any, gyro: Any, accel: Any) -> tuple[float, tuple[float, ...]]:
+def _check_sample(time: Any, gyro: Any, accel: Any) -> tuple[float, tuple[float, ...]]:
     """The time, and gyro and accel in one tuple."""
-    (seconds,) = _numbers("time", time, (), "a finite number of seconds", math.inf)
+    (seconds,) = _check_numbers("time", time, (), "a finite number of seconds", math.inf)
     if not math.isfinite(seconds):
         raise ValueError(f"time: must be a finite number of seconds, found {time!r}")
-    rate = _numbers("gyro", gyro, (3,), "three numbers", FASTEST_TURN, "rad/s")
-    return seconds, rate + _numbers("accel", accel, (3,), "three numbers", STRONGEST_FORCE, "m/s²")
+    rate = _check_numbers("gyro", gyro, (3,), "three numbers", FASTEST_TURN, "rad/s")
+    return seconds, rate + _check_numbers(
+        "accel", accel, (3,), "three numbers", STRONGEST_FORCE, "m/s²"
+    )
 
 
-def _numbers(
+def _check_numbers(
     name: str, value: Any, shape: tuple[int, ...], kind: str, largest: float, unit: str = ""
 ) -> tuple[float, ...]:
     """The numbers of an array of this shape, which must be within the range of an IMU."""
