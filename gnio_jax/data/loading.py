@@ -371,11 +371,13 @@ def _check_and_draw(
     """The rows of one recording, without its splits, and the reader's notes."""
     rows, reading = check_recording(recording, dataset)
     if pictures is not None:
-        from gnio_jax.data.pictures import overview, save  # Matplotlib takes a second to import
+        from gnio_jax import drawing  # Matplotlib takes a second to import
+        from gnio_jax.data.pictures import PALETTE, overview
 
         for sequence, row in zip(reading.sequences, rows, strict=False):
             assert row.check is not None
-            save(pictures / f"{file_stem(sequence.name)}.png", overview(sequence, row.check))
+            path = pictures / f"{file_stem(sequence.name)}.png"
+            drawing.save(path, overview(sequence, row.check), PALETTE)
     return rows, reading.notes
 
 

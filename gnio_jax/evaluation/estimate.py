@@ -8,6 +8,7 @@ trajectory has a row at the start and one at the end of every stride. The filter
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -21,14 +22,13 @@ from jaxtyping import Float
 from gnio_jax.config import DataConfig
 from gnio_jax.evaluation.infer import Displacements, keep
 from gnio_jax.evaluation.metrics import Filtered
-from gnio_jax.evaluation.prepare import Recording, Start
-from gnio_jax.evaluation.trajectory import Alignment, Trajectory, in_frame_of, relative_yaw
+from gnio_jax.evaluation.prepare import PreparedRecording, Start
+from gnio_jax.evaluation.trajectory import Alignment, Trajectory, align_if_possible, relative_yaw
 from gnio_jax.filtering import (
-    ConsideredStd,
+    Filter,
     FilterConfig,
     FilterHistory,
     FilterState,
-    NoiseModel,
     considered_covariance,
     over_sequences,
     run_filter,
@@ -36,8 +36,7 @@ from gnio_jax.filtering import (
     sensitivity,
 )
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
-from gnio_jax.filtering.history import GYRO_BIAS, POSITION
-from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.filtering.history import GYRO_BIAS, POSITION, explain_failure
 from gnio_jax.filtering.state import gyro_bias_covariance
 from gnio_jax.models import Network
 from gnio_jax.numerics import (
@@ -73,11 +72,11 @@ class States(NamedTuple):
     """Measured minus predicted displacement, m; NaN where there was no measurement."""
 
 
-class Estimate(NamedTuple):
+class SequenceEstimate(NamedTuple):
     """A trajectory with the estimator's other results: K + 1 rows for K strides.
 
-    Row k is at the end of stride k, which is `Recording.time[k]`. A measurement is in the row at
-    the end of its window.
+    Row k is at the end of stride k, which is `PreparedRecording.time[k]`. A measurement is in the
+    row at the end of its window.
     """
 
     name: str
@@ -97,13 +96,13 @@ class Estimate(NamedTuple):
 
 
 def estimate(
-    recordings: list[Recording],
+    recordings: list[PreparedRecording],
     source: Network | list[Displacements],
     windows: DataConfig,
-    ekf: FilterSetup | None,
+    ekf: Filter | None,
     batch_size: int = 16,
     progress: Progress = silent,
-) -> list[Estimate]:
+) -> list[SequenceEstimate]:
     """Trajectories of the recordings, by the filter, or by the sum of displacements if `ekf` is
     None.
 
@@ -117,14 +116,13 @@ def estimate(
     network, given = (
         (source, None) if isinstance(source, Network) else (Network(None, None), source)
     )
-    found: dict[int, Estimate] = {}
+    found: dict[int, SequenceEstimate] = {}
     strides = [each.strides for each in recordings]
     for batch in _batches(strides, batch_size):
         displacements = None if given is None else [given[i] for i in batch.members]
         members = [recordings[i] for i in batch.members]
         inputs = filter_inputs(members, displacements, batch.intervals, ekf.config)
-        fixed = {"apply": network.apply, "config": ekf.config}
-        history = _run(network.variables, inputs, ekf.noise, ekf.considered, **fixed)
+        history = _run(network.variables, inputs, ekf, apply=network.apply)
         history = jax.device_get(history)
         for place, i in enumerate(dict.fromkeys(batch.members)):
             own = jax.tree.map(lambda leaf, p=place, k=strides[i]: leaf[p, :k], history)
@@ -135,36 +133,40 @@ def estimate(
     return [found[i] for i in range(len(recordings))]
 
 
-def never_moves(estimates: list[Estimate]) -> list[Estimate]:
+def never_moves(estimates: list[SequenceEstimate]) -> list[SequenceEstimate]:
     """Estimates that stay at the start pose. An estimator must be better than these, above all in a
     small room."""
     still = []
     for each in estimates:
         time, *poses = each.trajectory
         path = Trajectory(time, *(np.repeat(part[:1], len(part), 0) for part in poses))
-        still.append(Estimate(each.name, path, each.reference, waypoints=each.waypoints))
+        still.append(SequenceEstimate(each.name, path, each.reference, waypoints=each.waypoints))
     return still
 
 
-def perfect(ekf: FilterSetup) -> FilterSetup:
+def perfect(ekf: Filter) -> Filter:
     """The filter for true displacements: without the settings that were calibrated for a
     network."""
     noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), measurement_scale=1.0, correlation=None)
     considered = ekf.considered and ekf.considered._replace(scale=0.0, heading=0.0, slope=0.0)
-    return ekf._replace(noise=noise, considered=considered)
+    return dataclasses.replace(ekf, noise=noise, considered=considered)
 
 
-def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> Estimate:
+def in_one_frame(
+    estimate: SequenceEstimate, alignment: Alignment | None = "origin"
+) -> SequenceEstimate:
     """Estimate and reference in one frame, for drawing: the estimate is aligned with its
     covariance, or without an `alignment` the reference is moved to the start of the estimate. An
     estimate with waypoints is aligned with these. If that is impossible, nothing changes.
     Covariances are turned only about the vertical, because an alignment of a level world turns
     about it."""
     if alignment is None and estimate.waypoints is None:
-        return estimate._replace(reference=in_frame_of(estimate.reference, estimate.trajectory))
+        return estimate._replace(
+            reference=align_if_possible(estimate.reference, estimate.trajectory)
+        )
     reference = estimate.waypoints or estimate.reference
     path, filtered = estimate.trajectory, estimate.filtered
-    aligned = in_frame_of(path, reference, alignment or "origin")
+    aligned = align_if_possible(path, reference, alignment or "origin")
     if filtered is not None and aligned is not path:
         turn = rotation_z(relative_yaw(aligned.orientation, path.orientation))
         covariance = turn @ filtered.covariance @ np.swapaxes(turn, 1, 2)
@@ -175,7 +177,7 @@ def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> 
 # --- the filter over many recordings
 
 
-class Inputs(NamedTuple):
+class BatchInputs(NamedTuple):
     """The inputs of the filter, with the recordings along the leading axis."""
 
     start: Start
@@ -204,11 +206,11 @@ def _batches(strides: list[int], batch_size: int) -> list[Batch]:
 
 
 def filter_inputs(
-    recordings: list[Recording],
+    recordings: list[PreparedRecording],
     given: list[Displacements] | None,
     strides: int,
     config: FilterConfig,
-) -> Inputs:
+) -> BatchInputs:
     """The recordings side by side, padded to the given number of strides by samples that change
     nothing before them. Rows of `given` without a displacement get a covariance of 1 m², which has
     a derivative but no effect."""
@@ -220,7 +222,7 @@ def filter_inputs(
             covariance = filled_up(np.where(known, each.covariance, np.eye(3)), strides)
             rows.append(Displacements(filled_up(each.value, strides, np.nan), covariance))
         stacked = _stacked(rows)
-    return Inputs(
+    return BatchInputs(
         _stacked([each.start for each in recordings]),
         *padded_signals(((each.gyro, each.accel) for each in recordings), samples),
         padded_masks((each.imu_valid for each in recordings), samples),
@@ -228,42 +230,38 @@ def filter_inputs(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("apply", "config"))
+@functools.partial(jax.jit, static_argnames="apply")
 def _run(
-    variables: Any,
-    inputs: Inputs,
-    noise: NoiseModel,
-    considered: ConsideredStd | None,
-    *,
-    apply: Callable | None,
-    config: FilterConfig,
+    variables: Any, inputs: BatchInputs, ekf: Filter, *, apply: Callable | None
 ) -> FilterHistory:
     """One compiled run over all recordings of a batch. Of its covariances only that of the position
     is kept, including the consider covariance."""
 
-    def run(own: Inputs) -> FilterHistory:
-        signals, fixed = (own.gyro, own.accel), (config, noise, own.imu_valid)
-        state = own.start.state(config)
+    def run(inputs: BatchInputs) -> FilterHistory:
+        signals, valid = (inputs.gyro, inputs.accel), inputs.imu_valid
+        state = inputs.start.state(ekf)
         if apply is None:
-            assert own.given is not None
-            frame, covariance = "given", own.given.covariance
-            history = run_filter(state, *signals, own.given.value, covariance, *fixed)[1]
+            assert inputs.given is not None
+            frame, displacement = "given", inputs.given.value
+            covariance = inputs.given.covariance
+            history = run_filter(ekf, state, *signals, displacement, covariance, valid)[1]
         else:
-            frame = config.displacement_frame
+            frame = ekf.config.displacement_frame
             predict = functools.partial(_predict, apply, variables)
-            history = run_odometry(predict, state, *signals, *fixed)[1]
+            history = run_odometry(predict, ekf, state, *signals, valid)[1]
         diagonal, whole = history.covariance_diagonal, history.covariance
         assert whole is not None
         position = whole[:, POSITION, POSITION]
-        if considered is not None:
-            displacement, covariance = history.given(noise)
+        if ekf.considered is not None:
+            displacement, covariance = history.given(ekf.noise)
 
             def repeated(state: FilterState, displacement: Array) -> FilterHistory:
-                return run_filter(state, *signals, displacement, covariance, *fixed, frame)[1]
+                rows = displacement, covariance, valid, frame
+                return run_filter(ekf, state, *signals, *rows)[1]
 
-            found = sensitivity(repeated, state, displacement)
-            axis = jnp.tile(own.start.raw_axis[None], (len(found), 1))
-            added = considered_covariance(found, considered, axis)
+            derivatives = sensitivity(repeated, state, displacement)
+            axis = jnp.tile(inputs.start.raw_axis[None], (len(derivatives), 1))
+            added = considered_covariance(derivatives, ekf.considered, axis)
             diagonal = diagonal + jnp.diagonal(added, axis1=1, axis2=2)
             position = position + added[:, POSITION, POSITION]
         return history._replace(covariance_diagonal=diagonal, covariance=position)
@@ -275,14 +273,18 @@ def _predict(apply: Callable, variables: Any, windows: Array) -> Prediction:
     return keep(apply(variables, windows))
 
 
-def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) -> Estimate:
+def _of_history(
+    recording: PreparedRecording, history: FilterHistory, ekf: Filter
+) -> SequenceEstimate:
     """The estimate from the history of one recording, with a row for its start. It is invalid where
     the history is not healthy."""
     start, notes = recording.start, recording.notes
     healthy = _after(1.0, history.healthy) > 0
     if not healthy.all():
         since = recording.time[np.argmin(healthy)] - recording.time[0]
-        notes = (*notes, f"filter: diverged at {since:.1f} s; the poses from then on are invalid")
+        cause = explain_failure(history, ekf.config)
+        problem = f"filter: diverged at {since:.1f} s ({cause})"
+        notes = (*notes, f"{problem}; the poses from then on are invalid")
     position = _after(start.position, history.position)
     orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
     poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
@@ -292,7 +294,7 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) 
     if (considered := ekf.considered) is not None:
         std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], considered.gyro_bias)
         std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], considered.raw_gyro_bias * start.raw_axis)
-    return Estimate(
+    return SequenceEstimate(
         recording.name,
         Trajectory(recording.time, *poses),
         recording.reference,
@@ -331,7 +333,9 @@ def _stacked(trees: list[Any]) -> Any:
 # --- the sum of displacements
 
 
-def integrate(recording: Recording, found: Displacements, windows: DataConfig) -> Estimate:
+def integrate(
+    recording: PreparedRecording, found: Displacements, windows: DataConfig
+) -> SequenceEstimate:
     """The path in which every stride is the mean of the windows that cover it, as in RoNIN-type
     baselines."""
     n, clones = windows.stride, windows.window // windows.stride
@@ -342,7 +346,7 @@ def integrate(recording: Recording, found: Displacements, windows: DataConfig) -
     moved = np.cumsum(mean_over_windows(steps, clones), 0)
     position = recording.start.position + np.concatenate([np.zeros((1, 3)), moved])
     orientation = quaternion_from_matrix(recording.attitude[::n])
-    return Estimate(
+    return SequenceEstimate(
         recording.name,
         Trajectory(recording.time, position, orientation),
         recording.reference,

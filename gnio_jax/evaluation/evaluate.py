@@ -24,13 +24,20 @@ from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.config import EvaluateConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.estimate import PERFECT_STD, Estimate, estimate, never_moves, perfect
-from gnio_jax.evaluation.infer import given_displacements, infer, no_displacements
+from gnio_jax.evaluation.estimate import (
+    PERFECT_STD,
+    SequenceEstimate,
+    estimate,
+    never_moves,
+    perfect,
+)
+from gnio_jax.evaluation.folder import write
+from gnio_jax.evaluation.infer import infer, no_displacements, reference_displacements
 from gnio_jax.evaluation.metrics import score
-from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
-from gnio_jax.evaluation.report import DEFINITIONS, Report, write
-from gnio_jax.evaluation.trajectory import Alignment, Undefined, paired, read_tum
-from gnio_jax.filtering.settings import filter_setup
+from gnio_jax.evaluation.prepare import Orientation, PreparedRecording, prepare
+from gnio_jax.evaluation.report import DEFINITIONS, Report
+from gnio_jax.evaluation.trajectory import Alignment, Undefined, pair, read_tum
+from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
@@ -53,8 +60,8 @@ class Evaluation(NamedTuple):
     """The result of `evaluate`."""
 
     report: Report
-    estimates: list[Estimate]
-    recordings: list[Recording]
+    estimates: list[SequenceEstimate]
+    recordings: list[PreparedRecording]
     folder: Path
     """Folder of the results."""
 
@@ -76,12 +83,15 @@ def evaluate(
     missing data, and a split of which no sequence can be estimated.
     """
     _check(config)
-    from gnio_jax.training.checkpoint import learnt_from, load_run  # Orbax takes seconds to import
+    from gnio_jax.training.checkpoint import (  # Orbax takes seconds to import
+        load_run,
+        training_recordings,
+    )
 
     workdir = Path(config.workdir or configuration.newest_run())
     run = run or load_run(workdir, config.checkpoint)
     config = resolve(config, run.config)
-    windows, ekf = run.config.data, filter_setup(run.config.data, config.filter)
+    windows, ekf = run.config.data, make_filter(run.config.data, config.filter)
 
     def stage(name: str) -> Progress:
         return functools.partial(reporter.progress, name)
@@ -92,18 +102,17 @@ def evaluate(
             problem = f"has waypoints, and no --alignment {config.alignment}"
             remedy = "leave it out: one turn about z and one shift are fitted"
             raise InputError(each.name, problem, remedy)
-    learnt = learnt_from(workdir, run.config, config.dataset)
+    learnt = training_recordings(workdir, run.config, config.dataset)
     if seen := [each.name for each in sequences if each.name in learnt]:
         count = f"{len(seen)} of {len(sequences)} recordings, e.g. {seen[0]}"
         reporter.line(f"warning: the network has learnt from {count}: its errors there are smaller")
     recordings, left_out = prepare(
         sequences,
         windows,
-        ekf.initial_std,
+        ekf,
         init=config.init,
         gyro_bias=config.gyro_bias,
         orientation=config.orientation if _infers(config) else None,
-        raw_gyro_bias=ekf.raw_gyro_bias,
     )
     if not recordings:
         name, reason = next(iter(left_out.items()))
@@ -119,7 +128,7 @@ def evaluate(
     else:
         source = network
     posed = [each for each in recordings if each.waypoints is None]
-    truth = [given_displacements(each, PERFECT_STD) for each in posed]
+    truth = [reference_displacements(each, PERFECT_STD) for each in posed]
 
     own, ideal = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
     batch, perfecting = config.batch_size, stage("estimating with perfect displacements")
@@ -145,11 +154,11 @@ def score_files(reference: Path, estimate: Path, alignment: Alignment = "origin"
     """The report about two trajectories in TUM format, written by any program, at the stamps that
     they share. Raises `InputError` if these are too few."""
     try:
-        path, truth = paired(read_tum(estimate), read_tum(reference))
+        path, truth = pair(read_tum(estimate), read_tum(reference))
     except Undefined as problem:
         remedy = "give both the stamps of one clock, in s"
         raise InputError(estimate, f"{problem} as in {reference}", remedy) from None
-    found = [Estimate(estimate.stem, path, truth)]
+    found = [SequenceEstimate(estimate.stem, path, truth)]
     count = f"{np.isfinite(truth.position).all(axis=1).sum():,} poses"
     settings = {"dataset": estimate.name, "split": f"against {count} of {reference.name}"}
     settings |= {"estimator": "given poses", "alignment": alignment}
@@ -234,7 +243,7 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     parts = [config.dataset, config.split, config.estimator]
     parts += [text.format(own[x]) for x, text in NAMED.items() if own[x] != usual[x]]
     if config.estimator != "integrate":
-        trained, own = configuration.flat(run.filter), configuration.flat(config.filter)
+        trained, own = configuration.flatten(run.filter), configuration.flatten(config.filter)
         for name in {**trained, **own}:
             if (value := own.get(name)) != trained.get(name):
                 numbers = value if isinstance(value, tuple) else (value,)
@@ -265,7 +274,7 @@ def _settings(
         "model": run.model.name,
         "checkpoint": config.checkpoint,
         **{name: getattr(run.data, name) for name in WINDOWS},
-        "filter": configuration.plain(config.filter),
+        "filter": configuration.to_plain(config.filter),
         "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,
         "definitions": DEFINITIONS,
         "device": jax.devices()[0].device_kind,

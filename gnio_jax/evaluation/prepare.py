@@ -3,6 +3,7 @@ start."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
@@ -12,11 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterSettings
-from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import Trajectory
-from gnio_jax.filtering import FilterConfig, FilterState, InitialStd, initial_state, level_state
-from gnio_jax.filtering.settings import filter_config
+from gnio_jax.filtering import (
+    Filter,
+    FilterState,
+    InitialStd,
+    initial_state,
+    level_state,
+    make_filter,
+)
 from gnio_jax.filtering.start import rest_at_start
 from gnio_jax.numerics import (
     cumulative_rotation,
@@ -69,13 +75,14 @@ class Start(NamedTuple):
         along it is considered."""
         return self.raw_gyro * self.rotation[2]
 
-    def state(self, config: FilterConfig) -> FilterState:
-        """The start as a state of the filter."""
-        known = self.rotation, self.velocity, self.position, self.gyro_bias
-        return initial_state(config, *known, 0, self.std, self.level_gyro_bias)
+    def state(self, ekf: Filter) -> FilterState:
+        """The start as a state of the filter, with the standard deviations of this start."""
+        ekf = dataclasses.replace(ekf, start=self.std)
+        pose = self.rotation, self.velocity, self.position
+        return initial_state(ekf, *pose, self.gyro_bias, 0, self.level_gyro_bias)
 
 
-class Recording(NamedTuple):
+class PreparedRecording(NamedTuple):
     """A sequence prepared for an estimator: K strides of n samples."""
 
     name: str
@@ -114,25 +121,25 @@ class Recording(NamedTuple):
 def prepare(
     sequences: Iterable[Sequence],
     windows: DataConfig,
-    std: InitialStd = TLIO_STD,
+    ekf: Filter | None = None,
     *,
     init: Init = "reference",
     gyro_bias: BiasSource = "zero",
     orientation: Orientation | None = None,
     from_first: bool = False,
-    raw_gyro_bias: float | None = None,
-) -> tuple[list[Recording], dict[str, str]]:
+) -> tuple[list[PreparedRecording], dict[str, str]]:
     """Recordings to estimate, and the names of the sequences that are left out with the reason.
 
     A recording begins at the first sample with a trusted reference. With `from_first`, or without a
-    reference, it begins at its first sample. `std` is the filter's initial uncertainty; a static
-    start replaces that of tilt and velocity. A sequence with waypoints has no pose to start from,
-    so its start is always static. `raw_gyro_bias` replaces the standard deviation of the level
-    components of the gyro's bias if neither the phone nor a rest gives a first estimate of it: if
-    `imu_compensated` is "no" and the bias starts from zero. `orientation` is the source of
-    `Recording.attitude`; None: there is none. Raises `InputError` for a sequence that lacks what
-    these choices need.
+    reference, it begins at its first sample. `ekf` has the uncertainty of the start; None: the
+    defaults. A static start replaces the standard deviations of tilt and velocity. A sequence with
+    waypoints has no pose to start from, so its start is always static. `ekf.raw_gyro_bias` replaces
+    the standard deviation of the level components of the gyro's bias if neither the phone nor a
+    rest gives a first estimate of it: if `imu_compensated` is "no" and the bias starts from zero.
+    `orientation` is the source of `PreparedRecording.attitude`; None: there is none. Raises
+    `InputError` for a sequence that lacks what these choices need.
     """
+    ekf = ekf or make_filter(windows, FilterSettings())
     recordings, left_out = [], {}
     for sequence in sequences:
         sequence = data.resample(sequence, windows.rate)
@@ -154,16 +161,18 @@ def prepare(
         if whole.waypoints is not None:
             own_init, reference_note = "static", OF_WAYPOINTS
         rotation, velocity, position, own_std, start_note = _start(
-            whole, measured, windows, std, own_init
+            whole, measured, windows, ekf, own_init
         )
-        level = raw_gyro_bias if raw and raw_gyro_bias is not None else std.gyro_bias
+        level = ekf.start.gyro_bias
+        if raw and ekf.raw_gyro_bias is not None:
+            level = ekf.raw_gyro_bias
         start = Start(rotation, velocity, position, bias, own_std, level, raw)
         trusted, mask = whole.valid[:, None], whole.imu_valid
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
         placement = str(sequence.attributes.get("placement", "unknown"))
         recordings.append(
-            Recording(
+            PreparedRecording(
                 name=sequence.name,
                 group=str(data.group(sequence)),
                 placement="" if placement == "unknown" else placement,
@@ -218,7 +227,7 @@ def _start(
     sequence: Sequence,
     measured: Int[np.ndarray, "m"],
     windows: DataConfig,
-    std: InitialStd,
+    ekf: Filter,
     init: Init,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, InitialStd, str]:
     """Rotation, velocity and position at the start, their uncertainty, and a note about them."""
@@ -226,15 +235,14 @@ def _start(
         velocity = sequence.velocity[0]
         velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
         rotation = matrix_from_quaternion(sequence.orientation[0])
-        return rotation, velocity, sequence.position[0], std, ""
+        return rotation, velocity, sequence.position[0], ekf.start, ""
     second = measured[measured < round(windows.rate)]
     if 2 * len(second) < round(windows.rate):  # most of the first second was not measured
         second = measured[: round(windows.rate)]
-    config = filter_config(windows, FilterSettings())
-    level = level_state(config, sequence.gyro[second], sequence.accel[second], std)
+    level = level_state(ekf, sequence.gyro[second], sequence.accel[second])
     found = np.sqrt(np.diag(level.core_covariance))
     tilt_std, velocity_std = float(found[0]), float(found[3])
-    std, note = std._replace(tilt=tilt_std, velocity=velocity_std), ""
+    std, note = ekf.start._replace(tilt=tilt_std, velocity=velocity_std), ""
     if velocity_std > ROUGH_START:
         tilt = float(f"{np.degrees(tilt_std):.1g}")  # rounded, so that few different notes are made
         sigma = f"one sigma: velocity {velocity_std:.1f} m/s, tilt {tilt:g}°"

@@ -18,7 +18,7 @@ entries instead of 3 W.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import no_type_check
+from typing import ClassVar, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +65,7 @@ class Displacement:
     frame: YawFrame = field(metadata={"static": True})
     """The yaw frame: by the filter's own attitude of the oldest clone, or by another one
     (`YawFrame`)."""
+    name: ClassVar[str] = "displacement"
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """Nothing changes without a measurement, before the ring is full, at gimbal lock, or where
@@ -72,8 +73,7 @@ class Displacement:
         a larger covariance instead."""
         config = step.config
         linear, defined = linearise_displacement(self, state, step)
-        present = self.present & (state.step >= config.clones)
-        linear = linear._replace(residual=jnp.where(present, linear.residual, jnp.nan))
+        linear = linear._replace(residual=jnp.where(self.present, linear.residual, jnp.nan))
         outcome, correction = project(state, linear, step)
         tested = outcome.present & defined
         gate, weight = innovation_gate(state.gate, config, state.step, outcome.nis, tested)

@@ -56,6 +56,7 @@ class Fix(NamedTuple):
     threshold: Float[Array, "*k"]
     """Largest rᵀ S⁻¹ r of all m components that passes; inf: every fix does. A fix that lacks
     components must pass the test of the same probability (`threshold_of`)."""
+    name = "fix"
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """A fix is refused if it fails the χ² test against the filter's prediction. So a fix that

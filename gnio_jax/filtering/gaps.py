@@ -48,6 +48,23 @@ def no_gap(n: int, dtype: np.dtype) -> Gap:
     return Gap(np.zeros(n, dtype), np.zeros(n, dtype), np.ones(n, dtype))
 
 
+def after_window(
+    stream: Imu, window: Float[Array, "r 7"] | None, config: FilterConfig
+) -> tuple[Imu, Float[Array, "r 7"]]:
+    """The stream behind the samples of `FilterState.window` (zeros if there are none yet), and the
+    last samples of both, as the window for a later run."""
+    used = np.ones(len(stream.gyro)) if stream.gap is None else stream.gap.used
+    dtype, reach = stream.gyro.dtype, config.reach
+    used = jnp.asarray(used, dtype)[:, None]
+    before = jnp.zeros((reach, 7), dtype) if window is None else window
+    rows = jnp.concatenate([before, jnp.concatenate([stream.gyro, stream.accel, used], axis=1)])
+    gap = None
+    if window is not None or stream.gap is not None:
+        zeros = jnp.zeros(len(rows), dtype)
+        gap = Gap(zeros, zeros, rows[:, 6])
+    return Imu(rows[:, :3], rows[:, 3:6], gap), rows[-reach:]
+
+
 def bridge(
     gyro: Float[Array, "n 3"],
     accel: Float[Array, "n 3"],

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
+from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
@@ -23,7 +23,7 @@ Predict = Callable[[Any], Prediction]
 
 
 def network_measurement(
-    predict: Predict, config: FilterConfig, noise: NoiseModel
+    predict: Predict, ekf: Filter
 ) -> Callable[..., tuple[Displacement, dict[str, Array]]]:
     """The displacement that the network measures, with its diagnostics, as a function
 
@@ -34,6 +34,8 @@ def network_measurement(
     from a window in which the filter coasted. Raises `ValueError` if `predict` does not return what
     the filter needs.
     """
+
+    config = ekf.config
 
     def of_one(window: Float[Array, "1 n 6"]) -> Prediction:
         found = predict(window)
@@ -61,7 +63,7 @@ def network_measurement(
         dtype, frame = state.offset.dtype, config.displacement_frame
         covariance = found.covariance(config.log_std_min, dtype)
         displacement = found.displacement.astype(dtype)
-        return scaled_displacement(displacement, covariance, noise, frame), found.diagnostics
+        return scaled_displacement(displacement, covariance, ekf.noise, frame), found.diagnostics
 
     return measure
 

@@ -30,11 +30,12 @@ from gnio_jax import geometry
 from gnio_jax.config import CorrelatedError, InitialStd
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.batch import padded_masks, padded_signals
+from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.fix import Fix, fixes_on_intervals
 from gnio_jax.filtering.history import FilterHistory
 from gnio_jax.filtering.network import Predict
 from gnio_jax.filtering.scan import run_odometry
-from gnio_jax.filtering.settings import FilterConfig, FilterSetup
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import THETA, FilterState, Mean
@@ -90,13 +91,13 @@ class WaypointPoses(NamedTuple):
 def waypoint_poses(
     sequence: Sequence,
     predict: Predict,
-    setup: FilterSetup,
+    ekf: Filter,
     place_std: float = PLACE_STD,
     time_std: float = TIME_STD,
 ) -> WaypointPoses:
     """Poses of a walk with waypoints.
 
-    predict: the displacements, as in `run_odometry`; setup: the filter, at the rate of `sequence`;
+    predict: the displacements, as in `run_odometry`; ekf: the filter, at the rate of `sequence`;
     place_std m, time_std s: the standard deviations of a waypoint. Programs are compiled for each
     `predict` and for a few lengths.
 
@@ -105,7 +106,8 @@ def waypoint_poses(
     or do not show the yaw; and where the filter fails, or most waypoints are far from the smoothed
     path.
     """
-    config = dataclasses.replace(setup.config, history="core")
+    config = dataclasses.replace(ekf.config, history="core")
+    ekf = dataclasses.replace(ekf, config=config)
     taps = _checked_waypoints(sequence, config)
     walk = _filled_walk(sequence, config)
 
@@ -123,8 +125,8 @@ def waypoint_poses(
         return interpolate(taps.time, sequence.time, values[:, :2])
 
     # The path without the waypoints, aligned with them.
-    level = _level_start(sequence, setup)
-    _, history = _odometry(predict, level, *walk[:2], config, setup.noise, walk.imu_valid)
+    level = _level_start(sequence, ekf)
+    _, history = _odometry(predict, ekf, level, *walk[:2], walk.imu_valid)
     _, _, position = poses_of(history)
     turn, origin, weight, speed_error = _aligned(at_taps(position), taps, place_std, config)
     yaw = np.arctan2(turn[1, 0], turn[0, 0])
@@ -134,14 +136,14 @@ def waypoint_poses(
         raise InputError(sequence.name, problem, "leave out the walk")
 
     unscaled = {"measurement_scale": 1.0, "std_factor": (1.0, 1.0, 1.0)}
-    noise = setup.noise._replace(**unscaled, correlation=CORRELATION)
-    settings = config, noise, walk.imu_valid, config.displacement_frame
-    std = _start_std(sequence, setup, level)
+    noise = ekf.noise._replace(**unscaled, correlation=CORRELATION)
+    ekf = dataclasses.replace(ekf, noise=noise, start=_start_std(sequence, ekf, level))
+    options = walk.imu_valid, config.displacement_frame
     for _ in range(PASSES):
         rotation, position = rotation_z(yaw) @ level.rotation, np.append(origin, 0.0)
-        start = initial_state(config, rotation, np.zeros(3), position, level.gyro_bias, std=std)
+        start = initial_state(ekf, rotation, np.zeros(3), position, level.gyro_bias)
         fixes = _fixes(sequence, taps, weight, place_std, time_std, walk, config)
-        smoothed = _smooth(start, *walk[:2], displacement, covariance, *settings, (fixes,))
+        smoothed = _smooth(ekf, start, *walk[:2], displacement, covariance, *options, (fixes,))
         rotation, velocity, position = poses_of(smoothed)
         error, travel = taps.position - at_taps(position), time_std * at_taps(velocity)
         spread = place_std**2 * np.eye(2) + travel[:, :, None] * travel[:, None]
@@ -151,7 +153,7 @@ def waypoint_poses(
         yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
 
     smoothed = jax.tree.map(lambda rows: np.asarray(rows)[: walk.count], smoothed)
-    smoothed = _without_yaw_prior(smoothed, std.yaw)
+    smoothed = _without_yaw_prior(smoothed, ekf.start.yaw)
     _check_result(sequence.name, smoothed, weight)
     poses = sequence._replace(
         orientation=quaternion_from_matrix(rotation),
@@ -164,8 +166,8 @@ def waypoint_poses(
     return WaypointPoses(poses, smoothed, weight)
 
 
-_odometry = jax.jit(run_odometry, static_argnames=("predict", "config"))
-_smooth = jax.jit(smooth, static_argnames=("config", "frame"))
+_odometry = jax.jit(run_odometry, static_argnames="predict")
+_smooth = jax.jit(smooth, static_argnames="frame")
 _planar_alignment = jax.jit(geometry.planar_alignment)
 
 
@@ -222,26 +224,26 @@ def _filled_walk(sequence: Sequence, config: FilterConfig) -> _Walk:
     return _Walk(gyro, accel, None if masks is None else masks[0], samples // n)
 
 
-def _level_start(sequence: Sequence, setup: FilterSetup) -> FilterState:
+def _level_start(sequence: Sequence, ekf: Filter) -> FilterState:
     """The level start from the first second that was measured. Raises `InputError`."""
-    measured, count = sequence.measured_rows, round(START_SECONDS / setup.config.dt)
+    measured, count = sequence.measured_rows, round(START_SECONDS / ekf.config.dt)
     rows = measured[measured < count]
     if 2 * len(rows) < count:  # most of it was not measured
         rows = measured[:count]
     signals = sequence.gyro[rows], sequence.accel[rows]
     try:
-        return level_state(setup.config, *signals, setup.initial_std)
+        return level_state(ekf, *signals)
     except ValueError as error:  # e.g. it shows no gravity
         problem = f"has no level start: {error}"
         raise InputError(sequence.name, problem, "repair or leave out the walk") from None
 
 
-def _start_std(sequence: Sequence, setup: FilterSetup, level: FilterState) -> InitialStd:
+def _start_std(sequence: Sequence, ekf: Filter, level: FilterState) -> InitialStd:
     """Standard deviations of the aligned start."""
-    std = setup.initial_std._replace(**START_STD)
+    std = ekf.start._replace(**START_STD)
     raw = sequence.attributes.get("imu_compensated") == "no" and not level.gyro_bias.any()
-    if raw and setup.raw_gyro_bias is not None:
-        std = std._replace(gyro_bias=setup.raw_gyro_bias)
+    if raw and ekf.raw_gyro_bias is not None:
+        std = std._replace(gyro_bias=ekf.raw_gyro_bias)
     return std
 
 

@@ -28,7 +28,7 @@ from gnio_jax.filtering.network import Predict
 from gnio_jax.models import Network
 from gnio_jax.reporting import Reporter
 from gnio_jax.training.checkpoint import Run, load_run
-from gnio_jax.training.task import Task, visits
+from gnio_jax.training.task import Task, visit_count
 from gnio_jax.types import Sequence
 
 Load = Callable[[str], Run]
@@ -36,7 +36,7 @@ Load = Callable[[str], Run]
 a module, because other processes call it too."""
 
 
-class Recordings(NamedTuple):
+class TrainingData(NamedTuple):
     """The data on which a task is trained and validated."""
 
     source: Any
@@ -49,7 +49,7 @@ class Recordings(NamedTuple):
     `data.poses_by`."""
 
 
-class PosesBy(NamedTuple):
+class PoseNetwork(NamedTuple):
     """The network that makes poses of walks with waypoints."""
 
     run: str
@@ -64,7 +64,7 @@ def set_up(
     reporter: Reporter,
     workers: int = 1,
     load: Load = load_run,
-) -> tuple[Task, Recordings]:
+) -> tuple[Task, TrainingData]:
     """Load the recordings and find the windows or segments in them.
 
     Raises `InputError` for options that the network does not have, missing data, recordings that
@@ -79,7 +79,7 @@ def set_up(
         remedy = f"make it a multiple of {devices}, or use fewer --devices"
         raise InputError("optim.batch_size", problem, remedy)
     train, val = config.data.train_split, config.data.val_split
-    names, poses = config.datasets, _poses_by(config, reporter, load)
+    names, pose_network = config.datasets, _load_pose_network(config, reporter, load)
     reporter.line(f"reading {', '.join(names)}: {train} and {val}")
     sources, held_out, splits = [], {}, {}
     for split, training in ((train, True), (val, False)):
@@ -87,36 +87,36 @@ def set_up(
         for name in names:
             label = f"{name}/" if len(names) > 1 else ""
             samples: dict[str, int] = {}
-            sequences = read_split(config, name, split, reporter, workers, samples, poses)
+            sequences = read_split(config, name, split, reporter, workers, samples, pose_network)
             source = task.source_of(sequences, config, training)
             if training:
                 sources.append(source)
             else:
                 held_out[name] = parallel.everywhere(source)
-            splits[split] |= {label + each: count for each, count in samples.items()}
+            splits[split] |= {label + sequence: count for sequence, count in samples.items()}
             hours = sum(samples.values()) / config.data.rate / 3600
             contents = f"{hours:.2f} h, {task.count(source):,} {task.unit}"
             reporter.line(f"  {label}{split}: {len(samples)} sequences, {contents}")
-    both = sorted(set(splits[train]) & set(splits[val]))
-    if both:
+    shared = sorted(set(splits[train]) & set(splits[val]))
+    if shared:
+        examples = f"{', '.join(shared[:3])}{' ...' if shared[3:] else ''}"
         reporter.line(
-            f"warning: {', '.join(both[:3])}{' ...' if both[3:] else ''} in {train} and in {val}: "
-            "the best checkpoint is chosen by recordings that it was trained on; separate the two "
-            "splits"
+            f"warning: {examples} in {train} and in {val}: the best checkpoint is chosen by "
+            "recordings that it was trained on; separate the two splits"
         )
-    if poses is not None:
-        splits["data.poses_by"] = [poses.digest]
+    if pose_network is not None:
+        splits["data.poses_by"] = [pose_network.digest]
     parts = tuple(map(task.count, sources))
-    epoch = sum(map(visits, parts, config.data.weights or [1.0] * len(parts)))
+    epoch = sum(map(visit_count, parts, config.data.weights or [1.0] * len(parts)))
     if epoch < size:
         problem = f"is {size}, but there are only {epoch} {task.unit}"
         raise InputError("optim.batch_size", problem, "lower it")
-    recordings = Recordings(parallel.everywhere(task.joined(sources)), held_out, splits)
-    anywhere = dataclasses.replace(configuration.without_places(config), seed=0)
-    return task(model, anywhere, epoch // size, parts), recordings
+    training_data = TrainingData(parallel.everywhere(task.join(sources)), held_out, splits)
+    portable = dataclasses.replace(configuration.without_paths(config), seed=0)
+    return task(model, portable, epoch // size, parts), training_data
 
 
-def _poses_by(config: TrainConfig, reporter: Reporter, load: Load) -> PosesBy | None:
+def _load_pose_network(config: TrainConfig, reporter: Reporter, load: Load) -> PoseNetwork | None:
     """The network that `data.poses_by` names. Raises `InputError` if its rate is lower than that of
     the trained network, because its poses come with the IMU at its own rate."""
     name = config.data.poses_by
@@ -132,7 +132,7 @@ def _poses_by(config: TrainConfig, reporter: Reporter, load: Load) -> PosesBy | 
             f"warning: {name}: its filter is not calibrated, and smooths worse than interpolation; "
             "calibrate it with gnio calibrate"
         )
-    return PosesBy(name, load, _digest_of_run(run))
+    return PoseNetwork(name, load, digest_network(run))
 
 
 def read_split(
@@ -142,17 +142,19 @@ def read_split(
     reporter: Reporter,
     workers: int,
     samples: dict[str, int],
-    poses: PosesBy | None = None,
+    pose_network: PoseNetwork | None = None,
 ) -> Iterator[Sequence]:
     """The recordings of a split of a dataset at the network's rate, one after another. Recordings
-    with waypoints get the poses that `poses` makes, or else interpolated ones. The number of
+    with waypoints get the poses that `pose_network` makes, or else interpolated ones. The number of
     samples of each recording is written into `samples` by its name. A walk that can have no poses
     is left out with a warning."""
     progress = functools.partial(reporter.progress, f"reading {split}")
-    read: Iterable[Sequence] = data.load_each(dataset, config.data_root, split, workers, progress)
-    if poses is not None:
-        read = _with_smoothed_poses(read, poses, split, reporter, workers)
-    for sequence in read:
+    sequences: Iterable[Sequence] = data.load_each(
+        dataset, config.data_root, split, workers, progress
+    )
+    if pose_network is not None:
+        sequences = _add_smoothed_poses(sequences, pose_network, split, reporter, workers)
+    for sequence in sequences:
         resampled = data.resample(sequence, config.data.rate)
         if resampled.waypoints is not None:
             try:
@@ -164,43 +166,47 @@ def read_split(
         yield resampled
 
 
-def _with_smoothed_poses(
-    read: Iterable[Sequence], by: PosesBy, split: str, reporter: Reporter, workers: int
+def _add_smoothed_poses(
+    sequences: Iterable[Sequence],
+    pose_network: PoseNetwork,
+    split: str,
+    reporter: Reporter,
+    workers: int,
 ) -> Iterator[Sequence]:
     """The recordings, with smoothed poses for those with waypoints. These take seconds per walk, so
     `workers` processes make them, and the cache of recordings keeps them."""
-    held: list[Sequence] = []  # recordings from the first walk with waypoints on
-    for sequence in read:
-        if sequence.waypoints is None and not held:
+    queue: list[Sequence] = []  # recordings from the first walk with waypoints on
+    for sequence in sequences:
+        if sequence.waypoints is None and not queue:
             yield sequence
         else:
-            held.append(sequence)
-    walks = {each.name: each for each in held if each.waypoints is not None}
-    entries = {name: _cache_entry(walk, by) for name, walk in walks.items()}
-    found = {name: read_reading(entry) for name, entry in entries.items()}
-    missing = [(walk, by) for name, walk in walks.items() if found[name] is None]
+            queue.append(sequence)
+    walks = {walk.name: walk for walk in queue if walk.waypoints is not None}
+    entries = {name: _cache_entry(walk, pose_network) for name, walk in walks.items()}
+    readings = {name: read_reading(entry) for name, entry in entries.items()}
+    missing = [(walk, pose_network) for name, walk in walks.items() if readings[name] is None]
     several = workers > 1 and len(missing) > FEW
-    make, workers = (_poses_on_cpu, workers) if several else (smoothed_poses, 1)
+    make, workers = (_smooth_on_cpu, workers) if several else (smooth_poses, 1)
     progress = functools.partial(reporter.progress, f"poses of {split}")
-    made = in_processes(make, missing, workers, progress)
-    for (walk, _), reading in zip(missing, made, strict=True):
+    smoothed = in_processes(make, missing, workers, progress)
+    for (walk, _), reading in zip(missing, smoothed, strict=True):
         write_reading(entries[walk.name], reading)
-        found[walk.name] = reading
-    for sequence in held:
-        reading = found.get(sequence.name) or Reading([sequence])
+        readings[walk.name] = reading
+    for sequence in queue:
+        reading = readings.get(sequence.name) or Reading([sequence])
         for refusal in reading.refusals:
             reporter.line(f"warning: {refusal}")
         yield from reading.sequences
 
 
-def _poses_on_cpu(walk: Sequence, by: PosesBy) -> Reading:
-    """`smoothed_poses` in a process of its own, on the CPU, because the first process uses the
+def _smooth_on_cpu(walk: Sequence, pose_network: PoseNetwork) -> Reading:
+    """`smooth_poses` in a process of its own, on the CPU, because the first process uses the
     GPU."""
     jax.config.update("jax_platforms", "cpu")
-    return smoothed_poses(walk, by)
+    return smooth_poses(walk, pose_network)
 
 
-def smoothed_poses(walk: Sequence, by: PosesBy) -> Reading:
+def smooth_poses(walk: Sequence, pose_network: PoseNetwork) -> Reading:
     """The walk with smoothed poses at the rate of the network that makes them, or the reason why it
     has none.
 
@@ -208,39 +214,41 @@ def smoothed_poses(walk: Sequence, by: PosesBy) -> Reading:
     point ahead, and the taps may belong to another walk.
     """
     with jax.enable_x64(True):
-        rate, predict, setup = _labeller(by)
+        rate, predict, ekf = _load_smoother(pose_network)
         try:
             resampled = data.resample(walk, rate)
             legs = data.with_poses(resampled)
-            poses = filtering.waypoint_poses(resampled, predict, setup).sequence
+            poses = filtering.waypoint_poses(resampled, predict, ekf).sequence
         except InputError as error:
             return Reading([], refusals=(str(error),))
     return Reading([poses.with_reference_where(legs.valid & poses.valid)])
 
 
 @functools.cache
-def _labeller(by: PosesBy) -> tuple[float, Predict, filtering.FilterSetup]:
+def _load_smoother(pose_network: PoseNetwork) -> tuple[float, Predict, filtering.Filter]:
     """A network's rate (Hz), the network and its filter. They are made once, because programs are
     compiled for each network object. Raises `InputError` if the run has changed."""
-    run = by.load(by.run)
-    if _digest_of_run(run) != by.digest:
-        raise InputError(by.run, "has changed while it made poses", "begin the training anew")
+    run = pose_network.load(pose_network.run)
+    if digest_network(run) != pose_network.digest:
+        raise InputError(
+            pose_network.run, "has changed while it made poses", "begin the training anew"
+        )
     network, windows = Network.of(run.model, run.variables), run.config.data
     predict = functools.partial(network.apply, network.variables)
-    return windows.rate, predict, filtering.filter_setup(windows, run.config.filter)
+    return windows.rate, predict, filtering.make_filter(windows, run.config.filter)
 
 
-def _digest_of_run(run: Run) -> str:
+def digest_network(run: Run) -> str:
     """Digest of the settings, without the places of folders, and of the weights of a run."""
-    settings = configuration.flat(configuration.without_places(run.config))
+    settings = configuration.flatten(configuration.without_paths(run.config))
     return _digest(sorted(settings.items()), run.variables)
 
 
-def _cache_entry(walk: Sequence, by: PosesBy) -> Path:
+def _cache_entry(walk: Sequence, pose_network: PoseNetwork) -> Path:
     """The file that keeps the smoothed poses of a walk. Its name is a digest of the walk, the run,
     and the sources that make the poses."""
     arrays = [walk.time, walk.gyro, walk.accel, walk.imu_valid, walk.waypoints]
-    name = _digest([walk.name, sorted(walk.attributes.items()), by.digest], arrays)
+    name = _digest([walk.name, sorted(walk.attributes.items()), pose_network.digest], arrays)
     return cache_entry(name, _sources())
 
 

@@ -43,12 +43,16 @@ def run_and_sensitivity(c, more, rotation, velocity, position, gyro, accel, disp
     """A filter that is disturbed by `c` and then by `more`: its history, sensitivity, and what is
     considered of it."""
     bias = c[:3] + more[:3]
-    start = filtering.initial_state(CONFIG, rotation, velocity, position, bias, std=START)
+    start = filtering.initial_state(
+        filtering.Filter(CONFIG, start=START), rotation, velocity, position, bias
+    )
     given = disturbed(disturbed(displacement, c), more), jax.vmap(jnp.diag)(std**2)
 
     def repeated(start, displacement, covariance):
-        given = gyro, accel, displacement, covariance, CONFIG, NOISE
-        return filtering.run_filter(start, *given, frame="own")[1]
+        ekf = filtering.Filter(CONFIG, NOISE)
+        return filtering.run_filter(ekf, start, gyro, accel, displacement, covariance, frame="own")[
+            1
+        ]
 
     history = repeated(start, *given)
     displacement, covariance = history.given(NOISE)
@@ -159,6 +163,7 @@ def test_the_bias_of_a_raw_gyro_is_covered_while_the_yaw_is_known_to_a_tenth_of_
     config = dataclasses.replace(CONFIG, clones_per_window=clones)
     noise = filtering.NoiseModel(1e-3, 1e-2, 1e-6, 1e-4, measurement_scale=1.0)
     std = filtering.InitialStd(gyro_bias=1e-4, velocity=0.3)
+    ekf = filtering.Filter(config, noise, std)
     runs = simulate(7, count, intervals, N, clones, DT, noise, std, sigma)
     rng, up = np.random.default_rng(5), np.asarray(runs.rotation0)[:, 2]
     vertical = rng.normal(size=(count, 1)) * up
@@ -167,12 +172,11 @@ def test_the_bias_of_a_raw_gyro_is_covered_while_the_yaw_is_known_to_a_tenth_of_
 
     def run(rotation, velocity, position, gyro, accel, displacement, up):
         pose = rotation, velocity, position
-        state = filtering.initial_state(config, *pose, std=std, level_gyro_bias=0.05)
+        state = filtering.initial_state(ekf, *pose, level_gyro_bias=0.05)
         spread = jnp.tile(sigma**2 * jnp.eye(3)[None], (intervals, 1, 1))
 
         def repeated(state, displacement):
-            signals = gyro, accel, displacement, spread, config, noise
-            return filtering.run_filter(state, *signals)[1]
+            return filtering.run_filter(ekf, state, gyro, accel, displacement, spread)[1]
 
         history = repeated(state, displacement)
         rows = filtering.sensitivity(repeated, state, displacement)
@@ -215,7 +219,7 @@ TOLD = Told()
 
 @pytest.fixture(scope="module")
 def ready():
-    tracker = filtering.Tracker(TOLD, CONFIG, NOISE, started(0), considered=STD)
+    tracker = filtering.Tracker(TOLD, filtering.Filter(CONFIG, NOISE, considered=STD), started(0))
     return tracker._advance, tracker._look_ahead
 
 
@@ -227,7 +231,7 @@ def built(monkeypatch, ready):
 def started(r):
     runs, _ = walks()
     pose = runs.rotation0[r], runs.velocity0[r], runs.position0[r]
-    return filtering.initial_state(CONFIG, *pose, drawn()[r, :3], std=START)
+    return filtering.initial_state(filtering.Filter(CONFIG, start=START), *pose, drawn()[r, :3])
 
 
 def test_the_tracker_has_the_covariance_of_the_whole_run(built):
@@ -235,7 +239,9 @@ def test_the_tracker_has_the_covariance_of_the_whole_run(built):
     (runs, _), wanted = walks(), history.covariance + added
     TOLD.calls = 0
     for r in range(TRACKED):
-        tracker = filtering.Tracker(TOLD, CONFIG, NOISE, started(r), considered=STD)
+        tracker = filtering.Tracker(
+            TOLD, filtering.Filter(CONFIG, NOISE, considered=STD), started(r)
+        )
         told = np.nan_to_num(disturbed(runs.displacement[r], drawn()[r]))
         poses = []
         for k in checked_at_first(range(N * STRIDES), 30):
@@ -252,7 +258,7 @@ def test_the_tracker_has_the_covariance_of_the_whole_run(built):
 
 
 def test_a_start_from_rest_considers_from_its_first_pose_on(built):
-    waiting = filtering.Tracker(TOLD, CONFIG, NOISE, considered=STD)
+    waiting = filtering.Tracker(TOLD, filtering.Filter(CONFIG, NOISE, considered=STD))
     rest = [[0.0, 0.0, 0.0], [0.0, 0.0, 9.81]]
     pose = [waiting.push(k * DT, *rest) for k in range(50)][-1]
     variance = np.diag(pose.covariance)[9:12]

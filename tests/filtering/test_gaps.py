@@ -19,15 +19,15 @@ WALK = random_walk(11, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, bias=Fals
 
 
 def start():
-    return filtering.initial_state(CONFIG, *WALK[0])
+    return filtering.initial_state(filtering.Filter(CONFIG), *WALK[0])
 
 
 THERE = np.ones(N * INTERVALS, bool)
 
 
 def run(valid=THERE, gyro=WALK[1], displacement=WALK[3]):
-    given = gyro, WALK[2], displacement, WALK[4], CONFIG, NOISE, valid
-    return filtering.run_filter(start(), *given)
+    given = gyro, WALK[2], displacement, WALK[4], valid
+    return filtering.run_filter(filtering.Filter(CONFIG, NOISE), start(), *given)
 
 
 bridge = jax.jit(gaps.bridge, static_argnums=4)

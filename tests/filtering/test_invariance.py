@@ -55,9 +55,10 @@ def monte_carlo(error, std, intervals=120, hole=0, fix_every=0, fix_std=1.0, smo
     )
 
     def run(rotation, velocity, position, gyro, accel, displacement, fix):
-        state = filtering.initial_state(config, rotation, velocity, position, std=std)
+        ekf = filtering.Filter(config, NOISE, std)
+        state = filtering.initial_state(ekf, rotation, velocity, position)
         spread = jnp.tile(SIGMA**2 * jnp.eye(3)[None], (intervals, 1, 1))
-        signals = state, gyro, accel, displacement, spread, config, NOISE, jnp.asarray(valid)
+        signals = ekf, state, gyro, accel, displacement, spread, jnp.asarray(valid)
         if smoothed:
             return filtering.smooth(*signals, measurements=(fix,))
         return filtering.run_filter(*signals, measurements=(fix,))[1]
@@ -169,10 +170,10 @@ def test_smoothed_states_before_a_large_turn_are_of_one_motion():
     @quick
     def smoothed(gyro, accel, fix):
         std = filtering.InitialStd(tiny, 0.4, tiny, tiny, tiny, tiny)
-        state = filtering.initial_state(config_of("invariant"), *pose, std=std)
         noise = filtering.NoiseModel(tiny, tiny, tiny, tiny)
-        nothing = np.full((intervals, 3), np.nan), spread
-        signals = state, gyro, accel, *nothing, config_of("invariant"), noise
+        ekf = filtering.Filter(config_of("invariant"), noise, std)
+        state = filtering.initial_state(ekf, *pose)
+        signals = ekf, state, gyro, accel, np.full((intervals, 3), np.nan), spread
         return filtering.smooth(*signals, measurements=(fix,))
 
     poses = [np.asarray(part) for part in smoothed(gyro, accel, fix)[:5]]
@@ -197,7 +198,7 @@ def run_pieces(error, pieces, turn=0.0):
     world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     std = filtering.InitialStd(velocity=1.0, yaw=0.4, tilt=0.05)
     pose = world @ walk.rotation0[0], world @ walk.velocity0[0], world @ walk.position0[0]
-    state = filtering.initial_state(config, *pose, std=std)
+    state = filtering.initial_state(filtering.Filter(config, start=std), *pose)
     spread = np.tile(SIGMA**2 * np.eye(3), (40, 1, 1))
     begin = 0
     for end in pieces:
@@ -211,7 +212,9 @@ def run_pieces(error, pieces, turn=0.0):
 @functools.cache
 def program(config):
     return quick(
-        lambda state, *signals: filtering.run_filter(state, *signals, config, NOISE, frame="own")
+        lambda state, *signals: filtering.run_filter(
+            filtering.Filter(config, NOISE), state, *signals, frame="own"
+        )
     )
 
 

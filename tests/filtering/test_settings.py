@@ -68,7 +68,7 @@ def test_every_setting_of_the_filter_is_reachable_from_a_file_or_fixed_by_name()
     others = {
         **{name: 0.5 for name in ("success_seconds", "pause_seconds", "rest_seconds")},
         **{name: 0.25 for name in ("rest_gyro", "rest_accel", "bridge_seconds")},
-        **{name: 0.75 for name in ("gap_gyro_std", "gap_accel_std", "zero_velocity_std")},
+        **{name: 0.75 for name in ("gap_gyro_std", "gap_accel_std")},
         **{"gate_threshold": 7.0, "convergence_seconds": 3.0},
         **{"log_std_min": -5.0, "speed_limit": 9.0},
         **{"error": "additive", "window_rotation": "single"},

@@ -19,7 +19,7 @@ from tests.support.surveyor import survey
 
 RATE, N, SECONDS, LEGS = 50.0, 10, 25.6, 4
 BEGIN, YAW = 50.0, 0.4
-SETUP = filtering.FilterSetup(
+EKF = filtering.Filter(
     filtering.FilterConfig(1 / RATE, N, 5),
     filtering.NoiseModel(3e-3, 3e-2, measurement_scale=1.0),
     filtering.InitialStd(),
@@ -96,7 +96,7 @@ ALL = np.arange(3 * LEGS + 1)
 @functools.cache
 def smoothed_walk():
     """With all waypoints."""
-    return filtering.waypoint_poses(tapped(ALL), predict, SETUP, 0.1, 0.2)
+    return filtering.waypoint_poses(tapped(ALL), predict, EKF, 0.1, 0.2)
 
 
 @pytest.mark.parametrize("numbers, wrong", [(ALL[ALL % 3 != 1], None), (ALL, 5)])
@@ -104,7 +104,7 @@ def test_truer_than_curves_between_the_waypoints(numbers, wrong):
     """In place and speed, of legs whose waypoints within are left out, and with one waypoint in a
     wrong place, which loses its weight. The attitude is that of the map."""
     truth, sequence = walk(), tapped(numbers, wrong)
-    poses, smoothed, weight = filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+    poses, smoothed, weight = filtering.waypoint_poses(sequence, predict, EKF, 0.1, 0.2)
     stamps, target = sequence.waypoints
     line = np.stack([np.interp(truth.time, stamps, x) for x in target.T], axis=1)
     paths = [poses.position[:, :2], PchipInterpolator(stamps, target)(truth.time), line]
@@ -175,7 +175,7 @@ def waypoint_changes():
 @pytest.mark.parametrize(("waypoints", "text"), list(waypoint_changes()))
 def test_waypoints_that_cannot_be_are_refused_in_one_line(waypoints, text):
     with pytest.raises(InputError, match=f"^walk: {text}$"):
-        filtering.waypoint_poses(tapped(ALL)._replace(waypoints=waypoints), predict, SETUP)
+        filtering.waypoint_poses(tapped(ALL)._replace(waypoints=waypoints), predict, EKF)
 
 
 def shortened(sequence, stop):
@@ -210,7 +210,7 @@ def test_an_imu_that_cannot_be_is_refused_in_one_line():
         ),
     ):
         with pytest.raises(InputError, match=f"^walk: {text}") as caught:
-            filtering.waypoint_poses(spoilt, predict, SETUP)
+            filtering.waypoint_poses(spoilt, predict, EKF)
         assert "\n" not in str(caught.value) and "; " in str(caught.value)
 
 
@@ -228,9 +228,7 @@ def test_waypoints_too_near_each_other_are_refused():
         waypoints = Waypoints(time[numbers], line)
         problem = f"^walk: its waypoints show its yaw to {text} only; add waypoints"
         with pytest.raises(InputError, match=problem):
-            filtering.waypoint_poses(
-                sequence._replace(waypoints=waypoints), predict, SETUP, 0.1, 0.2
-            )
+            filtering.waypoint_poses(sequence._replace(waypoints=waypoints), predict, EKF, 0.1, 0.2)
 
 
 def test_a_second_tap_at_one_place_changes_little():
@@ -242,8 +240,8 @@ def test_a_second_tap_at_one_place_changes_little():
     for metres in (0.0, 0.5):
         places = np.insert(position, 1, position[1] + [metres, 0.0], axis=0)
         twice = sequence._replace(waypoints=Waypoints(time, places))
-        _, smoothed, weight = filtering.waypoint_poses(twice, predict, SETUP, 0.1, 0.2)
-        _, once, _ = filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+        _, smoothed, weight = filtering.waypoint_poses(twice, predict, EKF, 0.1, 0.2)
+        _, once, _ = filtering.waypoint_poses(sequence, predict, EKF, 0.1, 0.2)
         np.testing.assert_allclose(smoothed.position, once.position, atol=2.5)
         variances = [part.covariance_diagonal[:, 6:8].sum(axis=1) for part in (smoothed, once)]
         assert np.sqrt(np.max(variances[0]) / np.max(variances[1])) < 1.5
@@ -268,7 +266,7 @@ def test_few_waypoints_show_yaw_and_place_as_well_as_the_covariance_says(numbers
         rows = np.searchsorted(truth.time, ends)
         position = truth.position[rows, :2] + 0.1 * rng.normal(size=(4, 2))
         taps = Waypoints(np.maximum(time, 0.0)[numbers], position[numbers])
-        poses, smoothed, _ = filtering.waypoint_poses(unknown(truth, taps), follow, SETUP, 0.1, 0.2)
+        poses, smoothed, _ = filtering.waypoint_poses(unknown(truth, taps), follow, EKF, 0.1, 0.2)
         variance = smoothed.covariance_diagonal[: (len(truth.time) - 1) // N]
         clones = N * (1 + np.arange(len(variance)))
         yaw = (attitudes(poses) * attitudes(truth).inv()).as_rotvec()[clones, 2]
@@ -284,7 +282,7 @@ def test_a_walk_whose_waypoints_lose_their_weight_is_refused():
     sequence = sequence._replace(gyro=sequence.gyro - np.array([0.0, 0.0, 0.15]))
     problem = "^walk: [0-9]+ of its 13 waypoints are far from the smoothed path; check"
     with pytest.raises(InputError, match=problem):
-        filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+        filtering.waypoint_poses(sequence, predict, EKF, 0.1, 0.2)
 
 
 def test_the_covariance_without_a_prior_of_the_yaw_has_the_information_of_the_rest():
@@ -315,9 +313,9 @@ def test_the_aligned_yaw_is_no_second_measurement(monkeypatch):
     """It comes from the waypoints. With a prior of half its standard deviation the yaw is as
     uncertain as with the whole one."""
     sequence = tapped(ALL[[0, 3, 6, 12]])
-    _, whole, _ = filtering.waypoint_poses(sequence, predict, SETUP, 0.3, 0.2)
+    _, whole, _ = filtering.waypoint_poses(sequence, predict, EKF, 0.3, 0.2)
     monkeypatch.setitem(smoothing.START_STD, "yaw", 0.1)
-    _, half, _ = filtering.waypoint_poses(sequence, predict, SETUP, 0.3, 0.2)
+    _, half, _ = filtering.waypoint_poses(sequence, predict, EKF, 0.3, 0.2)
     variances = [part.covariance_diagonal[:, 2] for part in (half, whole)]
     np.testing.assert_allclose(*variances, rtol=0.2)
     assert variances[1].min() > 0.1**2
@@ -336,10 +334,10 @@ def test_the_factors_of_the_noise_count_once():
         return Prediction(displacement, log_std + jnp.log(3.0))
 
     factors = {"measurement_scale": 2.25, "std_factor": (2.0, 2.0, 2.0)}
-    less = SETUP._replace(noise=SETUP.noise._replace(**factors))
+    less = dataclasses.replace(EKF, noise=EKF.noise._replace(**factors))
     smoothed, other = (
-        filtering.waypoint_poses(tapped(ALL), network, setup, 0.1, 0.2).smoothed
-        for network, setup in ((predict, less), (unsure, SETUP))
+        filtering.waypoint_poses(tapped(ALL), network, ekf, 0.1, 0.2).smoothed
+        for network, ekf in ((predict, less), (unsure, EKF))
     )
     np.testing.assert_allclose(smoothed.position, other.position, atol=1e-5)
     np.testing.assert_allclose(smoothed.covariance_diagonal, other.covariance_diagonal, rtol=1e-4)
@@ -355,9 +353,9 @@ def test_a_raw_gyro_and_taps_beside_the_first_and_the_last_stamp():
     ends = sequence.time[0] - 2.5 / RATE, sequence.time[-1] + 2.5 / RATE
     stamps = np.concatenate([ends[:1], sequence.waypoints.time[1:-1], ends[1:]])
     beyond = sequence._replace(waypoints=sequence.waypoints._replace(time=stamps))
-    _, smoothed, _ = filtering.waypoint_poses(beyond, predict, SETUP, 0.1, 0.2)
+    _, smoothed, _ = filtering.waypoint_poses(beyond, predict, EKF, 0.1, 0.2)
     np.testing.assert_allclose(smoothed.position, smoothed_walk().smoothed.position, atol=0.05)
-    wide, bias = SETUP._replace(raw_gyro_bias=0.05), 11  # of the gyro about z
+    wide, bias = dataclasses.replace(EKF, raw_gyro_bias=0.05), 11  # of the gyro about z
     for compensated, least, most in (("no", 1.5, np.inf), ("Android's gyro bias", 1.0, 1.0)):
         phone = sequence._replace(attributes={"imu_compensated": compensated})
         _, smoothed, _ = filtering.waypoint_poses(phone, predict, wide, 0.1, 0.2)
@@ -388,7 +386,7 @@ def test_a_gap_at_the_start_is_no_rest():
     )
     sequence = with_gap(sequence, np.arange(1, 60))
     assert np.abs(sequence.gyro[30]).max() > 0.2  # rad/s
-    poses, smoothed, weight = filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+    poses, smoothed, weight = filtering.waypoint_poses(sequence, predict, EKF, 0.1, 0.2)
     assert rms(poses.position[:, :2] - truth.position[:, :2]) < 0.3
     assert np.abs(smoothed.gyro_bias).max() < 0.02 and weight.min() > 0.5
     angle = (attitudes(poses) * attitudes(truth).inv())[60:].magnitude()
@@ -398,7 +396,7 @@ def test_a_gap_at_the_start_is_no_rest():
 def test_without_a_window_that_was_measured_there_are_no_poses():
     sequence = tapped(ALL)._replace(imu_valid=np.arange(len(walk().time)) % 50 < 20)
     with pytest.raises(InputError, match=r"^walk: has no 1 s that were measured without a gap; l"):
-        filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+        filtering.waypoint_poses(sequence, predict, EKF, 0.1, 0.2)
 
 
 CUT, WHOLE = 827, 82
@@ -409,10 +407,10 @@ def test_a_walk_ends_with_its_samples():
     """No estimate is made with samples behind the end: those that follow the last whole interval
     change nothing before them, and their poses are integrated from the last estimate."""
     sequence = shortened(tapped(ALL), CUT)
-    poses, smoothed, _ = filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+    poses, smoothed, _ = filtering.waypoint_poses(sequence, predict, EKF, 0.1, 0.2)
     whole = shortened(tapped(ALL), WHOLE * N)
     assert len(whole.waypoints.time) == len(sequence.waypoints.time)
-    expected = filtering.waypoint_poses(whole, predict, SETUP, 0.1, 0.2)
+    expected = filtering.waypoint_poses(whole, predict, EKF, 0.1, 0.2)
     for part, other in zip(smoothed, expected.smoothed, strict=True):
         if part is not None:
             assert len(part) == WHOLE
@@ -443,7 +441,7 @@ def test_a_tap_after_the_last_whole_interval_is_taken():
     )
     moved = taps._replace(position=changed(taps.position, -1, taps.position[-1] + 0.5))
     ends = [
-        filtering.waypoint_poses(sequence._replace(waypoints=waypoints), predict, SETUP, 0.1, 0.0)
+        filtering.waypoint_poses(sequence._replace(waypoints=waypoints), predict, EKF, 0.1, 0.0)
         for waypoints in (taps, moved)
     ]
     end, shifted = (poses.sequence.position[row, :2] for poses in ends)
@@ -456,10 +454,10 @@ def test_taps_become_fixes_that_no_test_refuses():
     large covariance."""
     sequence = shortened(tapped(ALL), CUT)
     weight = np.linspace(0.1, 1.4, len(sequence.waypoints.time))
-    walk_imu = smoothing._filled_walk(sequence, SETUP.config)
+    walk_imu = smoothing._filled_walk(sequence, EKF.config)
     behind = np.linalg.norm(walk_imu.gyro[CUT:], axis=1)
-    assert len(behind) == 128 * N - CUT and (behind > SETUP.config.rest_gyro).all()
-    fixes = smoothing._fixes(sequence, sequence.waypoints, weight, 0.1, 0.2, walk_imu, SETUP.config)
+    assert len(behind) == 128 * N - CUT and (behind > EKF.config.rest_gyro).all()
+    fixes = smoothing._fixes(sequence, sequence.waypoints, weight, 0.1, 0.2, walk_imu, EKF.config)
     rows = np.flatnonzero(np.isfinite(fixes.position).all(axis=1))
     assert len(fixes.position) == len(walk_imu.gyro) // N == 128 and walk_imu.count == WHOLE
     assert len(rows) == len(weight) and rows[-1] < WHOLE
@@ -472,6 +470,21 @@ def test_taps_become_fixes_that_no_test_refuses():
     np.testing.assert_allclose(stamps, sequence.waypoints.time, atol=1e-9)
 
 
+def test_the_error_of_the_path_is_horizontal_and_no_displacement_is_of_samples_behind_the_walk():
+    config, sequence = dataclasses.replace(EKF.config, history="core"), tapped(ALL)
+    ekf = dataclasses.replace(EKF, config=config)
+    imu = smoothing._filled_walk(shortened(sequence, CUT), config)
+    level = smoothing._level_start(sequence, ekf)
+    _, history = smoothing._odometry(predict, ekf, level, *imu[:2], None)
+    displacement, covariance = smoothing._displacements(history, 0.4, imu.count, config)
+    measured = np.arange(config.first_measured, WHOLE)
+    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(displacement[:, 0])), measured)
+    np.testing.assert_array_equal(displacement[measured], history.displacement[measured])
+    variances = np.exp(2 * np.log([0.3, 0.1, 0.1])) + np.array([0.4, 0.4, 0.0]) ** 2
+    for row in measured:
+        np.testing.assert_allclose(covariance[row], np.diag(variances), rtol=1e-6)
+
+
 def test_between_estimates_lies_the_cubic_of_their_positions_and_velocities():
     """Where the IMU measures gravity alone; and from the end of the last whole interval on, a
     straight line."""
@@ -480,7 +493,7 @@ def test_between_estimates_lies_the_cubic_of_their_positions_and_velocities():
     velocity, position = rng.normal(size=(2, rows, 3))
     ends = Mean(rotation, velocity, position, np.zeros((rows, 3)), np.zeros((rows, 3)))
     accel = np.tile([0.0, 0.0, GRAVITY], (rows * N, 1))
-    poses = smoothing._between_clones(ends, np.zeros((rows * N, 3)), accel, count, SETUP.config)
+    poses = smoothing._between_clones(ends, np.zeros((rows * N, 3)), accel, count, EKF.config)
     time = np.arange(rows * N) / RATE
     stamps = (np.arange(rows) + 1) * N / RATE
     cubic = CubicHermiteSpline(stamps[:count], position[:count], velocity[:count])
@@ -506,14 +519,14 @@ def test_between_estimates_of_one_motion_lies_that_motion():
     for k in range(count * N):
         motion.append(manifold.integrate(motion[-1], gyro[k : k + 1], accel[k : k + 1], 1 / RATE))
     ends = Mean(*(np.stack(part) for part in zip(*motion[N::N], strict=True)))
-    poses = smoothing._between_clones(ends, gyro, accel, count, SETUP.config)
+    poses = smoothing._between_clones(ends, gyro, accel, count, EKF.config)
     for part, expected in zip(poses, zip(*motion[:-1], strict=True), strict=False):
         np.testing.assert_allclose(part, np.stack(expected), atol=1e-9)
 
 
 @pytest.mark.slow
 def test_what_is_behind_the_end_is_no_rest():
-    setup = SETUP._replace(config=dataclasses.replace(SETUP.config, zero_velocity_std=0.02))
+    ekf = dataclasses.replace(EKF, measurements=(filtering.ZeroVelocity(0.02),))
     cut = shortened(tapped(ALL), CUT)
-    poses, _, _ = filtering.waypoint_poses(cut, predict, setup, 0.1, 0.2)
+    poses, _, _ = filtering.waypoint_poses(cut, predict, ekf, 0.1, 0.2)
     np.testing.assert_allclose(poses.velocity[-1, :2], walk().velocity[CUT - 1, :2], atol=0.2)

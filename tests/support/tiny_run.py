@@ -106,20 +106,12 @@ def assert_same_runs(workdir, other):
         assert ours == pytest.approx(theirs, rel=1e-6)
 
 
-def age(run):
-    """Make the checkpoints of a run those of an earlier version."""
-    for file in Path(run).glob("checkpoints/*/*/meta/metadata"):
-        meta = json.loads(file.read_text())
-        assert meta.pop("version") == checkpoint.VERSION
-        file.write_text(json.dumps(meta))
-
-
 @contextlib.contextmanager
 def stopped_at(step, act=lambda: signal.raise_signal(signal.SIGTERM)):
     """One step a dispatch, and `act` once a run has reached this one."""
-    real = loop.after_steps
+    real = loop.add_steps
 
-    def after_steps(*given):
+    def add_steps(*given):
         at = real(*given)
         if at.step == step:
             act()
@@ -127,5 +119,5 @@ def stopped_at(step, act=lambda: signal.raise_signal(signal.SIGTERM)):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "DISPATCH_SECONDS", 0)
-        patch.setattr(loop, "after_steps", after_steps)
+        patch.setattr(loop, "add_steps", add_steps)
         yield
