@@ -14,6 +14,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.filtering import waypoints as smoothing
 from gnio_jax.filtering.state import Mean
 from gnio_jax.types import GRAVITY, Prediction, Sequence, Waypoints
+from tests.support import manifold
 from tests.support.surveyor import survey
 
 RATE, N, SECONDS, LEGS = 50.0, 10, 25.6, 4
@@ -203,6 +204,10 @@ def test_an_imu_that_cannot_be_is_refused_in_one_line():
         (sequence._replace(accel=changed(sequence.accel, 8, np.inf)), "field 'accel' is .* row 9;"),
         (sequence._replace(accel=0.01 * sequence.accel), "has no level start: .*shows no gravity"),
         (sequence._replace(imu_valid=rows < 49), "49 of its samples were measured, at least 50"),
+        (
+            sequence._replace(accel=changed(sequence.accel, 400, 1e200)),
+            "the filter fails on it; leave",
+        ),
     ):
         with pytest.raises(InputError, match=f"^walk: {text}") as caught:
             filtering.waypoint_poses(spoilt, predict, EKF)
@@ -320,18 +325,37 @@ def test_the_aligned_yaw_is_no_second_measurement(monkeypatch):
 # ------------------------------------------------------------------------------------------------
 
 
-def test_less_trust_in_network_or_gyro_and_a_tap_beside_the_last_stamp():
-    """The uniform clock ends up to a sample of the phone before the tap that ended the recording; a
-    raw gyro starts with the wide prior of its bias, and another one does not."""
+def test_the_factors_of_the_noise_count_once():
+    """A network that is three times as uncertain is one whose covariance has a factor of 9. Both
+    are trusted less than that without a factor."""
+
+    def unsure(windows):
+        displacement, log_std, _ = predict(windows)
+        return Prediction(displacement, log_std + jnp.log(3.0))
+
+    factors = {"measurement_scale": 2.25, "std_factor": (2.0, 2.0, 2.0)}
+    less = dataclasses.replace(EKF, noise=EKF.noise._replace(**factors))
+    smoothed, other = (
+        filtering.waypoint_poses(tapped(ALL), network, ekf, 0.1, 0.2).smoothed
+        for network, ekf in ((predict, less), (unsure, EKF))
+    )
+    np.testing.assert_allclose(smoothed.position, other.position, atol=1e-5)
+    np.testing.assert_allclose(smoothed.covariance_diagonal, other.covariance_diagonal, rtol=1e-4)
+    variances = (part.covariance_diagonal[:, 6:8] for part in (smoothed, smoothed_walk().smoothed))
+    assert np.divide(*(part.mean() for part in variances)) > 1.02
+
+
+def test_a_raw_gyro_and_taps_beside_the_first_and_the_last_stamp():
+    """The uniform clock begins up to a sample of the phone after the tap that began the recording,
+    and ends before the one that ended it; a raw gyro starts with the wide prior of its bias, and
+    another one does not."""
     sequence, variances = tapped(ALL), smoothed_walk().smoothed.covariance_diagonal
-    stamps = np.append(sequence.waypoints.time[:-1], sequence.time[-1] + 2.5 / RATE)
+    ends = sequence.time[0] - 2.5 / RATE, sequence.time[-1] + 2.5 / RATE
+    stamps = np.concatenate([ends[:1], sequence.waypoints.time[1:-1], ends[1:]])
     beyond = sequence._replace(waypoints=sequence.waypoints._replace(time=stamps))
-    less = dataclasses.replace(EKF, noise=EKF.noise._replace(measurement_scale=9.0))
-    horizontal, bias = slice(6, 8), 11  # of the position, and of the gyro about z
-    _, smoothed, _ = filtering.waypoint_poses(beyond, predict, less, 0.1, 0.2)
-    mean = smoothed.covariance_diagonal[:, horizontal].mean()
-    assert mean > 1.02 * variances[:, horizontal].mean()
-    wide = dataclasses.replace(EKF, raw_gyro_bias=0.05)
+    _, smoothed, _ = filtering.waypoint_poses(beyond, predict, EKF, 0.1, 0.2)
+    np.testing.assert_allclose(smoothed.position, smoothed_walk().smoothed.position, atol=0.05)
+    wide, bias = dataclasses.replace(EKF, raw_gyro_bias=0.05), 11  # of the gyro about z
     for compensated, least, most in (("no", 1.5, np.inf), ("Android's gyro bias", 1.0, 1.0)):
         phone = sequence._replace(attributes={"imu_compensated": compensated})
         _, smoothed, _ = filtering.waypoint_poses(phone, predict, wide, 0.1, 0.2)
@@ -426,10 +450,13 @@ def test_a_tap_after_the_last_whole_interval_is_taken():
 
 
 def test_taps_become_fixes_that_no_test_refuses():
-    """In the intervals that the walk fills; a small weight is a large covariance."""
+    """In the intervals that the walk fills, behind which there is no rest; a small weight is a
+    large covariance."""
     sequence = shortened(tapped(ALL), CUT)
     weight = np.linspace(0.1, 1.4, len(sequence.waypoints.time))
     walk_imu = smoothing._filled_walk(sequence, EKF.config)
+    behind = np.linalg.norm(walk_imu.gyro[CUT:], axis=1)
+    assert len(behind) == 128 * N - CUT and (behind > EKF.config.rest_gyro).all()
     fixes = smoothing._fixes(sequence, sequence.waypoints, weight, 0.1, 0.2, walk_imu, EKF.config)
     rows = np.flatnonzero(np.isfinite(fixes.position).all(axis=1))
     assert len(fixes.position) == len(walk_imu.gyro) // N == 128 and walk_imu.count == WHOLE
@@ -441,6 +468,21 @@ def test_taps_become_fixes_that_no_test_refuses():
     np.testing.assert_allclose(fixes.time_std[rows], 0.2 / np.sqrt(weight))
     stamps = sequence.time[0] + (rows + 1) * N / RATE - fixes.before_end[rows]
     np.testing.assert_allclose(stamps, sequence.waypoints.time, atol=1e-9)
+
+
+def test_the_error_of_the_path_is_horizontal_and_no_displacement_is_of_samples_behind_the_walk():
+    config, sequence = dataclasses.replace(EKF.config, history="core"), tapped(ALL)
+    ekf = dataclasses.replace(EKF, config=config)
+    imu = smoothing._filled_walk(shortened(sequence, CUT), config)
+    level = smoothing._level_start(sequence, ekf)
+    _, history = smoothing._odometry(predict, ekf, level, *imu[:2], None)
+    displacement, covariance = smoothing._displacements(history, 0.4, imu.count, config)
+    measured = np.arange(config.first_measured, WHOLE)
+    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(displacement[:, 0])), measured)
+    np.testing.assert_array_equal(displacement[measured], history.displacement[measured])
+    variances = np.exp(2 * np.log([0.3, 0.1, 0.1])) + np.array([0.4, 0.4, 0.0]) ** 2
+    for row in measured:
+        np.testing.assert_allclose(covariance[row], np.diag(variances), rtol=1e-6)
 
 
 def test_between_estimates_lies_the_cubic_of_their_positions_and_velocities():
@@ -464,6 +506,22 @@ def test_between_estimates_lies_the_cubic_of_their_positions_and_velocities():
     np.testing.assert_allclose(poses[1][tail], np.tile(velocity[count - 1], (N, 1)), atol=1e-10)
     for k in range(count):
         np.testing.assert_allclose(poses[0][(k + 1) * N], rotation[k], atol=1e-10)
+
+
+def test_between_estimates_of_one_motion_lies_that_motion():
+    """From the start on, which is before the first estimate."""
+    rng, count = np.random.default_rng(3), 6
+    gyro, accel = 2 * rng.normal(size=(count * N, 3)), 5 * rng.normal(size=(count * N, 3))
+    rotation = Rotation.from_euler("xyz", [0.3, -0.4, 2.0]).as_matrix()
+    state = rotation, np.array([1.0, -0.5, 0.2]), np.array([3.0, -2.0, 1.0])
+    state = *state, np.array([0.1, -0.2, 0.15]), np.array([0.1, 0.05, -0.08])
+    motion = [state]
+    for k in range(count * N):
+        motion.append(manifold.integrate(motion[-1], gyro[k : k + 1], accel[k : k + 1], 1 / RATE))
+    ends = Mean(*(np.stack(part) for part in zip(*motion[N::N], strict=True)))
+    poses = smoothing._between_clones(ends, gyro, accel, count, EKF.config)
+    for part, expected in zip(poses, zip(*motion[:-1], strict=True), strict=False):
+        np.testing.assert_allclose(part, np.stack(expected), atol=1e-9)
 
 
 @pytest.mark.slow
