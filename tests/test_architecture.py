@@ -35,7 +35,7 @@ LIBRARIES = {
     "bokeh": {"evaluation.page"},
     "flax": {"models", "networks", "training", "evaluation"},
     "jax2onnx": {"apps.onnx.conversion"},
-    "loky": {"data.loading"},
+    "loky": {"data.workers"},
     "mcap": {"apps.importing.ros", "apps.export"},
     "matplotlib": {"drawing", "data.pictures", "evaluation.plots", "tables.plots"},
     "onnx": ONNX,
@@ -54,8 +54,8 @@ LIBRARIES = {
 REFUSED = set("found own each given there known place seen about asked kept told here both".split())
 REFUSED |= set("these those wanted taken laid made left rest apart since late".split())
 """Words that do not say what a variable holds."""
-OLD_NAMES = ("apps/importing", "apps/live", "apps/track", "data/parsing", "filtering")
-OLD_NAMES += ("evaluation/estimate.py", "evaluation/evaluate.py", "evaluation/prepare.py")
+OLD_NAMES = ("apps/live", "apps/track", "filtering/propagation", "filtering/scan")
+OLD_NAMES += ("filtering/state", "filtering/update", "filtering/waypoints")
 """Rooms and modules whose variables still have such names."""
 
 
