@@ -314,9 +314,9 @@ def test_evaluation_and_track_of_one_walk_are_equal_to_the_bit(runs, tmp_path, n
     rows = np.column_stack([*columns, known_walk.position(time)])
     np.savetxt(folder / "walk.csv", rows, delimiter=",", header=names, comments="", fmt="%.9f")
     walk = import_recording(folder / "walk.csv")
-    tracked = track(walk, packages.choose(runs / network), tmp_path / "t").estimate
+    tracked = track(walk, read_network(runs / network), tmp_path / "t").estimate
     config = EvaluateConfig(
-        workdir=str(runs / network),
+        network=str(runs / network),
         dataset="csv",
         data_root=str(folder),
         init="static",
