@@ -134,8 +134,31 @@ def _cell(figures: Report, metric: str) -> str:
 
 def _shorten(network: str) -> str:
     """The name of a network, or a run without the folders of this machine."""
-    is_name = network in networks.list_networks() and not Path(network).exists()
-    return shlex.quote(network if is_name else f"runs/{Path(network).name}")
+    names = {str(path): name for name, path in networks.list_networks().items()}
+    is_name = network in names.values() and not Path(network).exists()
+    return shlex.quote(network if is_name else names.get(network, f"runs/{Path(network).name}"))
+
+
+def _write_recipe(card: Card, network: TrainedNetwork) -> str:
+    """The commands that make the network, Markdown, and to what its filter is fitted."""
+    if network.card is not None:
+        return f"It is the published network `{network.card.name}`, whose card has the recipe."
+    config, folder = network.config, network.path or Path()
+    start = f" --init-from {_shorten(config.init_from)}" if config.init_from else ""
+    if config.data.poses_by:
+        start += f" --set data.poses_by={_shorten(config.data.poses_by)}"
+    steps, remark = [f"gnio train --config config.yaml --workdir runs/{card.name}{start}"], ""
+    if (folder / "calibration.json").is_file():
+        calibration = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
+        fitted = _shorten(calibration["run"])
+        if fitted == f"runs/{folder.name.removesuffix('_calibrated')}":
+            fitted = f"runs/{card.name}"
+        steps = steps if "runs/" in fitted else []  # a published network has its own recipe
+        headings = " --average-headings" if calibration.get("average_headings") else ""
+        steps.append(f"gnio calibrate --network {fitted}{headings}")
+        name = fitted.removeprefix("runs/")
+        remark = f"\n\nThe filter is fitted to split `{calibration['split']}` of run `{name}`."
+    return "\n".join(("```", *steps, "```")) + remark
 
 
 def _write_text(
@@ -143,22 +166,6 @@ def _write_text(
 ) -> str:
     """The text of the card, Markdown."""
     config, windows, name = network.config, network.config.data, card.name
-    folder = network.path or Path()
-    start = f" --init-from {_shorten(config.init_from)}" if config.init_from else ""
-    if windows.poses_by:
-        start += f" --set data.poses_by={_shorten(windows.poses_by)}"
-    steps, filter_note = [f"gnio train --config config.yaml --workdir runs/{name}{start}"], ""
-    if (folder / "calibration.json").is_file():
-        calibration = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
-        fitted_run = Path(calibration["run"]).name
-        if fitted_run == folder.name.removesuffix("_calibrated"):
-            fitted_run = name
-        headings = " --average-headings" if calibration.get("average_headings") else ""
-        steps.append(f"gnio calibrate --network runs/{fitted_run}{headings}")
-        filter_note = (
-            f" The filter is fitted to split `{calibration['split']}` of run `{fitted_run}`."
-        )
-    recipe = "\n".join(("```", *steps, "```"))
     considered = [name for name, std in config.filter.considered._asdict().items() if std > 0]
     has_waypoints = any(AT_WAYPOINTS[0] in evaluation.summary() for evaluation in figures.values())
     metrics = (*SHOWN, *AT_WAYPOINTS) if has_waypoints else SHOWN
@@ -194,11 +201,11 @@ Licence: {card.license}
 
 ## Recipe
 
-{recipe}
+{_write_recipe(card, network)}
 
 Dataset `{", ".join(config.datasets)}`, seed {config.seed}. config.yaml beside this card has all \
 settings, those of the filter as they are used. Consider covariance of the filter: \
-{", ".join(considered) or "none"}.{filter_note}
+{", ".join(considered) or "none"}.
 
 ## Figures
 

@@ -126,6 +126,7 @@ def test_a_published_network_is_published_again(published, monkeypatch, tmp_path
     write_report(tmp_path / "evaluations" / "walk" / "tyrex_test_ekf", figures)
     card = publish(published / "walk", tmp_path / "again.zip", "again", *SAID)
     assert (card.name, card.measured) == ("again", "ATE 2-D is 1.25 m on tyrex_test_ekf")
+    assert "It is the published network `walk`, whose card has" in read_text(tmp_path / "again.zip")
     first, second = map(read_network, (published / "walk", tmp_path / "again.zip"))
     assert first.config == second.config and first.digest == second.digest
 
