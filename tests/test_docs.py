@@ -27,6 +27,7 @@ SMALLER = {
         "6001": "221",
         "300": "11",
         "range(15)": "range(2)",
+        "skiprows=1": "skiprows=1, max_rows=300",
     },
     "docs/differentiable_filter.md": {"20 * 100": "20 * 25", "range(20)": "range(5)"},
     "docs/notebooks/learn_noise.py": {"SECONDS = 30": "SECONDS = 2", "STEPS = 150": "STEPS = 2"},
@@ -70,11 +71,17 @@ def code_of(page):
 
 
 @pytest.mark.slow
-def test_the_example_of_the_readme(one_walk, capsys, monkeypatch):
+def test_the_examples_of_the_readme(one_walk, tmp_path, capsys, monkeypatch):
     """With weights that NumPy has drawn: those of each shape would be a program."""
     monkeypatch.setattr(models, "initialise", lambda model, _: drawn(models.variable_shapes(model)))
-    run("README.md", code_of("README.md"))
-    shape, *steps = capsys.readouterr().out.splitlines()
+    monkeypatch.chdir(pages.ROOT)
+    with tiny_run.known():
+        config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
+        weights = packages.choose(tiny_run.save(tmp_path / "run", config))
+        monkeypatch.setattr(packages, "choose", lambda _: weights)
+        run("README.md", code_of("README.md"))
+    last, shape, *steps = capsys.readouterr().out.replace("\n ", " ").splitlines()
+    assert last.startswith("2.9 [") and last.count(".") == 13
     assert shape == "(11, 3)"
     losses, densities = np.array([line.split() for line in steps], float).T
     assert losses[1] < losses[0] and densities[1] < densities[0] < 1e-2

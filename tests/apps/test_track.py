@@ -261,10 +261,10 @@ def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, m
 
 
 def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monkeypatch):
-    given = {}
+    filters = []
 
-    def prepare(_, windows, std, **how):
-        given.update(how, std=std)
+    def prepare(_, windows, ekf, **how):
+        filters.append(ekf)
         raise InterruptedError
 
     monkeypatch.setattr("gnio_jax.apps.track.prepare", prepare)
@@ -275,7 +275,7 @@ def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monk
     walk = Imported(without_poses("walk", np.arange(620) / 100), (), ())
     with pytest.raises(InterruptedError):
         track(walk, weights, tmp_path / "t")
-    assert given["std"].velocity == 0.7 and given["raw_gyro_bias"] == 0.02
+    assert filters[0].start.velocity == 0.7 and filters[0].raw_gyro_bias == 0.02
 
 
 FIGURES = (0.0, 100.0, 80.0, 1.0, 2.0, 0.0, 0.0, 0.5, 1.0)

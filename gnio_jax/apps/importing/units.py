@@ -114,12 +114,21 @@ def check_rad_per_second(imu: Motion, path: Path) -> None:
     """Raise `InputError` if a gyro whose unit a format or header states differs from the rotation
     of gravity by the factor between rad and deg. `imu` is in SI units according to that
     statement."""
+    if contradiction := contradicting_unit(imu):
+        problem = f"its gyro looks like {contradiction[0]}, which it does not say"
+        problem += f" ({contradiction[1]})"
+        raise InputError(path, problem, "state the unit of the gyro: rad/s or deg/s")
+
+
+def contradicting_unit(imu: Motion) -> tuple[str, str] | None:
+    """The unit that the rotation of gravity gives a gyro, and the reason, if it differs from the
+    stated one by the factor between rad and deg; None if it does not, or shows nothing. `imu` is in
+    SI units according to that statement."""
     (slope, told), factor = _turning_of_gravity(imu), TO_RAD_PER_SECOND["deg/s"]
-    for share, looks in ((slope / factor, "deg/s"), (slope * factor, "rad/s")):
+    for share, unit in ((slope / factor, "deg/s"), (slope * factor, "rad/s")):
         if told and 0.5 < share < 2.0:
-            turns = f"gravity turns by {slope:.3g} of it"
-            problem = f"its gyro looks like {looks}, which it does not say ({turns})"
-            raise InputError(path, problem, "state the unit of the gyro: rad/s or deg/s")
+            return unit, f"gravity turns by {slope:.3g} of it"
+    return None
 
 
 def _turning_of_gravity(imu: Motion) -> tuple[float, bool]:
