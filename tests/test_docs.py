@@ -1,7 +1,9 @@
 """What the pages say runs: their Python, and their command lines as far as the parser."""
 
 import ast
+import dataclasses
 import importlib
+import inspect
 import re
 
 import jax
@@ -243,6 +245,53 @@ def test_the_reference_has_every_room():
             page = (docs / "api" / f"{room}.md").read_text(encoding="utf-8")
             assert f"\n::: gnio_jax.{room}\n" in page
             assert f"api/{room}.md" in navigation and room in gnio_jax.__all__
+
+
+LEFT_OUT = {"gnio_jax.apps.packages.publish"}
+"""Functions whose docstrings do not list their arguments yet."""
+
+
+def functions_of_the_reference():
+    """Every function and every class with a constructor of its own that docs/api shows."""
+    members = {}
+    for page in (pages.ROOT / "docs/api").glob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        for target, options in re.findall(r"^::: ([\w.]+)\n?(?: +options: (.*))?", text, re.M):
+            try:
+                module = importlib.import_module(target)
+            except ModuleNotFoundError:
+                home, _, name = target.rpartition(".")
+                members[target] = member(home, name)
+                continue
+            listed = re.search(r"members: (?:\[(.*)\]|false)", options)
+            names = getattr(module, "__all__", None) or [
+                name
+                for name, value in vars(module).items()
+                if not name.startswith("_") and getattr(value, "__module__", "") == target
+            ]
+            names = filter(None, (listed[1] or "").split(", ")) if listed else names
+            members |= {f"{target}.{name}": getattr(module, name) for name in names}
+    return {
+        name: value
+        for name, value in members.items()
+        if inspect.isfunction(value)
+        or (inspect.isclass(value) and inspect.isfunction(value.__init__))
+    }
+
+
+def test_a_function_of_five_arguments_lists_them():
+    """With all names and no other; fields of settings and tuples have docstrings of their own."""
+    long = 0
+    for name, value in functions_of_the_reference().items():
+        if dataclasses.is_dataclass(value) or name in LEFT_OUT:
+            continue
+        arguments = list(inspect.signature(value).parameters)
+        if len(arguments) >= 5:
+            section = re.search(r"\nArgs:\n((?: .*\n?)+)", inspect.cleandoc(value.__doc__ or ""))
+            assert section, f"{name}: its docstring has no section 'Args:'"
+            assert re.findall(r"^ {4}(\w+): ", section[1], re.M) == arguments, name
+            long += 1
+    assert long >= 20
 
 
 def test_every_network_is_named_where_people_look():

@@ -113,13 +113,23 @@ def track(
     command: str = "",
     rerun_file: Path | None = None,
 ) -> Tracked:
-    """Track a recording and write trajectory, picture, page and summary into the folder `out`.
+    """Track a recording and write trajectory, picture, page and summary into a folder.
 
     The stamps are the recording's own. `estimate_recording` says where the trajectory starts. A
-    reference is only compared with it. `formats` are further ones of
-    `export.FORMATS`, `command` is the command line, for the page, and `rerun_file` a file to write
-    for the viewer Rerun. The folder is written whole or not at all and replaces an earlier track.
-    Raises `InputError`.
+    reference is only compared with it.
+
+    Args:
+        recording: The recording, on a uniform clock.
+        weights: The network.
+        out: The folder. It is written whole or not at all and replaces an earlier track.
+        formats: Further formats of the trajectory, of `export.FORMATS`.
+        progress: A function that gets the finished share.
+        command: The command line, for the page.
+        rerun_file: A file to write for the viewer Rerun.
+
+    Raises:
+        InputError: The results could not be written, or the recording is too short or has a hole
+            that is too long.
     """
     sequence, config = recording.sequence, weights.run.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
@@ -200,7 +210,16 @@ def summarise(
     weights: Weights,
     ekf: Filter,
 ) -> Summary:
-    """The figures of a finished track, up to a divergence if there was one."""
+    """The figures of a finished track, up to a divergence if there was one.
+
+    Args:
+        found: The estimate, with the filter's covariances.
+        errors: Metrics against the reference by their names; empty without a reference.
+        ready: The recording as the filter took it.
+        recording: The recording as it was imported, with its notes and warnings.
+        weights: The network, for its name and its training data.
+        ekf: The filter.
+    """
     filtered, sequence = found.filtered, recording.sequence
     assert filtered is not None
     rows = int(np.flatnonzero(found.trajectory.known)[-1]) + 1

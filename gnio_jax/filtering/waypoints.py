@@ -77,11 +77,18 @@ def waypoint_poses(
 ) -> WaypointPoses:
     """Poses of a walk with waypoints.
 
-    predict: the displacements, as in `run_odometry`; ekf: the filter, at the rate of `sequence`;
-    place_std m, time_std s: the standard deviations of a waypoint. Programs are compiled for each
-    `predict` and for a few lengths. Raises `InputError` for a sequence of another rate, shorter
-    than `START_SECONDS`, or with fewer than two waypoints or one outside, and where the filter
-    fails.
+    Programs are compiled for each `predict` and for a few lengths.
+
+    Args:
+        sequence: The walk, at the filter's rate.
+        predict: The network, as in `run_odometry`.
+        ekf: The filter.
+        place_std: Standard deviation of the place of a waypoint, m.
+        time_std: Standard deviation of its stamp, s.
+
+    Raises:
+        InputError: The sequence has another rate, is shorter than `START_SECONDS`, has fewer than
+            two waypoints or one outside, or the filter fails.
     """
     config, noise = ekf.config, ekf.noise
     waypoints = _checked_waypoints(sequence, config)
