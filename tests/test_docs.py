@@ -32,6 +32,7 @@ SMALLER = {
         "skiprows=1": "skiprows=1, max_rows=300",
     },
     "docs/differentiable_filter.md": {"20 * 100": "20 * 25", "range(20)": "range(5)"},
+    "docs/many_sequences.md": {"2000": "400", "np.arange(4)": "np.arange(2)", ", 100)": ", 6)"},
     "docs/notebooks/learn_noise.py": {"SECONDS = 30": "SECONDS = 2", "STEPS = 150": "STEPS = 2"},
 }
 """Fewer samples and steps than on the page: page -> what stands there -> what runs."""
@@ -98,6 +99,21 @@ def test_the_loop_of_ones_own(one_walk, capsys):
     assert float(lines[5][-1]) < 3 and " ".join(lines[6]) == "taken 3 of 3"
 
 
+@pytest.mark.slow
+def test_many_sequences_and_draws(one_walk, capsys):
+    """The spread of six runs of 2 s is what the filter says, give or take a half."""
+    names = run("docs/many_sequences.md", code_of("docs/many_sequences.md"))
+    shape, rms, expected, _, nees = capsys.readouterr().out.splitlines()
+    assert shape == "positions (2, 20, 3)"
+    assert 0.5 < float(rms.split()[-1]) / float(expected.split()[-1]) < 1.5
+    assert 0.3 < float(nees.split()[4]) < 2.0
+    # A sequence of the batch is the run of this sequence alone.
+    starts = (part[1] for part in names["starts"])
+    signals = (names[name][1] for name in ("gyro", "accel", "measured"))
+    alone = names["run"](*starts, *signals).position
+    np.testing.assert_allclose(names["history"].position[1], alone, atol=1e-9)
+
+
 def test_a_measurement_of_ones_own(capsys):
     """The car's velocity is found, and turns with it; without the measurement it is not."""
     try:
@@ -162,7 +178,7 @@ def test_the_imports_of_the_reference():
 
 def test_every_block_that_runs_has_a_test():
     tested = {"README.md", "docs/differentiable_filter.md", "docs/networks.md", "docs/weights.md"}
-    tested |= {"docs/measurements.md"}
+    tested |= {"docs/measurements.md", "docs/many_sequences.md"}
     tested |= {"docs/api/index.md", "CONTRIBUTING.md"}
     assert {block.page for block in RUN} == tested
 
