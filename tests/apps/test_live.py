@@ -134,8 +134,8 @@ def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monk
     calibrated = found._replace(config=dataclasses.replace(found.config, filter=options))
     passed = []
 
-    def noted(*_, considered, **__):
-        passed.append(considered)
+    def noted(_, ekf, **__):
+        passed.append(ekf.considered)
         return Tracker.__new__(Tracker)
 
     monkeypatch.setattr(live, "Tracker", noted)

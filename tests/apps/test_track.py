@@ -263,7 +263,7 @@ def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, m
 def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monkeypatch):
     filters = []
 
-    def prepare(_, windows, ekf, **how):
+    def prepare(_, windows, ekf, **options):
         filters.append(ekf)
         raise InterruptedError
 

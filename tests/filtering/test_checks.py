@@ -70,7 +70,9 @@ def wrong():
             {"state": state._replace(core_covariance=lopsided)},
         )
     clones = CLONE * CONFIG.clones
+    angles_and_offsets = np.tile(np.repeat([1e-4, 1e8], 3), CONFIG.clones)  # rad² and m²
     for problem, covariance in (
+        ("positive definite", np.diag(angles_and_offsets - 2e-4 * (np.arange(clones) == 6))),
         ("positive definite", -np.eye(clones)),
         ("positive definite", np.eye(clones) + 1.1 * (np.eye(clones, k=6) + np.eye(clones, k=-6))),
         ("symmetric", np.eye(clones) + 0.1 * np.eye(clones, k=1)),

@@ -14,6 +14,7 @@ from gnio_jax import filtering
 from gnio_jax.config.schema import Positive
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import measurements
+from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.update import since_oldest
 from tests.support.checks import unchecked
 from tests.support.compiling import quick
@@ -81,6 +82,24 @@ def test_a_height_is_the_textbooks_update():
         if outcome.present[0]:
             np.testing.assert_allclose(outcome.residual[0], [residual], atol=1e-12)
             np.testing.assert_allclose(outcome.nis[0], residual**2 / spread, rtol=1e-9)
+
+
+@quick
+def measured_height(state, height, threshold):
+    step = filtering.Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), 0, 1, CONFIG, NOISE)
+    residual = jnp.stack([height - state.position[2]])
+    linear = filtering.linearise(state, residual, [[1.0]], position=[[0.0, 0.0, 1.0]])
+    return filtering.measure(state, linear, step, threshold)[1]
+
+
+def test_without_a_threshold_there_is_no_test():
+    """Nor of what was not measured."""
+    state = start()
+    for threshold, tested in ((np.inf, False), (10.8, True)):
+        for height, present in ((float(state.position[2]) + 0.01, True), (np.nan, False)):
+            outcome = measured_height(state, height, threshold)
+            assert bool(outcome.present) == bool(outcome.accepted) == present
+            assert bool(outcome.tested) == (present and tested)
 
 
 def test_rows_that_are_missing_are_refused_by_name():

@@ -95,3 +95,18 @@ def test_errors_do_not_feed_themselves_and_what_is_implausible_is_not_called_hea
     assert not healthy[~plausible].any()
     np.testing.assert_array_equal(healthy, np.logical_and.accumulate(healthy))
     assert bool(final.healthy) == healthy[-1]
+
+
+def test_a_negative_variance_is_not_healthy():
+    """Inside `jit`, where the start is not checked. All else is finite and slow."""
+    begin, gyro, accel, displacement, covariance = WALK
+    ekf = filtering.Filter(PLAIN)
+    state = filtering.initial_state(ekf, *begin)
+    negative = np.diag(state.core_covariance).copy()
+    negative[10] = -1e-6  # of the gyro's bias
+    state = state._replace(core_covariance=np.diag(negative))
+    nothing = np.full_like(displacement, np.nan)
+    final, history = FILTER(ekf, state, gyro, accel, nothing, covariance)
+    assert np.isfinite(history.covariance_diagonal).all() and np.isfinite(history.velocity).all()
+    assert (np.delete(history.covariance_diagonal, 10, axis=1) >= 0).all()
+    assert not np.any(history.healthy) and not final.healthy

@@ -143,6 +143,22 @@ def test_a_run_in_two_calls_is_one_run(cut):
     np.testing.assert_array_equal(state.window, final.window)
 
 
+def test_where_it_coasted_no_window_is_a_measurement():
+    """Nor where it coasted in the context before the window."""
+    config = dataclasses.replace(CONFIG, bridge_seconds=2 * DT)
+    gyro, accel = recording(0)
+    valid = np.ones(len(gyro), bool)
+    valid[32:40] = False  # the first two of these are held
+    _, history = filtering.run_odometry(
+        predict, filtering.Filter(config, NOISE), start(config), gyro, accel, imu_valid=valid
+    )
+    measured = np.isfinite(np.asarray(history.displacement)).all(axis=1)
+    for k in range(INTERVALS):
+        first, stop = (k - CLONES + 1) * N - config.context_samples, (k + 1) * N
+        coasted = first < 40 and stop > 34
+        assert measured[k] == (k >= FIRST and not coasted), k
+
+
 def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     """With `history.given`, which takes the factors of the axes off again. The network's log
     standard deviation is raised to a floor."""

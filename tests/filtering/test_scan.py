@@ -179,12 +179,13 @@ def laid(fixes):
 
 @pytest.mark.parametrize(
     "fail_scale, correlation, axes, every",
-    [(0.0, None, 0, None), (8.0, ERRORS, 2, None), (0.0, ERRORS, 3, 8)],
-    ids=["plain", "scaled, correlated, fixes", "correlated, whole fixes, in pieces"],
+    [(0.0, None, 0, None), (8.0, ERRORS, 2, 10), (0.0, ERRORS, 3, 8)],
+    ids=["plain", "scaled, correlated, fixes, in rounds", "correlated, whole fixes, in pieces"],
 )
 def test_random_walk(fail_scale, correlation, axes, every):
     """With missing and rejected rows. A run goes on from the state that another returned: ring,
-    gate and clock included; pieces of 8 intervals end at every slot of a ring of 5."""
+    gate and clock included. Pieces of 8 intervals end within a round of the ring of 5, and pieces
+    of 10 with a whole round."""
     config = GATED(DT, N, CLONES, mahalanobis_fail_scale=fail_scale)
     noise, fixes = noise_of(config, correlation), drawn_fixes(axes) if axes else {}
     measurements = (laid(fixes),) if axes else ()
@@ -230,7 +231,7 @@ def test_without_size_and_without_fixes_nothing_changes():
     nothing = noise_of(config, ERRORS._replace(share=0.0))
     final, found = ours(config, nothing, measurements=(none,), every=8)
     for name in found._fields:
-        if name not in ("others", "diagnostics"):
+        if name not in ("outcomes", "diagnostics"):
             assert_close(getattr(found, name), getattr(wanted, name), 1e-12, 1e-9)
     assert_close(final.core_covariance[CORRELATED, CORRELATED], np.eye(3), 1e-12)
     # Another noise, as arrays, and a state that a run left compile nothing.

@@ -70,6 +70,36 @@ def test_level_state_of_a_phone_that_a_hand_turns(rate):
     np.testing.assert_allclose(np.sqrt(state.core_covariance[0, 0]), 0.02 / 9.81, rtol=1e-6)
 
 
+def test_small_turns_about_every_axis_are_no_rest():
+    """Each rate is below the bound of rest, but not their sum in quadrature. The rates differ from
+    sample to sample, and the attitude of a sample follows from those before it."""
+    time = np.arange(50) * DT
+    phases = 2 * np.pi * (time[:, None] + [0.0, 0.3, 0.6])
+    gyro = 0.8 * CONFIG.rest_gyro * np.sqrt(2.0) * np.sin(phases)
+    first = Rotation.from_euler("ZYX", [0.0, 0.4, -1.1])
+    attitudes = [first]
+    for rate in gyro[:-1]:
+        attitudes.append(attitudes[-1] * Rotation.from_rotvec(rate * DT))
+    accel = np.stack([attitude.inv().apply([0, 0, 9.81]) for attitude in attitudes])
+    assert accel.var(axis=0).sum() < CONFIG.rest_accel**2
+    assert (gyro.std(axis=0) < CONFIG.rest_gyro).all()
+    state = filtering.level_state(filtering.Filter(CONFIG), gyro, accel)
+    np.testing.assert_allclose(state.rotation, first.as_matrix(), atol=1e-9)
+    # The mean alone would be off by:
+    assert np.linalg.norm(first.apply(accel.mean(axis=0))[:2]) / 9.81 > 1e-3
+
+
+def test_a_second_of_which_most_is_missing_is_no_rest():
+    """Half of it is enough."""
+    gyro, accel = np.tile([0.01, -0.02, 0.03], (100, 1)), np.tile([0, 0, 9.81], (100, 1))
+    for present, seconds in ((24, 1.0), (25, 2.0)):
+        broken = gyro.copy()
+        broken[50 + present :] = np.nan
+        rest = rest_at_start(broken, accel, DT)
+        assert rest.seconds == seconds
+        np.testing.assert_allclose(rest.gyro_bias, gyro[0], rtol=1e-12)
+
+
 def test_level_state_says_how_far_the_velocity_can_be_from_zero():
     """1.5 s times the spread, between a table's and a walker's, with a slope everywhere."""
 

@@ -59,6 +59,24 @@ def test_rest_counts_only_after_its_time(seconds, intervals):
     assert found == expected and sum(found) == 4 * (6 - intervals)
 
 
+def test_rest_is_seen_without_the_biases():
+    """Which are larger than the bounds of rest; and not with them."""
+    gyro_bias, accel_bias = 2 * CONFIG.rest_gyro, 2 * CONFIG.rest_accel
+    biases = np.array([gyro_bias, 0.0, 0.0]), np.array([0.0, 0.0, accel_bias])
+    config = dataclasses.replace(CONFIG, rest_seconds=0.0)
+    biased = STILL._replace(gyro=STILL.gyro + biases[0][None], accel=STILL.accel + biases[1][None])
+    for gyro, accel, imu, quiet in (
+        (*biases, biased, True),
+        (0.0, biases[1], biased, False),
+        (biases[0], 0.0, biased, False),
+        (0.0, biases[1], STILL, False),
+    ):
+        state = filtering.initial_state(
+            filtering.Filter(config), np.eye(3), np.zeros(3), np.zeros(3), gyro, accel
+        )
+        assert bool(detect_rest(state, imu, config)[1]) == quiet
+
+
 def resting(now, converged=True, last_success=100, pause_end=0, tried=True, speed=1.0):
     """The state before and after the IMU is quiet at sample `now`, with a velocity of `speed` known
     to 0.1 m/s per axis, and what the filter made of it. `tried`: there was a displacement, too."""
