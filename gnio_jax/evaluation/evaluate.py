@@ -77,10 +77,18 @@ def evaluate(
     the results to a folder of the run.
 
     The folder is written whole or not at all, and replaces that of an earlier evaluation with the
-    same options. `workers` processes read recordings that are slow to read; `command` is the
-    command line, for the page; `run` is the `training.checkpoint.Run` of `config`, if it is loaded
-    already. Raises `InputError` for options that do not fit together, a run without the checkpoint,
-    missing data, and a split of which no sequence can be estimated.
+    same options.
+
+    Args:
+        config: The options of `gnio evaluate`.
+        reporter: It gets progress and lines of text.
+        workers: Number of processes that read recordings that are slow to read.
+        command: The command line, for the page.
+        run: The `training.checkpoint.Run` of `config`, if it is loaded already.
+
+    Raises:
+        InputError: Options do not fit together, the run lacks the checkpoint, data are missing, or
+            no sequence of the split can be estimated.
     """
     _check(config)
     from gnio_jax.training.checkpoint import (  # Orbax takes seconds to import
