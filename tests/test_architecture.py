@@ -34,7 +34,7 @@ LIBRARIES = {
     "bokeh": {"evaluation.page"},
     "flax": {"models", "training", "evaluation", "interop"},
     "jax2onnx": {"apps.onnx.conversion"},
-    "loky": {"data.loading"},
+    "loky": {"data.workers"},
     "mcap": {"apps.importing.ros", "apps.export"},
     "matplotlib": {"drawing", "data.pictures", "evaluation.plots", "tables.plots"},
     "onnx": ONNX,
@@ -53,12 +53,9 @@ LIBRARIES = {
 REFUSED = set("found own each given there known place seen about asked kept told here both".split())
 REFUSED |= set("these those wanted taken laid made left rest apart since late".split())
 """Words that do not say what a variable holds."""
-OLD_NAMES = ("apps/importing", "apps/live", "apps/track", "config")
-OLD_NAMES += ("data/parsing", "filtering", "training", "evaluation/estimate.py")
-OLD_NAMES += ("evaluation/evaluate.py", "evaluation/prepare.py")
+OLD_NAMES = ("apps/live", "apps/track", "filtering/propagation", "filtering/scan")
+OLD_NAMES += ("filtering/state", "filtering/update", "filtering/waypoints")
 """Rooms and modules whose variables still have such names."""
-TWO_MEANINGS = {"Outcome"}
-"""Names that two classes of these rooms still share."""
 
 
 class Import(NamedTuple):
@@ -161,7 +158,7 @@ def test_the_name_of_a_class_has_one_meaning():
     homes = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef) and node.name not in TWO_MEANINGS:
+            if isinstance(node, ast.ClassDef):
                 home = homes.setdefault(node.name, path)
                 assert home == path, f"{home} and {path} have a class '{node.name}'"
 

@@ -216,7 +216,7 @@ def test_a_command_line_is_understood(line, monkeypatch):
             configuration.find_experiment(name)
 
 
-def test_a_command_line_of_yesterday_is_not():
+def test_an_unknown_option_does_not_parse():
     with pytest.raises(InputError, match="unknown option"):
         understood(["track", "walk.zip", "--wieghts", "mine"])
 

@@ -22,8 +22,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from gnio_jax import config, data, evaluation, filtering, geometry
-from gnio_jax.data.windows import gather, window_source
 from gnio_jax.training import checkpoint, loop
+from gnio_jax.training.windows import gather, window_source
 
 jax.config.update("jax_enable_x64", True)  # the filter runs in float64, the network in float32
 

@@ -20,13 +20,13 @@ import time
 from array import array
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.apps.importing import units
+from gnio_jax.data import physics
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory
@@ -439,8 +439,8 @@ def _check_gravity(samples: list[Sample], where: str) -> None:
 def _check_turning(samples: list[Sample], where: str) -> None:
     rows = np.array([[sample.time, *sample.gyro, *sample.accel] for sample in samples])
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]  # in order
-    motion = units.Motion(rows[:, 0] - rows[0, 0], rows[:, 1:4], rows[:, 4:7])
-    units.check_rad_per_second(motion, Path(where))
+    imu = physics.ImuSamples(rows[:, 0] - rows[0, 0], rows[:, 1:4], rows[:, 4:7])
+    physics.check_turning(imu, where)
 
 
 # --- following

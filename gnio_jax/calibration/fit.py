@@ -255,8 +255,8 @@ def innovation_objective(
 
     settings = with_free_parameters(settings, dict(zip(names, free, strict=True)))
     log_likelihood = jnp.sum(over_sequences(of_walk, shared=1)(settings, walks))
-    assert walks.given is not None
-    count = jnp.isfinite(walks.given.value).all(axis=2).sum()
+    assert walks.displacements is not None
+    count = jnp.isfinite(walks.displacements.value).all(axis=2).sum()
     return (_prior(free, start) - log_likelihood) / count, -log_likelihood / count
 
 
@@ -286,8 +286,8 @@ def _make_run(
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], Array]:
     """The function that runs the filter over one walk, given a start and displacements, and the
     displacements of the walk."""
-    assert walk.given is not None
-    value, covariance, _ = walk.given
+    assert walk.displacements is not None
+    value, covariance, _ = walk.displacements
     options = walk.imu_valid, ekf.config.displacement_frame
 
     def run(state: FilterState, displacement: Array) -> FilterHistory:

@@ -480,11 +480,10 @@ class FilterSettings(FilterOptions):
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
     for weights trained that way."""
     raw_gyro_bias: NonNegative | None = None
-    """Standard deviation of the gyro's first bias if its phone subtracts no bias, rad/s; the
-    recording then has `imu_compensated: no` (ours). In evaluation and tracking it is that of the
-    two components that are level at the start, and the vertical one keeps that of `start`. In
-    calibration, and for the poses of walks with waypoints, it is that of each axis. By default that
-    of `start` is taken for every IMU."""
+    """Standard deviation of the first gyro bias for phones that subtract no bias, rad/s (ours):
+    recordings with `imu_compensated: no`. By default it is that of `start`. Evaluation and tracking
+    apply it to the two components that are level at the start; calibration, and the poses of walks
+    with waypoints, to all three."""
 
     def __post_init__(self) -> None:
         if isinstance(self.measurements, dict):  # A hash needs entries that cannot change.
@@ -507,8 +506,8 @@ class ThroughFilter:
     """Parts that are trained through the filter. Without this option the network is trained on
     windows. noise: the filter's densities and bias walks; measurement: the factors of the network's
     covariance, the correlation of its errors, and the numbers of `filter.measurements`; start: the
-    standard deviations at the start; uncertainty, head, encoder: the network's; all: everything. A
-    filter option that is 0 stays 0."""
+    standard deviations at the start; uncertainty, head, encoder: the network's; all: everything.
+    Options of the filter that are 0 are not trained."""
     piece_seconds: Positive = 60.0
     """Length of the segments of recordings that are filtered, s."""
     filter_learning_rate: Positive = 0.03

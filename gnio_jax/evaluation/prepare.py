@@ -143,8 +143,8 @@ def prepare(
     recordings, left_out = [], {}
     for sequence in sequences:
         sequence = data.resample(sequence, windows.rate)
-        known = finite_rows(sequence.position) & finite_rows(sequence.orientation)
-        sequence = sequence._replace(valid=sequence.valid & known)
+        posed = finite_rows(sequence.position) & finite_rows(sequence.orientation)
+        sequence = sequence._replace(valid=sequence.valid & posed)
         _check(sequence, init, gyro_bias, orientation)
         first = 0 if from_first else int(np.argmax(sequence.valid))
         strides = (len(sequence.time) - 1 - first) // windows.stride
@@ -155,18 +155,18 @@ def prepare(
             problem = f"{seconds:.2f} s measured from its first trusted sample on"
             left_out[sequence.name] = f"{problem}, too short for a window and a stride"
             continue
-        bias, bias_note = _gyro_bias(whole, measured, windows.rate, gyro_bias)
+        bias, bias_note = _estimate_gyro_bias(whole, measured, windows.rate, gyro_bias)
         raw = sequence.attributes.get("imu_compensated") == "no" and not bias.any()
-        own_init, reference_note = init, ""
+        start_init, reference_note = init, ""
         if whole.waypoints is not None:
-            own_init, reference_note = "static", OF_WAYPOINTS
-        rotation, velocity, position, own_std, start_note = _start(
-            whole, measured, windows, ekf, own_init
+            start_init, reference_note = "static", OF_WAYPOINTS
+        rotation, velocity, position, std, start_note = _find_start(
+            whole, measured, windows, ekf, start_init
         )
         level = ekf.start.gyro_bias
         if raw and ekf.raw_gyro_bias is not None:
             level = ekf.raw_gyro_bias
-        start = Start(rotation, velocity, position, bias, own_std, level, raw)
+        start = Start(rotation, velocity, position, bias, std, level, raw)
         trusted, mask = whole.valid[:, None], whole.imu_valid
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
@@ -181,7 +181,7 @@ def prepare(
                 accel=whole.accel[:-1],
                 imu_valid=None if mask is None or mask.all() else mask[:-1],
                 start=start,
-                attitude=orientation and _attitude(whole, start, windows.rate, orientation),
+                attitude=orientation and _trace_attitude(whole, start, windows.rate, orientation),
                 reference=Trajectory(whole.time[ends], *(part[ends] for part in poses)),
                 displacement=true_displacement(
                     poses[1],
@@ -206,12 +206,12 @@ def _check(
     if sequence.valid.any():
         return
     tapped = sequence.waypoints is not None
-    wanted = {
+    remedies = {
         "--init static": init == "reference" and not tapped,
         "--gyro-bias zero": gyro_bias == "reference",
         "--orientation filter": orientation == "reference",
     }
-    for remedy, needed in wanted.items():
+    for remedy, needed in remedies.items():
         if needed:
             problem = "has waypoints, no poses" if tapped else "has no reference"
             raise InputError(sequence.name, problem, f"give {remedy}")
@@ -223,7 +223,7 @@ def _cut(sequence: Sequence, rows: slice) -> Sequence:
     return sequence._replace(**arrays)
 
 
-def _start(
+def _find_start(
     sequence: Sequence,
     measured: Int[np.ndarray, "m"],
     windows: DataConfig,
@@ -240,8 +240,8 @@ def _start(
     if 2 * len(second) < round(windows.rate):  # most of the first second was not measured
         second = measured[: round(windows.rate)]
     level = level_state(ekf, sequence.gyro[second], sequence.accel[second])
-    found = np.sqrt(np.diag(level.core_covariance))
-    tilt_std, velocity_std = float(found[0]), float(found[3])
+    core_std = np.sqrt(np.diag(level.core_covariance))
+    tilt_std, velocity_std = float(core_std[0]), float(core_std[3])
     std, note = ekf.start._replace(tilt=tilt_std, velocity=velocity_std), ""
     if velocity_std > ROUGH_START:
         tilt = float(f"{np.degrees(tilt_std):.1g}")  # rounded, so that few different notes are made
@@ -250,7 +250,7 @@ def _start(
     return np.asarray(level.rotation), np.zeros(3), np.zeros(3), std, note
 
 
-def _gyro_bias(
+def _estimate_gyro_bias(
     sequence: Sequence, measured: Int[np.ndarray, "m"], rate: float, source: BiasSource
 ) -> tuple[Float[np.ndarray, "3"], str]:
     """First estimate of the gyro bias, rad/s, and its origin."""
@@ -260,43 +260,45 @@ def _gyro_bias(
         # Samples interpolated across a gap look like rest, so only measured samples count.
         gyro, accel = np.full((2, len(sequence.time), 3), np.nan)
         gyro[measured], accel[measured] = sequence.gyro[measured], sequence.accel[measured]
-        rest = rest_at_start(gyro, accel, 1.0 / rate)
-        if not rest.seconds:
+        bias, seconds = rest_at_start(gyro, accel, 1.0 / rate)
+        if not seconds:
             note = "gyro bias: no rest at the start (quieter than a hand), so it starts from zero"
             return np.zeros(3), note
-        return rest.gyro_bias, f"gyro bias: mean of {rest.seconds:g} s of rest at the start"
+        return bias, f"gyro bias: mean of {seconds:g} s of rest at the start"
     rows = np.arange(min(round(REFERENCE_BIAS_SECONDS * rate), len(sequence.time) - 1))
     rows = np.intersect1d(rows[sequence.valid[rows] & sequence.valid[rows + 1]], measured)
     if len(rows) < rate:
         return np.zeros(3), "gyro bias: under 1 s of reference at the start, so it starts from zero"
-    before, after = (rotations(sequence.orientation[each]) for each in (rows, rows + 1))
+    before, after = (rotations(sequence.orientation[i]) for i in (rows, rows + 1))
     true_rate = (before.inv() * after).as_rotvec() * rate
     note = f"gyro bias: {len(rows) / rate:g} s against the reference orientation"
     return (sequence.gyro[rows] - true_rate).mean(0), note
 
 
-def _attitude(sequence: Sequence, start: Start, rate: float, source: Orientation) -> Matrices:
+def _trace_attitude(sequence: Sequence, start: Start, rate: float, source: Orientation) -> Matrices:
     """Body→world at every sample.
 
     `filter` is the gyro integrated from the start; `device` is the device's own estimate, turned
     about z to the yaw of the start. Where reference or device are missing, the gyro is integrated
-    from the last known attitude. Raises `InputError` if they are missing at the start.
+    from the last attitude that they give. Raises `InputError` if they are missing at the start.
     """
     turns = Rotation.from_rotvec((sequence.gyro[:-1] - start.gyro_bias) / rate)
     integrated = start.rotation @ cumulative_rotation(turns).as_matrix()
     if source == "filter":
         return integrated
-    given = sequence.orientation if source == "reference" else sequence.device_orientation
-    assert given is not None  # `_check` ensures it
-    known = finite_rows(given) & (sequence.valid if source == "reference" else True)
-    if not known[0]:
+    orientation = sequence.orientation if source == "reference" else sequence.device_orientation
+    assert orientation is not None  # `_check` ensures it
+    present = finite_rows(orientation)
+    if source == "reference":
+        present = present & sequence.valid
+    if not present[0]:
         problem = f"has no {source} orientation at its start"
         raise InputError(sequence.name, problem, "give --orientation filter")
     # Untrusted rows may have any values, even ones that are no rotation.
-    rotation = matrix_from_quaternion(np.where(known[:, None], given, np.nan))
+    rotation = matrix_from_quaternion(np.where(present[:, None], orientation, np.nan))
     if source == "device":
         ours, its = yaw_rotation(np.stack([start.rotation, rotation[0]]))
         rotation = ours @ its.T @ rotation
-    last = last_true(known)
-    turned_since = np.einsum("tji,tjk->tik", integrated[last], integrated)
-    return np.where(known[:, None, None], rotation, rotation[last] @ turned_since)
+    last = last_true(present)
+    turn = np.einsum("tji,tjk->tik", integrated[last], integrated)
+    return np.where(present[:, None, None], rotation, rotation[last] @ turn)

@@ -51,35 +51,35 @@ def register(measurement: type) -> None:
 
 
 def create_measurements(
-    numbers: Mapping[str, Mapping[str, Any] | None], place: Location
+    numbers: Mapping[str, Mapping[str, Any] | None], location: Location
 ) -> tuple[Measurement, ...]:
     """The measurements of these names with their numbers, in their order. Numbers may be traced.
 
-    Raises `InputError` at `place` for an unknown name, and for a number that is unknown, missing or
-    out of its bounds.
+    Raises `InputError` at `location` for an unknown name, and for a number that is unknown, missing
+    or out of its bounds.
     """
     return tuple(
-        _create(name, fields, place.child(name))
+        _create(name, fields, location.child(name))
         for name, fields in numbers.items()
         if fields is not None
     )
 
 
-def _create(name: str, numbers: Mapping[str, Any], place: Location) -> Measurement:
+def _create(name: str, numbers: Mapping[str, Any], location: Location) -> Measurement:
     if name not in _MEASUREMENTS:
         plugins.load()
     if name not in _MEASUREMENTS:
         remedy = f"{did_you_mean(name, names())}known measurements: {', '.join(names())}"
-        place.refuse("is not known", f"{remedy}; a plugin may register others")
+        location.refuse("is not known", f"{remedy}; a plugin may register others")
     kind = _MEASUREMENTS[name]
     hints = get_type_hints(kind, include_extras=True)
     values = dict(numbers)
     for field, value in numbers.items():
         if field not in hints:
-            place.child(field).refuse("is unknown", f"known numbers: {', '.join(hints)}")
+            location.child(field).refuse("is unknown", f"known numbers: {', '.join(hints)}")
         if not isinstance(value, Tracer):
-            values[field] = check_value(hints[field], value, place.child(field))
+            values[field] = check_value(hints[field], value, location.child(field))
     for field in kind._fields:
         if field not in numbers and field not in kind._field_defaults:
-            place.child(field).refuse("is missing", f"write {field}: NUMBER")
+            location.child(field).refuse("is missing", f"write {field}: NUMBER")
     return kind(**values)

@@ -192,11 +192,11 @@ def free_parameters(settings: FilterSettings, paths: Iterable[str]) -> dict[str,
     Each of the `paths` names a number ("noise.gyro_density") or a section of them ("noise"). A
     number that is 0 is switched off and has no free parameter.
     """
-    wanted = tuple(paths)
+    paths = tuple(paths)
     return {
         name: math.log(value) - (math.log1p(-value) if name == SHARE else 0.0)
         for name, value in _numbers(settings).items()
-        if value > 0 and any(is_below(name, path) for path in wanted)
+        if value > 0 and any(is_below(name, path) for path in paths)
     }
 
 

@@ -139,13 +139,13 @@ def _smooth(
     state, steps, _ = clone_steps(take_row, inputs, rows, keep)
     size, dtype = sum(state.cross_covariance.shape), state.offset.dtype
     nothing = Adjoint(jnp.zeros(size, dtype), jnp.zeros((size, size), dtype))
-    backward = functools.partial(_backward, config=config)
+    backward = functools.partial(_step_back, config=config)
     _, (mean, covariance) = jax.lax.scan(backward, nothing, steps, reverse=True)
     diagonal = jnp.diagonal(covariance, axis1=1, axis2=2)
     return SmoothedHistory(*mean, diagonal, covariance if config.history == "core" else None)
 
 
-def _backward(
+def _step_back(
     adjoint: Adjoint, step: _ForwardStep, config: FilterConfig
 ) -> tuple[Adjoint, tuple[Mean, Array]]:
     """The smoothed estimate after a step, and the adjoint before it."""
@@ -160,10 +160,10 @@ def _backward(
     oldest = (step.slot + 1) % config.clones
     core = CORE + len(step.trace.transition.decay)
     for correction in reversed(step.trace.corrections):
-        adjoint = _before_shift(adjoint, correction.after, core)
-        adjoint = _before_update(adjoint, correction, oldest)
-        adjoint = _before_shift(adjoint, correction.before, core)
-    adjoint = _before_propagation(adjoint, step.trace.transition, step.slot)
+        adjoint = _pull_back_shift(adjoint, correction.after, core)
+        adjoint = _pull_back_update(adjoint, correction, oldest)
+        adjoint = _pull_back_shift(adjoint, correction.before, core)
+    adjoint = _pull_back_propagation(adjoint, step.trace.transition, step.slot)
     return adjoint, (mean, covariance)
 
 
@@ -174,7 +174,7 @@ class Adjoint(NamedTuple):
     matrix: Float[Array, "m m"]
 
 
-def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
+def _pull_back_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
     """The adjoint before an update; `oldest` is the slot of the oldest clone."""
 
     measured = functools.partial(measurable_errors, correction.jacobian, oldest=oldest)
@@ -192,22 +192,24 @@ def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, 
     )
 
 
-def _before_shift(adjoint: Adjoint, shift: Shift | None, core: int) -> Adjoint:
+def _pull_back_shift(adjoint: Adjoint, shift: Shift | None, core: int) -> Adjoint:
     """The adjoint before the error, with `core` entries of the core, was expressed at the new
     estimate."""
     if shift is None:
         return adjoint
 
-    def back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
+    def pull_back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
         """Gᵀ rows; the clones stay as they are."""
         like = jax.ShapeDtypeStruct((core, rows.shape[1]), rows.dtype)
-        (turned_back,) = jax.linear_transpose(shift, like)(rows[:core])
-        return jnp.concatenate([turned_back, rows[core:]])
+        (turned,) = jax.linear_transpose(shift, like)(rows[:core])
+        return jnp.concatenate([turned, rows[core:]])
 
-    return Adjoint(back(adjoint.vector[:, None])[:, 0], back(back(adjoint.matrix).T))
+    return Adjoint(pull_back(adjoint.vector[:, None])[:, 0], pull_back(pull_back(adjoint.matrix).T))
 
 
-def _before_propagation(adjoint: Adjoint, transition: Transition, slot: Int[Array, ""]) -> Adjoint:
+def _pull_back_propagation(
+    adjoint: Adjoint, transition: Transition, slot: Int[Array, ""]
+) -> Adjoint:
     """The adjoint before the propagation and the cloning into `slot`."""
     size, core = len(adjoint.vector), CORE + len(transition.decay)
 
@@ -219,8 +221,8 @@ def _before_propagation(adjoint: Adjoint, transition: Transition, slot: Int[Arra
             clones = turned_rows(clones, levers)
         return jnp.concatenate([moved, put(clones, transition.pose(moved), CLONE * slot, 0)])
 
-    def back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
+    def pull_back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
         like = jax.ShapeDtypeStruct((size, rows.shape[1]), rows.dtype)
         return jax.linear_transpose(step, like)(rows)[0]
 
-    return Adjoint(back(adjoint.vector[:, None])[:, 0], back(back(adjoint.matrix).T))
+    return Adjoint(pull_back(adjoint.vector[:, None])[:, 0], pull_back(pull_back(adjoint.matrix).T))

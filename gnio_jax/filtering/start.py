@@ -107,12 +107,11 @@ def level_state(ekf: Filter, gyro: Any, accel: Any) -> FilterState:
     bias of the gyro is its mean, as in `rest_at_start`; otherwise it is zero.
 
     The standard deviations of tilt and velocity are not those of `ekf.start`. That of the tilt
-    follows from the accelerometer's
-    bias and from the spread of the averaged accelerations, with one independent sample per half
-    second. That of the velocity is proportional to this spread, from 0.05 m/s on a table to 1 m/s
-    for a walker. The yaw is zero by definition, so it keeps that of `ekf.start`. Raises
-    `ValueError` naming an argument of wrong shape or precision, that is not finite, or that shows
-    no gravity.
+    follows from the accelerometer's bias and from the spread of the averaged accelerations, with
+    one independent sample per half second. That of the velocity is proportional to this spread,
+    from 0.05 m/s on a table to 1 m/s for a walker. The yaw is zero by definition, so it keeps that
+    of `ekf.start`. Raises `ValueError` naming an argument of wrong shape or precision, that is not
+    finite, or that shows no gravity.
     """
     check_filter(ekf)
     config, std = ekf.config, ekf.start
@@ -121,7 +120,7 @@ def level_state(ekf: Filter, gyro: Any, accel: Any) -> FilterState:
     accel = checked_array("accel", accel, (samples, 3), config)
     if samples < 2:
         raise ValueError(f"accel: at least two samples are needed, found {samples}")
-    rotation, gyro_bias, tilt_std, velocity_std, up = _levelled(
+    rotation, gyro_bias, tilt_std, velocity_std, up = _level(
         gyro, accel, jnp.asarray(std.accel_bias), config
     )
     if not isinstance(up, Tracer) and (size := np.linalg.norm(up)) < LEAST_GRAVITY:
@@ -134,7 +133,7 @@ def level_state(ekf: Filter, gyro: Any, accel: Any) -> FilterState:
 
 # One program, as in `without_clones`.
 @functools.partial(jax.jit, static_argnames="config")
-def _levelled(
+def _level(
     gyro: Array, accel: Array, bias_std: Array, config: FilterConfig
 ) -> tuple[Array, Array, Array, Array, Array]:
     """The attitude from gravity, the gyro's bias, the standard deviations of tilt and velocity, and
@@ -171,14 +170,14 @@ def rest_at_start(
     """The whole seconds at the start in which raw gyro (rad/s) and accel (m/s²) are as quiet as on
     a table (ours). NaN means that a sample is missing; a second without more than half of its
     samples is not quiet."""
-    second, rest = round(REST_SECONDS / dt), 0
-    there = finite_rows(gyro) & finite_rows(accel)
-    while rest + second <= len(gyro):
-        rows = rest + np.flatnonzero(there[rest : rest + second])
+    second, end = round(REST_SECONDS / dt), 0
+    present = finite_rows(gyro) & finite_rows(accel)
+    while end + second <= len(gyro):
+        rows = end + np.flatnonzero(present[end : end + second])
         if 2 * len(rows) < second or gyro[rows].std(0).max() > REST_GYRO_STD:
             break
         if accel[rows].std(0).max() > REST_ACCEL_STD:
             break
-        rest += second
-    bias = gyro[:rest][there[:rest]].mean(0) if rest else np.zeros(3)
-    return Rest(np.asarray(bias, np.float64), rest * dt)
+        end += second
+    bias = gyro[:end][present[:end]].mean(0) if end else np.zeros(3)
+    return Rest(np.asarray(bias, np.float64), end * dt)

@@ -169,16 +169,16 @@ class Tracker:
         so much faster than `imu_rate` that it would alias, and for a rest without gravity, whose
         samples are left out.
         """
-        self._stream.push(*_checked_sample(time, gyro, accel))
+        self._stream.push(*_check_sample(time, gyro, accel))
         if self._core is None:
             self._start_from_rest()
-        n, made = self._ekf.config.samples_per_clone, False
-        while self._core is not None and self._stream.known >= n:
+        n, stepped = self._ekf.config.samples_per_clone, False
+        while self._core is not None and self._stream.ready >= n:
             rows = self._stream.rows(n).astype(self._core.window.dtype)
             self._stream.take(n)
             self._core, estimate = self._advance(self._core, rows)
-            self._ahead, made = (0, estimate, self._core.filter.imu), True
-        return self._as_pose() if made else None
+            self._ahead, stepped = (0, estimate, self._core.filter.imu), True
+        return self._read_pose() if stepped else None
 
     def pose(self) -> Pose | None:
         """The pose after the newest grid sample; between clone steps the samples since the last
@@ -190,18 +190,18 @@ class Tracker:
         if self._core is None:
             return None
         done, estimate, memory = self._ahead
-        known = self._stream.known
-        for row in self._stream.rows(known)[done:].astype(self._core.window.dtype):
+        ready = self._stream.ready
+        for row in self._stream.rows(ready)[done:].astype(self._core.window.dtype):
             estimate, memory = self._look_ahead(estimate, memory, row)
-        self._ahead = known, estimate, memory
-        return self._as_pose()
+        self._ahead = ready, estimate, memory
+        return self._read_pose()
 
     def filter_state(self) -> FilterState | None:
         """The filter after the last clone step, as `run_odometry` would return it; None while there
         is no start."""
         if self._core is None:
             return None
-        config, core = self._ekf.config, _copied(self._core)
+        config, core = self._ekf.config, _copy(self._core)
         state = unroll_clones(core.filter, int(core.intervals) % config.clones, config)
         return state._replace(window=core.window)
 
@@ -215,7 +215,7 @@ class Tracker:
 
     def _start_from_rest(self) -> None:
         """Start as soon as the next samples make a whole rest; they are filtered afterwards."""
-        while self._core is None and self._stream.known >= self._rest:
+        while self._core is None and self._stream.ready >= self._rest:
             rows = self._stream.rows(self._rest)
             unusable = np.flatnonzero((rows[:, VALID] == 0) | ~rows[:, ACCEL].any(axis=1))
             if len(unusable):
@@ -238,15 +238,15 @@ class Tracker:
         tangents = None if self._ekf.considered is None else start_tangents(state)
         # Copies, because the compiled step takes the memory of its argument, which no other array,
         # nor two of its fields, may share.
-        core = _copied(Core(state, window, jnp.int32(0), tangents))
+        core = _copy(Core(state, window, jnp.int32(0), tangents))
         flags = jnp.stack([jnp.nan, jnp.nan, state.healthy]).astype(window.dtype)
         self._core: Core | None = core
         estimate = device_pose(self._ekf, state, flags, tangents)
         self._ahead: tuple[int, DevicePose, ImuMemory] = 0, estimate, core.filter.imu
-        """Number of known samples that `pose` has integrated, and the result."""
+        """Number of ready samples that `pose` has integrated, and the result."""
         return core
 
-    def _as_pose(self) -> Pose:
+    def _read_pose(self) -> Pose:
         """The newest estimate on the host, at the end of the interval of its last sample."""
         ahead, estimate, _ = self._ahead
         mean, covariance, numbers = jax.tree.map(np.array, estimate)
@@ -285,11 +285,11 @@ def advance(
     window = jnp.concatenate([core.window[config.samples_per_clone :], newest])
     complete = core.filter.step >= config.clones_per_window
     complete = complete & jnp.all(window[:, VALID] > 0)
-    of_window = network_measurement(predict, ekf)
+    measure_window = network_measurement(predict, ekf)
     latest = Imu(window[:, GYRO], window[:, ACCEL], None)
 
     def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
-        return of_window(complete, lambda: latest, state, oldest)[0], {}
+        return measure_window(complete, lambda: latest, state, oldest)[0], {}
 
     def step(state: FilterState, measure: Measure) -> tuple[FilterState, FilterHistory]:
         slot = core.intervals % config.clones
@@ -351,17 +351,19 @@ def device_pose(
     return DevicePose(state.mean, covariance, flags)
 
 
-def _checked_sample(time: Any, gyro: Any, accel: Any) -> tuple[float, tuple[float, ...]]:
+def _check_sample(time: Any, gyro: Any, accel: Any) -> tuple[float, tuple[float, ...]]:
     """The time, and gyro and accel in one tuple."""
-    (seconds,) = _numbers("time", time, (), "a finite number of seconds", math.inf)
+    (seconds,) = _check_numbers("time", time, (), "a finite number of seconds", math.inf)
     if not math.isfinite(seconds):
         raise ValueError(f"time: must be a finite number of seconds, found {time!r}")
-    rate = _numbers("gyro", gyro, (3,), "three numbers", FASTEST_TURN, "rad/s")
-    return seconds, rate + _numbers("accel", accel, (3,), "three numbers", STRONGEST_FORCE, "m/s²")
+    rate = _check_numbers("gyro", gyro, (3,), "three numbers", FASTEST_TURN, "rad/s")
+    return seconds, rate + _check_numbers(
+        "accel", accel, (3,), "three numbers", STRONGEST_FORCE, "m/s²"
+    )
 
 
-def _numbers(
-    name: str, value: Any, shape: tuple[int, ...], wanted: str, largest: float, unit: str = ""
+def _check_numbers(
+    name: str, value: Any, shape: tuple[int, ...], kind: str, largest: float, unit: str = ""
 ) -> tuple[float, ...]:
     """The numbers of an array of this shape, which must be within the range of an IMU."""
     try:
@@ -369,13 +371,13 @@ def _numbers(
     except (TypeError, ValueError):
         array = np.empty(0)
     if array.shape != shape:
-        raise ValueError(f"{name}: must be {wanted}, found {value!r}")
+        raise ValueError(f"{name}: must be {kind}, found {value!r}")
     numbers = tuple(array.reshape(-1).tolist())
-    size = max((abs(each) for each in numbers if math.isfinite(each)), default=0.0)
+    size = max((abs(number) for number in numbers if math.isfinite(number)), default=0.0)
     if size > largest:
         raise ValueError(f"{name}: no IMU measures more than {largest:g} {unit}, found {size:g}")
     return numbers
 
 
-def _copied(tree: Any) -> Any:
+def _copy(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.array(leaf, copy=True), tree)

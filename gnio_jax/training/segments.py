@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from gnio_jax import geometry
 from gnio_jax.config import AugmentConfig
-from gnio_jax.data.windows import low_pass_margin, random_low_pass
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import InitialStd
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, spans
+from gnio_jax.training.windows import low_pass_margin, random_low_pass
 from gnio_jax.types import Array, Sequence
 
 
@@ -181,7 +181,7 @@ def turn_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
 def low_pass_segments(
     key: PRNGKeyArray, segments: Segment, config: AugmentConfig, rate: float
 ) -> Segment:
-    """A batch of segments of which a random share is low-passed (`data.windows.random_low_pass`).
+    """A batch of segments of which a random share is low-passed (`windows.random_low_pass`).
 
     Network and filter see a slower sensor; the low-pass is in the body's frame. Beyond its ends a
     segment continues with its first and last sample. Jittable.

@@ -21,7 +21,10 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
-from gnio_jax.data.windows import (
+from gnio_jax.models.layers import MOMENTUM
+from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
+from gnio_jax.training.task import BatchLosses, Row, Task, TrainState
+from gnio_jax.training.windows import (
     WindowSource,
     augment,
     gather,
@@ -31,9 +34,6 @@ from gnio_jax.data.windows import (
     shift_windows,
     window_source,
 )
-from gnio_jax.models.layers import MOMENTUM
-from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
-from gnio_jax.training.task import BatchLosses, Row, Task, TrainState
 from gnio_jax.types import Prediction, Sequence, Windows
 
 

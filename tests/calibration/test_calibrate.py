@@ -228,7 +228,7 @@ def test_displacements_and_true_positions_have_their_times(run, splits_read, tmp
     monkeypatch.setattr(calibrating, "fit_innovations", unfitted)
     monkeypatch.setattr(calibrating, "compare_positions", compare_positions)
     calibration.calibrate(CalibrateConfig(str(run), out=str(tmp_path / "calibrated")))
-    for value, walk in zip(inputs[0].given.value, estimates, strict=True):
+    for value, walk in zip(inputs[0].displacements.value, estimates, strict=True):
         for interval in (CLONES, 100, STRIDES - 1):
             assert (value[interval] == walk.displacements.value[interval + 1]).all()
     assert len(positions[0].error) == WALKS * STRIDES
@@ -322,7 +322,9 @@ def test_a_second_calibration_compiles_nothing_and_an_early_end_is_a_warning(mon
     options = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(CalibrateConfig)}
     assert set(re.findall(r"--[a-z-]+", warning)) <= options  # the remedy exists
     programs = fitting._value_and_gradient._cache_size()
-    others = walks._replace(given=walks.given._replace(value=1.01 * walks.given.value))
+    others = walks._replace(
+        displacements=walks.displacements._replace(value=1.01 * walks.displacements.value)
+    )
     settings = changed(TRUE, noise={"std_factor": (0.7, 1.0, 1.0)}, start={"velocity": 0.2})
     fit(others, settings, most_steps=1)
     assert programs > 0 and fitting._value_and_gradient._cache_size() == programs
@@ -398,8 +400,8 @@ def test_the_padding_of_a_walk_has_no_effect():
     after = np.arange(N * STRIDES)[:, None] >= N * strides
     nothing = np.arange(STRIDES)[:, None] >= strides
     rows = Displacements(
-        np.where(nothing, np.nan, walks.given.value),
-        np.where(nothing[..., None], np.eye(3), walks.given.covariance),
+        np.where(nothing, np.nan, walks.displacements.value),
+        np.where(nothing[..., None], np.eye(3), walks.displacements.covariance),
     )
     still, falling = [0.0, 0.0, 9.81], [90.0, 0.0, 9.81]  # to 360 m/s, beyond the filter's bound
     evidences = [

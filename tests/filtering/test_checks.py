@@ -1,4 +1,4 @@
-"""Values that cannot be: refused by name at the door, and reported inside `jit`."""
+"""Impossible values are rejected by name, eagerly, and reported inside `jit`."""
 
 import dataclasses
 import re

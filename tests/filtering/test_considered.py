@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
 from gnio_jax.filtering import tracker as online
-from gnio_jax.filtering.consider import disturbed
+from gnio_jax.filtering.consider import disturb
 from gnio_jax.types import Prediction
 from tests.support.checks import checked_at_first
 from tests.support.compiling import optimised
@@ -46,7 +46,7 @@ def run_and_sensitivity(c, more, rotation, velocity, position, gyro, accel, disp
     start = filtering.initial_state(
         filtering.Filter(CONFIG, start=START), rotation, velocity, position, bias
     )
-    given = disturbed(disturbed(displacement, c), more), jax.vmap(jnp.diag)(std**2)
+    given = disturb(disturb(displacement, c), more), jax.vmap(jnp.diag)(std**2)
 
     def repeated(start, displacement, covariance):
         ekf = filtering.Filter(CONFIG, NOISE)
@@ -115,8 +115,8 @@ def test_displacements_are_disturbed_as_they_are_said_to_be():
     c = np.array([9.0, 9.0, 9.0, 0.2, -0.3, 0.1])
     wanted = np.exp(0.2) * Rotation.from_euler("z", -0.3).apply(np.nan_to_num(u))
     wanted[:, 2] += 0.1 * np.hypot(u[:, 0], u[:, 1])
-    np.testing.assert_allclose(disturbed(u, c), np.where(np.isnan(u), np.nan, wanted), atol=2e-7)
-    derivative = jax.jit(jax.jacfwd(lambda c: disturbed(u, c)))
+    np.testing.assert_allclose(disturb(u, c), np.where(np.isnan(u), np.nan, wanted), atol=2e-7)
+    derivative = jax.jit(jax.jacfwd(lambda c: disturb(u, c)))
     slope = derivative(c)
     assert np.isfinite(np.asarray(slope)[[0, 1, 3, 4]]).all()
     # Where there are no errors it is that of the formula, standing still too.
@@ -242,7 +242,7 @@ def test_the_tracker_has_the_covariance_of_the_whole_run(built):
         tracker = filtering.Tracker(
             TOLD, filtering.Filter(CONFIG, NOISE, considered=STD), started(r)
         )
-        told = np.nan_to_num(disturbed(runs.displacement[r], drawn()[r]))
+        told = np.nan_to_num(disturb(runs.displacement[r], drawn()[r]))
         poses = []
         for k in checked_at_first(range(N * STRIDES), 30):
             TOLD.displacement = told[k // N]

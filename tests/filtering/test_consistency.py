@@ -1,4 +1,4 @@
-"""Is the filter as certain as it may be? Monte Carlo with noises as it assumes them, correlated
+"""The filter is consistent (NEES, NIS): Monte Carlo with noises as it assumes them, correlated
 errors among them; and by autodiff the Jacobian of a measurement in its own frame."""
 
 import functools
@@ -121,7 +121,7 @@ def correlated():
     return with_correlated_errors(walks(), CLONES, CORRELATED_SIGMA, ERRORS, N * DT)
 
 
-def test_it_is_as_certain_as_it_may_be_with_correlated_errors():
+def test_the_filter_is_consistent_with_correlated_errors():
     runs, position = correlated(), PARTS["position"]
     error, spread, nis, _ = monte_carlo(runs, CORRELATED_SIGMA, ERRORS.share)
     assert 0.9 < nis[:, 100:].mean() / 3 < 1.1

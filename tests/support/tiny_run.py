@@ -12,9 +12,8 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.data import windows
 from gnio_jax.models import registry
-from gnio_jax.training import checkpoint, loop
+from gnio_jax.training import checkpoint, loop, windows
 from tests.support import drawn_run
 from tests.support.numpy_layers import batch_norm, float64, linear
 from tests.support.tiny_network import Tiny

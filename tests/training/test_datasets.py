@@ -13,11 +13,10 @@ from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.calibration import predictions
 from gnio_jax.config import CalibrateConfig, DataConfig, EvaluateConfig, TrainConfig
-from gnio_jax.data import windows
 from gnio_jax.data.readers import DATASETS
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import resolve
-from gnio_jax.training import checkpoint, loop, segments
+from gnio_jax.training import checkpoint, loop, segments, windows
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.task import TrainState
 from gnio_jax.training.window_task import WindowTask

@@ -16,7 +16,7 @@ from gnio_jax.data import loading
 from gnio_jax.errors import InputError
 from gnio_jax.models import Network
 from gnio_jax.reporting import Lines, Silence
-from gnio_jax.training import recordings, run_folder
+from gnio_jax.training import recordings, run_folder, waypoint_poses
 from gnio_jax.training.checkpoint import load_run
 from gnio_jax.training.window_task import WindowTask
 from gnio_jax.types import Waypoints
@@ -45,7 +45,7 @@ def experiment(run, workdir="", **changes):
 def read(monkeypatch, walks, run, workers=1):
     monkeypatch.setattr(loading, "read_split", lambda *_: iter(walks))
     config, samples = experiment(run), {}
-    poses = recordings._load_pose_network(config, Lines(), load_run)
+    poses = waypoint_poses.load_pose_network(config, Lines(), load_run)
     given = config, "synthetic", "train", Lines(), workers, samples, poses
     found = list(recordings.read_split(*given))
     assert samples == {each.name: len(each.time) for each in found}
@@ -60,7 +60,7 @@ def smoothed(earlier, monkeypatch):
     network = Network.of(run.model, run.variables)
     wanted = filtering.make_filter(run.config.data, run.config.filter)
 
-    def waypoint_poses(walk, predict, ekf):
+    def smooth(walk, predict, ekf):
         asked.append(walk.name)
         assert jnp.ones(()).dtype == np.float64
         if len(asked) == 1:
@@ -80,7 +80,7 @@ def smoothed(earlier, monkeypatch):
         )
         return filtering.WaypointPoses(poses, None, None)
 
-    monkeypatch.setattr(filtering, "waypoint_poses", waypoint_poses)
+    monkeypatch.setattr(filtering, "waypoint_poses", smooth)
     return asked
 
 
@@ -124,11 +124,11 @@ def test_smooth_poses_come_from_the_run_and_then_from_the_cache(
 def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypatch):
     sources = []
     monkeypatch.setattr(
-        recordings, "cache_entry", lambda name, files: sources.append(files) or Path(name)
+        waypoint_poses, "cache_entry", lambda name, files: sources.append(files) or Path(name)
     )
     walk, run = tapped(0), load_run(earlier)
-    digest = recordings.digest_network(run)
-    by = recordings.PoseNetwork(str(earlier), load_run, digest)
+    digest = waypoint_poses.digest_network(run)
+    by = waypoint_poses.PoseNetwork(str(earlier), load_run, digest)
     assert walk.waypoints is not None
     time, place = walk.waypoints
     others = [
@@ -139,8 +139,8 @@ def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypat
         walk._replace(imu_valid=np.arange(len(walk.time)) > 5),
         walk._replace(waypoints=Waypoints(time, place + 1e-9)),
     ]
-    entries = {recordings._cache_entry(each, by) for each in [walk, *others]}
-    entries.add(recordings._cache_entry(walk, by._replace(digest="other")))
+    entries = {waypoint_poses._cache_entry(each, by) for each in [walk, *others]}
+    entries.add(waypoint_poses._cache_entry(walk, by._replace(digest="other")))
     assert len(entries) == len(others) + 2
     names = {"/".join(path.parts[-2:]) for path in sources[0]}
     assert {"filtering/waypoints.py", "models/gnio.py", "gnio_jax/geometry.py"} <= names
@@ -149,23 +149,23 @@ def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypat
     other = run._replace(config=dataclasses.replace(run.config, filter=settings))
     changed_weights = jax.tree.map(lambda leaf: leaf + 1e-6, run.variables)
     moved = run._replace(config=dataclasses.replace(run.config, workdir="elsewhere"))
-    assert recordings.digest_network(moved) == digest
+    assert waypoint_poses.digest_network(moved) == digest
     for each in (other, run._replace(variables=changed_weights)):
-        assert recordings.digest_network(each) != digest
+        assert waypoint_poses.digest_network(each) != digest
 
 
 def test_a_run_that_changes_at_its_place_makes_its_own_poses(earlier, smoothed, monkeypatch):
     config = load_run(earlier).config
     read(monkeypatch, [tapped(0)], earlier)
-    old = recordings.PoseNetwork(
-        str(earlier), load_run, recordings.digest_network(load_run(earlier))
+    old = waypoint_poses.PoseNetwork(
+        str(earlier), load_run, waypoint_poses.digest_network(load_run(earlier))
     )
     tiny_run.save(earlier, dataclasses.replace(config, filter=changed(SETTINGS)), size=0.3)
     read(monkeypatch, [tapped(0)], earlier)
     assert smoothed == ["survey 0"] * 2
-    recordings._load_smoother.cache_clear()
+    waypoint_poses._load_smoother.cache_clear()
     with pytest.raises(InputError, match="has changed while it made poses"):
-        recordings.smooth_poses(tapped(0), old)
+        waypoint_poses.smooth_poses(tapped(0), old)
 
 
 def unread():
@@ -184,7 +184,7 @@ def test_a_run_that_cannot_make_poses_is_told_before_anything_is_read(tmp_path, 
 
 def test_a_run_that_is_not_calibrated_is_warned_of(tmp_path, capsys):
     run = tiny_run.save(tmp_path / "plain", tiny_run.config(None, "", data=DataConfig(rate=50.0)))
-    assert recordings._load_pose_network(experiment(run), Lines(), load_run) is not None
+    assert waypoint_poses.load_pose_network(experiment(run), Lines(), load_run) is not None
     assert f"warning: {run}: its filter is not calibrated" in capsys.readouterr().err
 
 
@@ -204,7 +204,7 @@ def test_a_resumed_run_takes_the_same_poses_from_another_place(
             return yaml.safe_load((tmp_path / "run" / "splits.yaml").read_text())
 
     kept = opened(earlier, resume=False)
-    assert kept["data.poses_by"] == [recordings.digest_network(load_run(earlier))]
+    assert kept["data.poses_by"] == [waypoint_poses.digest_network(load_run(earlier))]
     assert opened(shutil.copytree(earlier, tmp_path / "moved")) == kept
     other = tiny_run.save(tmp_path / "other", load_run(earlier).config, size=0.3)
     with pytest.raises(InputError, match=r"begun with other recordings in split 'data\.poses_by'"):
@@ -226,7 +226,7 @@ def test_processes_make_the_poses_that_one_makes(earlier, monkeypatch):
         return next(outputs) if shape == (3,) else np.full(shape, float(kind == "batch_stats"))
 
     run = drawn_run.save(earlier.with_name("ahead"), config, draw)
-    monkeypatch.setattr(recordings, "FEW", 1)
+    monkeypatch.setattr(waypoint_poses, "FEW", 1)
     walks = [survey(seed, legs=3).tapped(np.zeros(4)) for seed in (1, 2)]
     shared = read(monkeypatch, walks, run, workers=2)
     monkeypatch.setenv("GNIO_CACHE", str(earlier / "empty"))

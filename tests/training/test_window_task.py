@@ -10,10 +10,9 @@ import pytest
 
 from gnio_jax import parallel
 from gnio_jax.config import ModelConfig, TrainConfig
-from gnio_jax.data import windows
 from gnio_jax.models.heads import CalibratedUncertainty
 from gnio_jax.reporting import Silence
-from gnio_jax.training import task, window_task
+from gnio_jax.training import task, window_task, windows
 from gnio_jax.training.losses import Losses, loss_stage
 from gnio_jax.training.recordings import set_up
 from gnio_jax.training.task import TrainState
