@@ -21,6 +21,7 @@ __all__ = [
     "interop",
     "load_pretrained",
     "models",
+    "networks",
     "tables",
     "track",
     "training",
@@ -31,7 +32,7 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.metadata.version("gnio-jax")
     if name == "load_pretrained":
-        return importlib.import_module("gnio_jax.apps.packages").load_pretrained
+        return importlib.import_module("gnio_jax.networks").load
     if name == "track":
         return importlib.import_module("gnio_jax.apps.arrays").track
     if name in __all__:

@@ -13,7 +13,7 @@ import pytest
 import gnio_jax
 from gnio_jax import config as configuration
 from gnio_jax import data, models
-from gnio_jax.apps import packages
+from gnio_jax.apps.publish import publish
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import measurements
@@ -128,13 +128,13 @@ def test_a_measurement_of_ones_own(capsys):
 
 
 def test_weights_that_are_loaded(tmp_path, monkeypatch):
-    """`mine` is the package of a tiny network."""
+    """`mine` is a tiny network."""
     config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
     monkeypatch.setenv("GNIO_WEIGHTS", str(tmp_path))
     names = {"gnio_jax": gnio_jax, "windows": np.zeros((2, 50, 6), np.float32)}
     with tiny_run.known():
         folder = tiny_run.save(tmp_path / "run", config)
-        packages.publish(folder, tmp_path / "mine", "mine", "nobody's walks", "CC0")
+        publish(folder, tmp_path / "mine", "mine", "nobody's walks", "CC0")
         run("docs/weights.md", code_of("docs/weights.md"), names)
     assert names["prediction"].displacement.shape == (2, 3)
 

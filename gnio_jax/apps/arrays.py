@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.apps import packages
+from gnio_jax import networks
 from gnio_jax.apps.importing import units
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.recording import RawRecording, as_sequence
@@ -48,7 +48,7 @@ class Odometry(NamedTuple):
     """Warnings, and what was found out about the samples and the start, one sentence each."""
 
 
-def track(time: Any, gyro: Any, accel: Any, weights: str | Path = "pedestrian") -> Odometry:
+def track(time: Any, gyro: Any, accel: Any, network: str | Path = "pedestrian") -> Odometry:
     """The trajectory of a phone that somebody carries, from arrays of its IMU's samples.
 
     Start, filter and result are those of `gnio track` for a file with these samples. Stand still
@@ -61,11 +61,11 @@ def track(time: Any, gyro: Any, accel: Any, weights: str | Path = "pedestrian") 
         gyro: (n, 3) angular rate, body frame, rad/s.
         accel: (n, 3) specific force, body frame, m/s², with gravity in it: the axis that points up
             reads +9.81 at rest, as on Android.
-        weights: Name of a package of weights, its folder or zip, or the folder of a run.
+        network: Name of a trained network, or its folder or zip.
 
     Raises:
         InputError: An array has the wrong shape, a value that is not finite, or another unit; the
-            samples last less than two seconds or so; there are no such weights. It is a
+            samples last less than two seconds or so; there is no such network. It is a
             `ValueError`.
     """
     time, gyro, accel = _checked_samples(time, gyro, accel)
@@ -77,7 +77,7 @@ def track(time: Any, gyro: Any, accel: Any, weights: str | Path = "pedestrian") 
         warnings=[],
         sign="android",
     )
-    chosen = packages.choose(weights)
+    chosen = networks.load(network)
     with jax.enable_x64(True):  # for the filter; the network states its float32
         imported = as_sequence(recording, ImportOptions(), None, SOURCE)
         estimate, ready, ekf = estimate_recording(imported.sequence, chosen)

@@ -1,6 +1,6 @@
 """The trajectory of your own recording and its accuracy (`gnio track`).
 
-recording + weights → check → prepare → estimate → score → summarise → write
+recording + network → check → prepare → estimate → score → summarise → write
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from gnio_jax import config as configuration
 from gnio_jax.apps import export, rerun
 from gnio_jax.apps.importing import GAPS, Imported
-from gnio_jax.apps.packages import Weights
+from gnio_jax.apps.publish import describe_data
 from gnio_jax.config import TrainConfig
 from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.resampling import longest_bridge
@@ -37,6 +37,7 @@ from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
 from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.filtering.zero_velocity import quiet_samples
 from gnio_jax.models import Network
+from gnio_jax.networks import TrainedNetwork
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.types import GRAVITY, Sequence
 
@@ -67,9 +68,9 @@ class Summary(NamedTuple):
     """The figures and remarks about a track."""
 
     recording: str
-    weights: str
+    network: str
     trained_on: str
-    """The training data, and the measured error of these weights if there is one."""
+    """The training data, and the measured error of the network if there is one."""
     start_time: float
     """Duration by the recording's own clock, s."""
     seconds: float
@@ -106,7 +107,7 @@ class Tracked(NamedTuple):
 
 def track(
     recording: Imported,
-    weights: Weights,
+    trained: TrainedNetwork,
     out: Path,
     formats: tuple[str, ...] = (),
     progress: Progress = silent,
@@ -120,7 +121,7 @@ def track(
 
     Args:
         recording: The recording, on a uniform clock.
-        weights: The network.
+        trained: The network.
         out: The folder. It is written whole or not at all and replaces an earlier track.
         formats: Further formats of the trajectory, of `export.FORMATS`.
         progress: A function that gets the finished share.
@@ -131,13 +132,13 @@ def track(
         InputError: The results could not be written, or the recording is too short or has a hole
             that is too long.
     """
-    sequence, config = recording.sequence, weights.run.config
+    sequence, config = recording.sequence, trained.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
-    found, ready, ekf = estimate_recording(sequence, weights, progress)
+    found, ready, ekf = estimate_recording(sequence, trained, progress)
     compared = np.isfinite(found.reference.position).any() or found.waypoints is not None
     errors = metrics.score([found])[found.name].values if compared else {}
-    summary = summarise(found, errors, ready, recording, weights, ekf)
+    summary = summarise(found, errors, ready, recording, trained, ekf)
     with replacing_folder(out) as folder:
         _write_figures(folder, found, summary, formats)
         _draw(folder, found, summary, config, command)
@@ -161,7 +162,7 @@ def _check_results(
 
 
 def estimate_recording(
-    sequence: Sequence, weights: Weights, progress: Progress = silent
+    sequence: Sequence, trained: TrainedNetwork, progress: Progress = silent
 ) -> tuple[SequenceEstimate, PreparedRecording, Filter]:
     """The estimate of a recording, the recording as the filter took it, and the filter.
 
@@ -171,7 +172,7 @@ def estimate_recording(
     `InputError` for a recording that is too short or has a hole that is too long.
     """
     _check_bridged(sequence)
-    config = weights.run.config
+    config = trained.config
     ekf = make_filter(config.data, config.filter)
     ready, left_out = prepare(
         [sequence],
@@ -186,7 +187,7 @@ def estimate_recording(
     if ekf.considered is not None and not ready[0].start.raw_gyro:
         considered = ekf.considered._replace(raw_gyro_bias=0.0)
         ekf = dataclasses.replace(ekf, considered=considered if any(considered) else None)
-    network = Network.of(weights.run.model, weights.run.variables)
+    network = Network.of(trained.model, trained.variables)
     (found,) = estimate(ready, network, config.data, ekf, 1, progress)
     return found, ready[0], ekf
 
@@ -207,7 +208,7 @@ def summarise(
     errors: dict[str, float | None],
     ready: PreparedRecording,
     recording: Imported,
-    weights: Weights,
+    trained: TrainedNetwork,
     ekf: Filter,
 ) -> Summary:
     """The figures of a finished track, up to a divergence if there was one.
@@ -217,7 +218,7 @@ def summarise(
         errors: Metrics against the reference by their names; empty without a reference.
         ready: The recording as the filter took it.
         recording: The recording as it was imported, with its notes and warnings.
-        weights: The network, for its name and its training data.
+        trained: The network, for its name and its training data.
         ekf: The filter.
     """
     filtered, sequence = found.filtered, recording.sequence
@@ -236,8 +237,8 @@ def summarise(
         counted += "so the real error is probably larger"
     summary = Summary(
         recording=sequence.name,
-        weights=weights.name,
-        trained_on=weights.trained_on,
+        network=trained.name,
+        trained_on=describe_data(trained),
         start_time=float(sequence.attributes.get("start_time", 0.0)),
         seconds=seconds,
         path_length=length,
@@ -251,7 +252,7 @@ def summarise(
         warnings=(),
         notes=(*recording.notes, *ready.notes),
         limits=f"limits: {length:.1f} m in {seconds:.0f} s; expected error at the end "
-        f"{error:.1f} m{share} by the filter, {counted}; weights {weights.name}; place and heading "
+        f"{error:.1f} m{share} by the filter, {counted}; network {trained.name}; place and heading "
         "are relative to the start",
     )
     own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
@@ -365,7 +366,7 @@ def _draw(
         "command": command,
         "walked": f"{length}, ends {summary.from_start:.1f} m from the start",
         "expected error at the end": f"{expected} by the filter",
-        "weights": f"{summary.weights}, trained on {summary.trained_on}",
+        "network": f"{summary.network}, trained on {summary.trained_on}",
         "window orientation": "filter",
         "alignment": aligned if summary.errors else "",
         "reference": partly if 0 < known < 1 else "",

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import gnio_jax
-from gnio_jax.apps import packages
+from gnio_jax import networks
 from gnio_jax.apps.importing import import_recording
 from gnio_jax.apps.track import track
 from gnio_jax.config import DataConfig, ImportOptions, ModelConfig, TrainConfig
@@ -37,7 +37,7 @@ def samples():
 
 @pytest.fixture(scope="module")
 def odometry(runs, samples):
-    return gnio_jax.track(*samples, weights=runs / "walker")
+    return gnio_jax.track(*samples, network=runs / "walker")
 
 
 def test_it_is_the_trajectory_of_gnio_track(odometry, runs, samples, tmp_path, monkeypatch):
@@ -50,7 +50,7 @@ def test_it_is_the_trajectory_of_gnio_track(odometry, runs, samples, tmp_path, m
         time_unit="s", gyro_unit="rad/s", accel_unit="m/s2", accel_sign="android"
     )
     recording = import_recording(tmp_path / "walk.csv", stated)
-    tracked = track(recording, packages.choose(runs / "walker"), tmp_path / "track")
+    tracked = track(recording, networks.load(runs / "walker"), tmp_path / "track")
     estimate = tracked.estimate
     path, filtered, states = estimate.trajectory, estimate.filtered, estimate.states
     assert filtered is not None and states is not None
@@ -82,7 +82,7 @@ def test_rows_in_any_order_and_lists_whatever_the_precision_of_jax(odometry, run
     order = np.r_[100:580, 0:100]
     mixed = [values[order].tolist() for values in samples]
     with jax.enable_x64(False):
-        again = gnio_jax.track(*mixed, weights=str(runs / "walker"))
+        again = gnio_jax.track(*mixed, network=str(runs / "walker"))
         assert not jax.config.read("jax_enable_x64")
     np.testing.assert_allclose(again.position, odometry.position, atol=1e-9)
     np.testing.assert_allclose(again.covariance, odometry.covariance, rtol=1e-6)
@@ -152,10 +152,10 @@ WRONG = {
 @pytest.mark.parametrize("message", WRONG)
 def test_what_is_refused(message, runs, samples):
     with pytest.raises(InputError) as error:
-        gnio_jax.track(*WRONG[message](*samples), weights=runs / "walker")
+        gnio_jax.track(*WRONG[message](*samples), network=runs / "walker")
     assert message in str(error.value) and isinstance(error.value, ValueError)
 
 
 def test_weights_that_do_not_exist(samples):
     with pytest.raises(InputError, match="did you mean 'pedestrian'"):
-        gnio_jax.track(*samples, weights="pedestrain")
+        gnio_jax.track(*samples, network="pedestrain")
