@@ -23,6 +23,7 @@ __all__ = [
     "models",
     "networks",
     "tables",
+    "track",
     "training",
 ]
 
@@ -32,6 +33,8 @@ def __getattr__(name: str) -> Any:
         return importlib.metadata.version("gnio-jax")
     if name == "load_pretrained":
         return importlib.import_module("gnio_jax.networks").load
+    if name == "track":
+        return importlib.import_module("gnio_jax.apps.arrays").track
     if name in __all__:
         return importlib.import_module(f"gnio_jax.{name}")
     raise AttributeError(f"module 'gnio_jax' has no attribute '{name}'")

@@ -114,20 +114,65 @@ def track(
     command: str = "",
     rerun_file: Path | None = None,
 ) -> Tracked:
-    """Track a recording and write trajectory, picture, page and summary into the folder `out`.
+    """Track a recording and write trajectory, picture, page and summary into a folder.
 
-    The trajectory starts at the origin with yaw zero; its stamps are the recording's own. The tilt
-    at the start comes from the gravity of the first second. The velocity is zero, with a standard
-    deviation that depends on how quiet that second is, and a rest at the start gives the gyro's
-    bias. A reference is not used for the start, only for comparison. `formats` are further ones of
-    `export.FORMATS`, `command` is the command line, for the page, and `rerun_file` a file to write
-    for the viewer Rerun. The folder is written whole or not at all and replaces an earlier track.
-    Raises `InputError`.
+    The stamps are the recording's own. `estimate_recording` says where the trajectory starts. A
+    reference is only compared with it.
+
+    Args:
+        recording: The recording, on a uniform clock.
+        trained: The network.
+        out: The folder. It is written whole or not at all and replaces an earlier track.
+        formats: Further formats of the trajectory, of `export.FORMATS`.
+        progress: A function that gets the finished share.
+        command: The command line, for the page.
+        rerun_file: A file to write for the viewer Rerun.
+
+    Raises:
+        InputError: The results could not be written, or the recording is too short or has a hole
+            that is too long.
     """
     sequence, config = recording.sequence, trained.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
+    found, ready, ekf = estimate_recording(sequence, trained, progress)
+    compared = np.isfinite(found.reference.position).any() or found.waypoints is not None
+    errors = metrics.score([found])[found.name].values if compared else {}
+    summary = summarise(found, errors, ready, recording, trained, ekf)
+    with replacing_folder(out) as folder:
+        _write_figures(folder, found, summary, formats)
+        _draw(folder, found, summary, config, command)
+    if rerun_file is not None:
+        rerun.write(rerun_file, [found], [ready])
+    return Tracked(found, summary, out)
+
+
+def _check_results(
+    out: Path, formats: tuple[str, ...], rerun_file: Path | None, stamps: Float[np.ndarray, "n"]
+) -> None:
+    """Raise `InputError`, before any work, for results that could not be written afterwards."""
+    track = all((out / name).is_file() for name in NAMES)
+    if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
+        raise InputError(out, "exists and is not an earlier track", "name another --out")
+    check_writable_folder(out.parent)
+    for kind in formats:
+        export.check("--format", kind, stamps)
+    if rerun_file is not None:
+        rerun.check(rerun_file)
+
+
+def estimate_recording(
+    sequence: Sequence, trained: TrainedNetwork, progress: Progress = silent
+) -> tuple[SequenceEstimate, PreparedRecording, Filter]:
+    """The estimate of a recording, the recording as the filter took it, and the filter.
+
+    The trajectory starts at the origin with yaw zero. The tilt at the start comes from the gravity
+    of the first second. The velocity is zero, with a standard deviation that depends on how quiet
+    that second is, and a rest at the start gives the gyro's bias. A reference is not used. Raises
+    `InputError` for a recording that is too short or has a hole that is too long.
+    """
     _check_bridged(sequence)
+    config = trained.config
     ekf = make_filter(config.data, config.filter)
     ready, left_out = prepare(
         [sequence],
@@ -144,29 +189,7 @@ def track(
         ekf = dataclasses.replace(ekf, considered=considered if any(considered) else None)
     network = Network.of(trained.model, trained.variables)
     (found,) = estimate(ready, network, config.data, ekf, 1, progress)
-    compared = np.isfinite(found.reference.position).any() or found.waypoints is not None
-    errors = metrics.score([found])[found.name].values if compared else {}
-    summary = summarise(found, errors, ready[0], recording, trained, ekf)
-    with replacing_folder(out) as folder:
-        _write_figures(folder, found, summary, formats)
-        _draw(folder, found, summary, config, command)
-    if rerun_file is not None:
-        rerun.write(rerun_file, [found], ready)
-    return Tracked(found, summary, out)
-
-
-def _check_results(
-    out: Path, formats: tuple[str, ...], rerun_file: Path | None, stamps: Float[np.ndarray, "n"]
-) -> None:
-    """Raise `InputError`, before any work, for results that could not be written afterwards."""
-    track = all((out / name).is_file() for name in NAMES)
-    if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
-        raise InputError(out, "exists and is not an earlier track", "name another --out")
-    check_writable_folder(out.parent)
-    for kind in formats:
-        export.check("--format", kind, stamps)
-    if rerun_file is not None:
-        rerun.check(rerun_file)
+    return found, ready[0], ekf
 
 
 def _check_bridged(sequence: Sequence) -> None:
@@ -188,7 +211,16 @@ def summarise(
     trained: TrainedNetwork,
     ekf: Filter,
 ) -> Summary:
-    """The figures of a finished track, up to a divergence if there was one."""
+    """The figures of a finished track, up to a divergence if there was one.
+
+    Args:
+        found: The estimate, with the filter's covariances.
+        errors: Metrics against the reference by their names; empty without a reference.
+        ready: The recording as the filter took it.
+        recording: The recording as it was imported, with its notes and warnings.
+        trained: The network, for its name and its training data.
+        ekf: The filter.
+    """
     filtered, sequence = found.filtered, recording.sequence
     assert filtered is not None
     rows = int(np.flatnonzero(found.trajectory.known)[-1]) + 1

@@ -78,9 +78,17 @@ def evaluate(
     results to a folder of the network.
 
     The folder is written whole or not at all, and replaces that of an earlier evaluation with the
-    same options. `workers` processes read recordings that are slow to read; `command` is the
-    command line, for the page. Raises `InputError` for options that do not fit together, a network
-    that cannot be loaded, missing data, and a split of which no sequence can be estimated.
+    same options.
+
+    Args:
+        config: The options of `gnio evaluate`.
+        reporter: It gets progress and lines of text.
+        workers: Number of processes that read recordings that are slow to read.
+        command: The command line, for the page.
+
+    Raises:
+        InputError: Options do not fit together, the network cannot be loaded, data are missing, or
+            no sequence of the split can be estimated.
     """
     _check(config)
     path = find_network(config.network or newest_run())

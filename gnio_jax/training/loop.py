@@ -77,13 +77,21 @@ def train_all(
     """`train` for experiments that differ only in their seeds and folders (`config.with_seeds`),
     one after the other. Recordings are read once and steps are compiled once.
 
-    With `resume` finished runs are skipped, begun ones continue from their latest checkpoint, and
-    missing ones start. A signal ends the run that it interrupts. The runs after it do not begin and
-    have no outcome. `workers` processes read recordings that are slow to read. A batch of windows
-    is divided among `devices` devices of each process (`parallel.sharing`); their number changes
-    the results only by rounding, even in a run that is resumed. Raises `InputError` where the
-    initial network is not that of the config, for settings that do not fit together, for a folder
-    that holds another run, and where the devices cannot share a batch evenly.
+    A signal ends the run that it interrupts. The runs after it do not begin and have no outcome.
+
+    Args:
+        configs: The experiments.
+        resume: Whether finished runs are skipped and begun ones continue from their latest
+            checkpoint. Missing ones start.
+        reporter: It gets progress and lines of text.
+        workers: Number of processes that read recordings that are slow to read.
+        devices: Number of devices of each process among which a batch of windows is divided
+            (`parallel.sharing`); None: all of them, and on a CPU one. It changes the results only
+            by rounding, even in a run that is resumed.
+
+    Raises:
+        InputError: The initial network is not of the same network, settings do not fit together, a
+            folder holds another run, or the devices cannot share a batch evenly.
     """
     reporter = (reporter or Lines()) if parallel.is_first() else Silence()
     folders = map(configuration.default_workdir, configs)
