@@ -36,12 +36,17 @@ def publish(
     older one. It is written whole or not at all, and its settings do not contain folders of this
     machine.
 
-    The publisher must describe the `data` on which the network was trained (recordings, devices,
-    people, carrying positions), the `license` under which the data may be used and the weights
-    passed on, and the cases in which it `fails`, one sentence each.
+    Args:
+        network: The folder of a network, a published one, or a name.
+        out: The place of the published network.
+        name: Its name, a file name.
+        data: The data on which it was trained: recordings, devices, people, ways of carrying.
+        license: The terms under which the data may be used and the weights passed on.
+        fails: The cases in which it fails, one sentence each.
 
-    Raises `InputError` for a network that cannot be loaded, a name that is not a file name, empty
-    texts, or something at `out` that is no published network.
+    Raises:
+        InputError: The network cannot be loaded, the name is no file name, a text is empty, or
+            something at `out` is no published network.
     """
     if name != file_stem(name):
         remedy = "use letters, digits, '.', '_', '+' and '-'"

@@ -409,7 +409,7 @@ def test_the_padding_of_a_walk_has_no_effect():
             walks._replace(
                 gyro=np.where(after, 0.0, walks.gyro),
                 accel=np.where(after, force, walks.accel),
-                given=rows,
+                displacements=rows,
             ),
             TRUE,
             most_steps=1,
