@@ -12,12 +12,16 @@ from typing import Any, NamedTuple
 
 from gnio_jax.config import CompareConfig, EvaluateConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept, statistics, tabulate
-from gnio_jax.evaluation.kept import IDENTITY
+from gnio_jax.evaluation import reuse, statistics, tabulate
+from gnio_jax.evaluation.folder import REMEDY, read
 from gnio_jax.evaluation.metrics import NAMES
-from gnio_jax.evaluation.report import REMEDY, Report, read
+from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation.reuse import IDENTITY, RequestedEvaluation
 from gnio_jax.evaluation.statistics import Cell
 from gnio_jax.files import with_ending
+from gnio_jax.networks import list_networks
+from gnio_jax.networks.find import is_network
+from gnio_jax.networks.folder import name_of
 from gnio_jax.reporting import Lines, Reporter
 
 USUAL = (
@@ -40,8 +44,8 @@ class EvaluationSource(NamedTuple):
     run: Path
     folder: Path
     identity: dict[str, Any]
-    """Values of the settings `kept.IDENTITY`."""
-    figures: Report | kept.Kept
+    """Values of the settings `reuse.IDENTITY`."""
+    figures: Report | RequestedEvaluation
     """The figures of a named evaluation, or for a run its requested evaluation."""
 
 
@@ -62,7 +66,7 @@ class ComparedRow(NamedTuple):
         """Recordings that all seeds have, and for which the metric, if given, has a value."""
         seeds = [report.scores for report in self.reports]
         if metric is not None:
-            return set(statistics.values(seeds, metric))
+            return set(statistics.collect_values(seeds, metric))
         return set.intersection(*map(set, seeds))
 
 
@@ -92,23 +96,23 @@ def compare(
             remedy = f"write the runs before --metrics; the metrics are: {', '.join(NAMES)}"
             raise InputError("--metrics", f"no metric '{word}'", remedy)
     if len(config.rows) < 2:
-        remedy = "name the run to compare with first, and all of them before --metrics"
-        raise InputError("RUNS", "needs two or more", remedy)
+        remedy = "name the one to compare with first, and all of them before --metrics"
+        raise InputError("NETWORKS", "needs two or more", remedy)
     sources_by_row = [[_source(path, config) for path in find(word)] for word in config.rows]
     sources = [source for row in sources_by_row for source in row]
     _check_sources(sources)
 
-    def report_of(evaluation: Report | kept.Kept) -> Report:
+    def report_of(evaluation: Report | RequestedEvaluation) -> Report:
         return (
             evaluation
             if isinstance(evaluation, Report)
-            else kept.made(evaluation, reporter, workers)
+            else reuse.load_or_evaluate(evaluation, reporter, workers)
         )
 
     rows = [
         ComparedRow(
             label,
-            [source.run.name for source in row],
+            [name_of(source.run) for source in row],
             [report_of(source.figures) for source in row],
         )
         for label, row in zip(_labels(config.rows), sources_by_row, strict=True)
@@ -134,7 +138,7 @@ def compare(
 
 
 def find(word: str) -> list[Path]:
-    """The runs, or folders of evaluations, that `word` names: itself, or its seeds.
+    """The networks, or folders of evaluations, that `word` names: itself, or its seeds.
 
     A name without a seed stands for all its seeds, in their order: `runs/gnio` for `runs/gnio_s0`,
     `runs/gnio_s1` and so on, `runs/gnio_calibrated` for `runs/gnio_s0_calibrated` and so on. Raises
@@ -158,8 +162,12 @@ def find(word: str) -> list[Path]:
     if missing and len(missing) < len(paths):
         problem = f"exists for {len(paths) - len(missing)} of {len(paths)} seeds only"
         raise InputError(word, problem, f"missing: {', '.join(map(str, missing))}")
+    if not paths and word in list_networks():
+        return [list_networks()[word]]
     if not paths or missing:
-        remedy = "name a run, the folder of an evaluation, or a run of several seeds without _s0"
+        remedy = (
+            "name a network, the folder of an evaluation, or a run of several seeds without _s0"
+        )
         if "eval" in path.parts:
             remedy = "make it with gnio evaluate, whose help names the options"
         raise InputError(word, "is not there", remedy)
@@ -167,16 +175,18 @@ def find(word: str) -> list[Path]:
 
 
 def _source(path: Path, config: CompareConfig) -> EvaluationSource:
-    """The evaluation of a run with all options at their defaults, or the evaluation that is
+    """The evaluation of a network with all options at their defaults, or the evaluation that is
     named."""
-    if (path / "config.yaml").is_file():
-        settings = {"split": config.split, "estimator": config.estimator, "plots": False}
-        evaluation = kept.look(EvaluateConfig(str(path), data_root=config.data_root, **settings))
+    if is_network(path):
+        names = ("dataset", "data_root", "split", "estimator")
+        settings = {name: getattr(config, name) for name in names}
+        evaluation = reuse.find_existing(EvaluateConfig(str(path), plots=False, **settings))
         identity = {name: getattr(evaluation.config, name) for name in IDENTITY}
         return EvaluationSource(path, path, evaluation.folder, identity, evaluation)
     report = read(path)
-    run = Path(os.path.abspath(path)).parent.parent
-    if path.resolve().parent.name == "eval" and (problem := kept.out_of_date(report, run)):
+    folder = Path(os.path.abspath(path)).parent
+    run = folder.parent if folder.name == "eval" else folder
+    if path.resolve().parent.name == "eval" and (problem := reuse.find_change(report, run)):
         raise InputError(path, problem, REMEDY)
     identity = {name: report.settings.get(name) for name in IDENTITY}
     return EvaluationSource(path, run, path, identity, report)
@@ -260,12 +270,14 @@ def lines(comparison: Comparison) -> list[list[str]]:
             row.recordings(metric) == comparison.rows[0].recordings(metric)
             for row in comparison.rows
         )
-        for index, (row, (mean, difference)) in enumerate(zip(comparison.rows, cells, strict=True)):
+        for index, (row, (summary, difference)) in enumerate(
+            zip(comparison.rows, cells, strict=True)
+        ):
             better = ""
             if difference and difference.compared and not difference.withheld:
                 better = f"{difference.better} of {difference.compared}"
-            text = tabulate.mean(mean, column.digits)
-            text += "" if alike else f" over {mean.sequences}"
+            text = tabulate.mean(summary, column.digits)
+            text += "" if alike else f" over {summary.sequences}"
             head = ["" if index else column.title, row.label, text]
             table.append([*head, tabulate.difference(difference, column.digits), better])
     return table
@@ -326,7 +338,8 @@ def filter_options(comparison: Comparison) -> list[str]:
 
 def write(path: Path, comparison: Comparison) -> None:
     """Write `path`.md, `path`.csv and `path`.png."""
-    from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
+    from gnio_jax import drawing  # Matplotlib takes a second to import
+    from gnio_jax.evaluation import plots
 
     text = f"{title(comparison)}\n\n{tabulate.markdown(HEADER, lines(comparison))}\n"
     text += "\n\n".join(explanations(comparison))
@@ -340,8 +353,8 @@ def write(path: Path, comparison: Comparison) -> None:
     drawable = [
         metric
         for metric, cells in comparison.cells.items()
-        if any(cell.mean.seeds for cell in cells)
+        if any(cell.summary.seeds for cell in cells)
     ]
     rows = {row.label: row.reports for row in comparison.rows}
-    picture = plots.paired(rows, next(iter(drawable or comparison.cells)))
-    plots.save(with_ending(path, ".png"), picture)
+    picture = plots.sequence_dots(rows, next(iter(drawable or comparison.cells)))
+    drawing.save(with_ending(path, ".png"), picture)

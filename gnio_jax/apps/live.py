@@ -32,12 +32,11 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory
 from gnio_jax.evaluation.metrics import path_length
 from gnio_jax.evaluation.prepare import ROUGH_START
-from gnio_jax.filtering import Pose, Tracker
-from gnio_jax.filtering.settings import filter_setup
+from gnio_jax.filtering import Pose, Tracker, make_filter
 from gnio_jax.filtering.start import level_state
 from gnio_jax.models import Network
+from gnio_jax.networks import TrainedNetwork
 from gnio_jax.numerics import quaternion_from_matrix
-from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
 # --- samples
@@ -323,7 +322,9 @@ TURNING_SECONDS = 10.0
 """Time after which the rotation of gravity is compared with the gyro, s (ours)."""
 
 
-def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float = 1.0) -> Tracker:
+def create_tracker(
+    run: TrainedNetwork, imu_rate: float | None = None, rest_seconds: float = 1.0
+) -> Tracker:
     """The compiled tracker of a run, with the filter and the start of `gnio track`.
 
     From the same samples it makes the same trajectory as `gnio track`, to rounding, if the
@@ -335,44 +336,41 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
     `Tracker.expect` changes it. If samples are further apart than 1.5 of its intervals, some are
     missing between them. Raises `ValueError` for a rest that is shorter than two samples.
     """
-    setup = filter_setup(run.config.data, run.config.filter)
     network = Network.of(run.model, run.variables)
     return Tracker(
         lambda windows: network.apply(network.variables, windows),
-        setup.config,
-        setup.noise,
+        make_filter(run.config.data, run.config.filter),
         rest_seconds=rest_seconds,
-        std=setup.initial_std,
         hole=longest_interval(run, imu_rate),
         imu_rate=imu_rate or run.config.data.rate,
-        considered=setup.considered,
     )
 
 
-def longest_interval(run: Run, imu_rate: float | None = None) -> float:
+def longest_interval(run: TrainedNetwork, imu_rate: float | None = None) -> float:
     """Largest time between samples without missing ones, s; `imu_rate` as in `create_tracker`."""
     own = 1 / run.config.data.rate
     return 1.5 * max(own, 1 / imu_rate if imu_rate else own)
 
 
-def expect(tracker: Tracker, found: Followed, run: Run, imu_rate: float) -> None:
+def expect(tracker: Tracker, found: Followed, run: TrainedNetwork, imu_rate: float) -> None:
     """Set the rate of the samples, Hz, in the tracker of a run and in `found`."""
     tracker.expect(imu_rate, longest_interval(run, imu_rate))
     found.bridged = longest_bridge(imu_rate)
 
 
-def begins_at_rest(run: Run) -> Callable[[list[Sample]], bool]:
+def begins_at_rest(run: TrainedNetwork) -> Callable[[list[Sample]], bool]:
     """A function that tells whether the first second of some samples is quiet enough for the start
     of the filter."""
-    setup = filter_setup(run.config.data, run.config.filter)
+    ekf = make_filter(run.config.data, run.config.filter)
 
     def at_rest(samples: list[Sample]) -> bool:
         first = [each for each in samples if each.time - samples[0].time < FIRST_SECONDS]
         if len(first) < FIRST_SAMPLES or samples[-1].time - samples[0].time < FIRST_SECONDS:
             return True  # too few samples: the rest may continue
         rows = np.array([(each.time, *each.gyro, *each.accel) for each in first])
-        config = dataclasses.replace(setup.config, dt=float(np.median(np.diff(rows[:, 0]))))
-        state = level_state(config, rows[:, 1:4], rows[:, 4:], setup.initial_std)
+        config = dataclasses.replace(ekf.config, dt=float(np.median(np.diff(rows[:, 0]))))
+        sampled = dataclasses.replace(ekf, config=config)
+        state = level_state(sampled, rows[:, 1:4], rows[:, 4:])
         return float(state.core_covariance[VELOCITY.start, VELOCITY.start]) <= ROUGH_START**2
 
     return at_rest
@@ -601,7 +599,7 @@ def line(found: Followed) -> str:
     walked = 0.0
     if len(time) > 1:
         walked = path_length(path.position[:, :2], float(np.median(np.diff(time))))
-    health = "" if found.pose.healthy else "  THE FILTER DIVERGED"
+    health = "" if found.pose.healthy else f"  THE FILTER DIVERGED ({found.pose.failure})"
     return (
         f"{found.pose.time - time[0]:7.1f} s  x {x:+8.2f}  y {y:+8.2f}  z {z:+7.2f} m  "
         f"± {sigma:.2f} m  walked {walked:.1f} m{health}"

@@ -1,4 +1,4 @@
-"""One evaluation, from a run and its options to a folder of results.
+"""One evaluation, from a network and its options to a folder of results.
 
     prepare → infer → estimate → score → report
 
@@ -24,14 +24,23 @@ from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.config import EvaluateConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.estimate import PERFECT_STD, Estimate, estimate, never_moves, perfect
-from gnio_jax.evaluation.infer import given_displacements, infer, no_displacements
+from gnio_jax.evaluation.estimate import (
+    PERFECT_STD,
+    SequenceEstimate,
+    estimate,
+    never_moves,
+    perfect,
+)
+from gnio_jax.evaluation.folder import write
+from gnio_jax.evaluation.infer import infer, no_displacements, reference_displacements
 from gnio_jax.evaluation.metrics import score
-from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
-from gnio_jax.evaluation.report import DEFINITIONS, Report, write
-from gnio_jax.evaluation.trajectory import Alignment, Undefined, paired, read_tum
-from gnio_jax.filtering.settings import filter_setup
+from gnio_jax.evaluation.prepare import Orientation, PreparedRecording, prepare
+from gnio_jax.evaluation.report import DEFINITIONS, Report
+from gnio_jax.evaluation.trajectory import Alignment, Undefined, pair, read_tum
+from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
+from gnio_jax.networks import TrainedNetwork, find_network, newest_run, read_network
+from gnio_jax.networks.folder import evaluations_folder, training_recordings
 from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
 
@@ -53,8 +62,8 @@ class Evaluation(NamedTuple):
     """The result of `evaluate`."""
 
     report: Report
-    estimates: list[Estimate]
-    recordings: list[Recording]
+    estimates: list[SequenceEstimate]
+    recordings: list[PreparedRecording]
     folder: Path
     """Folder of the results."""
 
@@ -64,80 +73,88 @@ def evaluate(
     reporter: Reporter = SILENCE,
     workers: int = 1,
     command: str = "",
-    run: Any = None,
 ) -> Evaluation:
-    """Estimate every sequence of a split with the network of a run, measure the errors, and write
-    the results to a folder of the run.
+    """Estimate every sequence of a split with a trained network, measure the errors, and write the
+    results to a folder of the network.
 
     The folder is written whole or not at all, and replaces that of an earlier evaluation with the
-    same options. `workers` processes read recordings that are slow to read; `command` is the
-    command line, for the page; `run` is the `training.checkpoint.Run` of `config`, if it is loaded
-    already. Raises `InputError` for options that do not fit together, a run without the checkpoint,
-    missing data, and a split of which no sequence can be estimated.
+    same options.
+
+    Args:
+        config: The options of `gnio evaluate`.
+        reporter: It gets progress and lines of text.
+        workers: Number of processes that read recordings that are slow to read.
+        command: The command line, for the page.
+
+    Raises:
+        InputError: Options do not fit together, the network cannot be loaded, data are missing, or
+            no sequence of the split can be estimated.
     """
     _check(config)
-    from gnio_jax.training.checkpoint import learnt_from, load_run  # Orbax takes seconds to import
+    path = find_network(config.network or newest_run())
+    if config.checkpoint == "latest":
+        from gnio_jax.training.checkpoint import load_latest  # Orbax takes half a second to import
 
-    workdir = Path(config.workdir or configuration.newest_run())
-    run = run or load_run(workdir, config.checkpoint)
-    config = resolve(config, run.config)
-    windows, ekf = run.config.data, filter_setup(run.config.data, config.filter)
+        trained = load_latest(path)
+    else:
+        trained = read_network(path)
+    config = resolve(config, trained.config)
+    windows, ekf = trained.config.data, make_filter(trained.config.data, config.filter)
 
     def stage(name: str) -> Progress:
         return functools.partial(reporter.progress, name)
 
     sequences = data.load(config.dataset, config.data_root, config.split, workers, stage("reading"))
-    for each in sequences:
-        if each.waypoints is not None and config.alignment not in ("origin", "yaw_position"):
+    for sequence in sequences:
+        if sequence.waypoints is not None and config.alignment not in ("origin", "yaw_position"):
             problem = f"has waypoints, and no --alignment {config.alignment}"
             remedy = "leave it out: one turn about z and one shift are fitted"
-            raise InputError(each.name, problem, remedy)
-    learnt = learnt_from(workdir, run.config, config.dataset)
-    if seen := [each.name for each in sequences if each.name in learnt]:
-        count = f"{len(seen)} of {len(sequences)} recordings, e.g. {seen[0]}"
+            raise InputError(sequence.name, problem, remedy)
+    learnt = training_recordings(path, trained.config, config.dataset)
+    if overlap := [sequence.name for sequence in sequences if sequence.name in learnt]:
+        count = f"{len(overlap)} of {len(sequences)} recordings, e.g. {overlap[0]}"
         reporter.line(f"warning: the network has learnt from {count}: its errors there are smaller")
     recordings, left_out = prepare(
         sequences,
         windows,
-        ekf.initial_std,
+        ekf,
         init=config.init,
         gyro_bias=config.gyro_bias,
         orientation=config.orientation if _infers(config) else None,
-        raw_gyro_bias=ekf.raw_gyro_bias,
     )
     if not recordings:
         name, reason = next(iter(left_out.items()))
         problem = f"no sequence of split '{config.split}' can be estimated ({name}: {reason})"
         raise InputError(f"dataset {config.dataset}", problem)
 
-    network = Network.of(run.model, run.variables)
+    network = Network.of(trained.model, trained.variables)
     if _infers(config):
         least_std = math.exp(ekf.config.log_std_min) if config.estimator == "ekf" else 0.0
         source = infer(network, recordings, windows, stage("inferring"), least_std=least_std)
     elif config.estimator == "imu_only":
-        source = [no_displacements(each) for each in recordings]
+        source = [no_displacements(recording) for recording in recordings]
     else:
         source = network
-    posed = [each for each in recordings if each.waypoints is None]
-    truth = [given_displacements(each, PERFECT_STD) for each in posed]
+    posed = [recording for recording in recordings if recording.waypoints is None]
+    truth = [reference_displacements(recording, PERFECT_STD) for recording in posed]
 
-    own, ideal = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
+    actual, ideal = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
     batch, perfecting = config.batch_size, stage("estimating with perfect displacements")
-    estimates = estimate(recordings, source, windows, own, batch, stage("estimating"))
+    estimates = estimate(recordings, source, windows, actual, batch, stage("estimating"))
     floor = estimate(posed, truth, windows, ideal, batch, perfecting)
     compared = {"never_moves": never_moves(estimates), "perfect_displacements": floor}
 
     report = Report(
-        {**_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
+        _describe_settings(config, trained, sequences),
         score(estimates, config.alignment),
         {row: score(of, config.alignment) for row, of in compared.items() if of},
-        {each.name: each.group for each in recordings},
-        {each.name: list(each.notes) for each in estimates if each.notes},
+        {recording.name: recording.group for recording in recordings},
+        {result.name: list(result.notes) for result in estimates if result.notes},
         left_out,
-        {each.name: each.placement for each in recordings if each.placement},
+        {recording.name: recording.placement for recording in recordings if recording.placement},
     )
-    folder = folder_of(workdir, config, run.config)
-    write(folder, report, estimates, run.config, command, config.plots, stage("drawing"))
+    folder = folder_of(path, config, trained.config)
+    write(folder, report, estimates, trained.config, command, config.plots, stage("drawing"))
     return Evaluation(report, estimates, recordings, folder)
 
 
@@ -145,17 +162,17 @@ def score_files(reference: Path, estimate: Path, alignment: Alignment = "origin"
     """The report about two trajectories in TUM format, written by any program, at the stamps that
     they share. Raises `InputError` if these are too few."""
     try:
-        path, truth = paired(read_tum(estimate), read_tum(reference))
+        path, truth = pair(read_tum(estimate), read_tum(reference))
     except Undefined as problem:
         remedy = "give both the stamps of one clock, in s"
         raise InputError(estimate, f"{problem} as in {reference}", remedy) from None
-    found = [Estimate(estimate.stem, path, truth)]
+    estimates = [SequenceEstimate(estimate.stem, path, truth)]
     count = f"{np.isfinite(truth.position).all(axis=1).sum():,} poses"
     settings = {"dataset": estimate.name, "split": f"against {count} of {reference.name}"}
     settings |= {"estimator": "given poses", "alignment": alignment}
-    still = {"never_moves": score(never_moves(found), alignment)}
+    still = {"never_moves": score(never_moves(estimates), alignment)}
     groups = {estimate.stem: estimate.stem}
-    return Report(settings, score(found, alignment), still, groups, {}, {})
+    return Report(settings, score(estimates, alignment), still, groups, {}, {})
 
 
 def _check(config: EvaluateConfig) -> None:
@@ -183,17 +200,17 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
     if config.dataset is None and len(run.datasets) > 1:
         remedy = f"give --dataset, e.g. {dataset}"
         raise InputError(
-            config.workdir or "the run", f"has learnt from {', '.join(run.datasets)}", remedy
+            config.network or "the run", f"has learnt from {', '.join(run.datasets)}", remedy
         )
     if data.get(dataset).needs_root:
-        given = config.data_root or (run.data_root if dataset in run.datasets else None)
-        root = str(data.find_root(dataset, given).resolve())
+        data_root = config.data_root or (run.data_root if dataset in run.datasets else None)
+        root = str(data.find_root(dataset, data_root).resolve())
     return dataclasses.replace(
         config,
         dataset=dataset,
         data_root=root,
         coupling=config.coupling if config.estimator == "ekf" else "tight",
-        orientation=config.orientation or _usual_orientation(config),
+        orientation=config.orientation or _default_orientation(config),
         filter=changed.filter,
         set=(),
     )
@@ -205,55 +222,58 @@ def _infers(config: EvaluateConfig) -> bool:
     return loose or config.estimator == "integrate"
 
 
-def _usual_orientation(config: EvaluateConfig) -> Orientation:
+def _default_orientation(config: EvaluateConfig) -> Orientation:
     return "reference" if _infers(config) else "filter"
 
 
-def folder_of(workdir: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
-    """The folder of a run for the results of a resolved `config`. If that folder holds figures of
-    other recordings, it keeps them: the name then ends with the place of the recordings, in this
-    and in later evaluations."""
-    folder = workdir / "eval" / folder_name(config, run)
+def folder_of(path: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
+    """The folder of a network for the results of a resolved `config`.
+
+    If it already holds the results of another `data_root`, they stay: from then on the folder of
+    this data root has a suffix of its name and a digest of its path."""
+    folder = evaluations_folder(path) / folder_name(config, run)
     if config.data_root is None:
         return folder
-    place = Path(config.data_root)
-    own = folder.with_name(f"{folder.name}_{place.name}-{zlib.crc32(bytes(place)):08x}-root")
+    root = Path(config.data_root)
+    with_root = folder.with_name(f"{folder.name}_{root.name}-{zlib.crc32(bytes(root)):08x}-root")
     try:
-        there = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        taken = there["settings"]["data_root"] != config.data_root
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        occupied = metrics["settings"]["data_root"] != config.data_root
     except (OSError, ValueError, LookupError, TypeError):  # the file names no recordings
-        taken = False
-    return own if taken or own.exists() else folder
+        occupied = False
+    return with_root if occupied or with_root.exists() else folder
 
 
 def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     """<dataset>_<split>_<estimator>, then every choice of a resolved `config` other than the
     default."""
-    usual = vars(EvaluateConfig(orientation=_usual_orientation(config)))
-    own = vars(config)
+    defaults = vars(EvaluateConfig(orientation=_default_orientation(config)))
+    choices = vars(config)
     parts = [config.dataset, config.split, config.estimator]
-    parts += [text.format(own[x]) for x, text in NAMED.items() if own[x] != usual[x]]
+    parts += [text.format(choices[x]) for x, text in NAMED.items() if choices[x] != defaults[x]]
     if config.estimator != "integrate":
-        trained, own = configuration.flat(run.filter), configuration.flat(config.filter)
-        for name in {**trained, **own}:
-            if (value := own.get(name)) != trained.get(name):
+        trained, chosen = configuration.flatten(run.filter), configuration.flatten(config.filter)
+        for name in {**trained, **chosen}:
+            if (value := chosen.get(name)) != trained.get(name):
                 numbers = value if isinstance(value, tuple) else (value,)
                 text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
                 parts.append(f"{name}-{text}")
     return "_".join(map(str, parts))
 
 
-def _settings(
-    config: EvaluateConfig, run: TrainConfig, sequences: list[Sequence]
+def _describe_settings(
+    config: EvaluateConfig, trained: TrainedNetwork, sequences: list[Sequence]
 ) -> dict[str, Any]:
     """The settings that define the meaning of the figures and their subject."""
-    compensated = {str(each.attributes.get("imu_compensated", "no")) for each in sequences}
-    tapped = all(each.waypoints is not None for each in sequences)
+    compensated = {str(sequence.attributes.get("imu_compensated", "no")) for sequence in sequences}
+    tapped = all(sequence.waypoints is not None for sequence in sequences)
     return {
         "dataset": config.dataset,
         "data_root": config.data_root,
         "split": config.split,
-        "recordings": {each.name: round(float(np.ptp(each.time)), 3) for each in sequences},
+        "recordings": {
+            sequence.name: round(float(np.ptp(sequence.time)), 3) for sequence in sequences
+        },
         "estimator": config.estimator,
         "coupling": config.coupling if config.estimator == "ekf" else None,
         "orientation_source": config.orientation,
@@ -262,12 +282,16 @@ def _settings(
         "gyro_bias": config.gyro_bias,
         "imu_compensated": " and ".join(sorted(compensated)),
         "alignment": config.alignment,
-        "model": run.model.name,
+        "network": trained.name,
+        "model": trained.config.model.name,
         "checkpoint": config.checkpoint,
-        **{name: getattr(run.data, name) for name in WINDOWS},
-        "filter": configuration.plain(config.filter),
+        "weights": trained.digest or None,
+        **{name: getattr(trained.config.data, name) for name in WINDOWS},
+        "filter": configuration.to_plain(config.filter),
         "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,
         "definitions": DEFINITIONS,
         "device": jax.devices()[0].device_kind,
         "version": version("gnio-jax"),
+        "epoch": trained.epoch,
+        "step": trained.step,
     }

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from gnio_jax import data, evaluation
 from gnio_jax.evaluation import tabulate
 from gnio_jax.models import Network
-from gnio_jax.training import checkpoint
+from gnio_jax.networks import read_network
 
 ACTIVITIES = ("standing", "slow", "walking", "running", "stairs")
 STANDING, SLOW, RUNNING, CLIMBING = 0.05, 0.8, 1.9, 0.12
@@ -40,15 +40,15 @@ class PredictedWindows(NamedTuple):
 
 
 def predict_split(workdir: Path, split: str) -> PredictedWindows:
-    """The predictions of the best checkpoint of a run for the windows of a split of its dataset."""
-    run = checkpoint.load_run(workdir)
+    """The predictions of the network of a run for the windows of a split of its dataset."""
+    run = read_network(workdir)
     config = run.config.data
     sequences = data.load(run.config.datasets[0], run.config.data_root, split)
     recordings, _ = evaluation.prepare(sequences, config, orientation="reference")
     network = Network.of(run.model, run.variables)
     predicted = evaluation.infer(network, recordings, config, diagnostics=DIAGNOSTICS)
     # There is a row for each stride; rows before the end of the first window have neither.
-    references = [evaluation.given_displacements(recording, 0.0) for recording in recordings]
+    references = [evaluation.reference_displacements(recording, 0.0) for recording in recordings]
     truth, displacement = (
         np.concatenate([rows.value for rows in parts]) for parts in (references, predicted)
     )

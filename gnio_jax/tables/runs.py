@@ -13,9 +13,10 @@ from gnio_jax import calibration, data
 from gnio_jax import config as configuration
 from gnio_jax.config import CalibrateConfig, EvaluateConfig, TablesConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept
+from gnio_jax.evaluation import reuse
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Scores
+from gnio_jax.networks.folder import read_settings
 from gnio_jax.reporting import Reporter
 from gnio_jax.tables.experiments import TableRow
 from gnio_jax.training import loop, run_folder
@@ -62,8 +63,8 @@ def run_row(
         runs = [calibrate_run(run, reporter, workers) for run in runs]
     settings = {"split": options.split, "estimator": options.estimator, "plots": False}
     requests = [EvaluateConfig(str(run), data_root=config.data_root, **settings) for run in runs]
-    evaluations = [kept.look(request) for request in requests]
-    reports = [kept.made(evaluation, reporter, workers) for evaluation in evaluations]
+    evaluations = [reuse.find_existing(request) for request in requests]
+    reports = [reuse.load_or_evaluate(evaluation, reporter, workers) for evaluation in evaluations]
     return RowResult(row, reports, runs, [evaluation.folder for evaluation in evaluations])
 
 
@@ -107,14 +108,10 @@ def _state(config: TrainConfig) -> str:
 
 
 def calibrate_run(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
-    """The run's best checkpoint with its filter fitted to its validation split: the existing
-    calibrated run if it is of that checkpoint, else a new one."""
-
-    def best(run: Path) -> list[str]:
-        return sorted(step.name for step in (run / "checkpoints" / "best").glob("[0-9]*"))
-
+    """The run's best weights with the filter fitted to its validation split: the existing
+    calibrated run if it has these weights, else a new one."""
     folder = workdir.with_name(f"{workdir.name}_calibrated")
-    if folder.exists() and best(folder) == best(workdir):
+    if folder.exists() and read_settings(folder).digest == read_settings(workdir).digest:
         return folder
     reporter.line(f"calibrating {workdir.name}")
     shutil.rmtree(folder, ignore_errors=True)

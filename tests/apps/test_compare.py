@@ -9,17 +9,17 @@ from gnio_jax import config as configuration
 from gnio_jax.apps import compare as comparison
 from gnio_jax.config import CompareConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept, tabulate
-from tests.support.reports import LOST, report_of, write_report, write_run
+from gnio_jax.evaluation import reuse, tabulate
+from tests.support.reports import LOST, digest, report_of, write_report, write_run
 
 GROUPS = {"a": "ann", "b": "ann", "c": "bob"}
-FILTER = configuration.plain(TrainConfig().filter)
+FILTER = configuration.to_plain(TrainConfig().filter)
 
 
 def write(run, ates, name="synthetic_test_ekf", drop=(), groups=GROUPS, more=None, **settings):
     """An evaluation of a run; `ates`, `groups`, `more` and `drop` as in `report_of`."""
-    made = report_of(ates, groups, more, drop, **{"filter": FILTER, **settings})
-    return write_report(write_run(run) / "eval" / name, made)
+    settings = {"filter": FILTER, "weights": digest(write_run(run)), **settings}
+    return write_report(run / "eval" / name, report_of(ates, groups, more, drop, **settings))
 
 
 def compare(*words, metrics=("ate",), **options):
@@ -48,8 +48,8 @@ def test_by_hand(runs, monkeypatch):
     found = compare(runs / "plain", runs / "new")
     plain, new = found.cells["ate"]
     assert [row.label for row in found.rows] == ["plain", "new"] and plain.difference is None
-    assert plain.mean.seeds == pytest.approx([8 / 3, 4.0])
-    assert new.mean.seeds == pytest.approx([7 / 3])
+    assert plain.summary.seeds == pytest.approx([8 / 3, 4.0])
+    assert new.summary.seeds == pytest.approx([7 / 3])
     difference = second(found)
     assert difference.mean == pytest.approx(-1.0) and difference.gain == pytest.approx(30.0)
     reach = 12.7062 * 4 / 3  # t of one degree of freedom
@@ -128,15 +128,17 @@ def test_names_without_a_seed_stand_for_all_seeds(tmp_path):
 
 
 def test_runs_are_evaluated_where_they_are_not_yet_and_read_once(runs, monkeypatch):
-    made, looked, look = [], [], kept.look
+    made, looked, look = [], [], reuse.find_existing
 
     def evaluate(config, progress, workers, **_):
-        made.append((config.workdir, config.split, config.estimator, workers))
-        name = config.workdir.removeprefix(f"{runs}/")
+        made.append((config.network, config.split, config.estimator, workers))
+        name = config.network.removeprefix(f"{runs}/")
         write(runs / name, {"a": 4.0}, "synthetic_val_ekf", split="val")
 
-    monkeypatch.setattr(kept, "evaluate", evaluate)
-    monkeypatch.setattr(kept, "look", lambda asked: looked.append(asked.workdir) or look(asked))
+    monkeypatch.setattr(reuse, "evaluate", evaluate)
+    monkeypatch.setattr(
+        reuse, "find_existing", lambda asked: looked.append(asked.network) or look(asked)
+    )
     config = CompareConfig((f"{runs}/plain", f"{runs}/new"), split="val", metrics=("ate",))
     found = comparison.compare(config, workers=3)
     names = [f"{runs}/{name}" for name in ("plain_s0", "plain_s1", "new_s0")]
@@ -186,7 +188,7 @@ def test_refusals(runs):
     (runs / "untrained").mkdir()
     (runs / "untrained" / "config.yaml").write_text("dataset: synthetic\n")
     write(runs / "old", {"a": 1.0}, definitions=1)
-    write(runs / "left", {"a": 1.0}, step=6)
+    write(runs / "left", {"a": 1.0}, weights="0" * 64)
     for words, problem in (
         (("plain",), "needs two or more"),
         (("plain", "gone"), "is not there"),
@@ -198,9 +200,9 @@ def test_refusals(runs):
         (("mix", "new"), f"mix_s1/{own}: sequence a takes 600 s here"),
         (("linked", "plain"), "linked_s1: is the same evaluation as"),
         (("plain", "new_s0/eval/aligned"), "is of alignment se3, the first row of origin"),
-        (("untrained", "plain"), "checkpoints/best: holds no checkpoint"),
+        (("untrained", "plain"), "untrained: holds no weights"),
         (("plain", f"old/{own}"), "another version"),
-        (("plain", f"left/{own}"), "of a checkpoint that the run has no more"),
+        (("plain", f"left/{own}"), "of weights that the network has no more"),
         (("plain", "new_s0/eval"), "neither a run nor an evaluation"),
     ):
         assert problem in refused(*words)
