@@ -75,7 +75,7 @@ def encoding_of(path: object, head: bytes) -> str:
     if head[1:2] == b"\0" and head[1::2].count(0) > 0.4 * len(head) / 2:
         return "utf-16-le"
     body = head.rstrip(b"\0")
-    if len(body) - len(body.translate(None, _CONTROLS)) > 0.01 * len(body):
+    if len(body) - len(body.translate(None, _CONTROLS)) > 0.03 * len(body):
         raise InputError(path, "is no text", "export the recording as CSV")
     try:
         codecs.getincrementaldecoder("utf-8")().decode(body)

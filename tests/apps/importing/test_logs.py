@@ -193,6 +193,7 @@ DAMAGE = {
     "a text at the end": lambda r: [*r, "", "stopped after 14 s", f"{COUNT} rows, no error"],
     "a short row": lambda r: [*r[:300], "3.000,0.1", *r[301:]],
     "two rows in one": lambda r: [*r[:300], r[300] + r[301], *r[302:]],
+    "a reboot": lambda r: [*r[:400], *(f"load:0x3fff00{n},len:{n}" for n in range(9)), *r[400:]],
     "an open quote": lambda r: [*r[:300], '"', *r[300:]],
     "infinity": lambda r: [*r[:300], re.sub(",[^,]*", ",inf", r[300], count=1), *r[301:]],
     "NaN": lambda r: [*r[:300], re.sub(",[^,]*", ",NaN", r[300], count=1), *r[301:]],
@@ -666,6 +667,18 @@ def test_gravity_tells_signs_and_axes(tmp_path, turn, words):
         refused(path, words, gyro_unit="rad/s")  # stated or not
     else:
         check(path)
+
+
+def test_a_unit_in_doubt_tells_what_gravity_says(tmp_path):
+    """Of a phone that is turned without steps, by a gyro with the wrong sign."""
+    angle, rate = 0.6 * np.sin(0.9 * TIME), 0.54 * np.cos(0.9 * TIME)
+    force = 9.81 * np.stack([-np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+    gyro = np.stack([0 * rate, -rate, 0 * rate], axis=1)
+    values = np.hstack([gyro, force]) + np.random.default_rng(0).normal(0, 0.01, WALK.shape)
+    words = "unit of field 'gyro' is ambiguous .* in rad/s gravity turns against the gyro"
+    refused(put(tmp_path, table(values=values)), words)
+    right = put(tmp_path, table(values=values * [1, -1, 1, 1, 1, 1]))
+    assert any("gyro taken as rad/s" in note for note in import_recording(right)[1])
 
 
 def test_the_remedy_for_wrong_axes_works(tmp_path):
