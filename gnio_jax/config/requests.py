@@ -156,9 +156,10 @@ class ImportOptions:
 
     columns: Annotated[tuple[str, ...], Words("OURS=THEIRS")] = ()
     """For a CSV: our name and the file's name of each column with another name: time=stamp
-    gyro_x=wx ... Our names are time, gyro_x..z, accel_x..z, and accel_time if the accelerometer's
-    time is another column. "a+b" is the sum of two columns (gravity and user acceleration). In a
-    file without a header, columns are numbered from 0."""
+    gyro_x=wx ... Our names are time, gyro_x..z, accel_x..z, those of a reference (qw..qz, px..pz,
+    vx..vz), and accel_time if the accelerometer's time is another column. "a+b" is the sum of two
+    columns (gravity and user acceleration) or one stamp (secs+nsecs, date+time), "-a" the opposite.
+    In a file without a header, columns are numbered from 0."""
     accel_path: Path | None = None
     """CSV of the accelerometer, if it is another file than the gyro's."""
     where: str | None = None

@@ -64,6 +64,12 @@ def test_units_and_clocks_are_found(scale, clock, words):
         physics.check_turning(imu, "walk")
 
 
+def test_a_clock_in_doubt_is_supported_if_no_other_one_explains_gravity_better():
+    assert physics.is_clock_supported(WALK)
+    for pace in (0.2, 0.4, 0.5, 2.0, 2.5, 5.0):
+        assert not physics.is_clock_supported(WALK._replace(time=TIME * pace))
+
+
 def test_what_cannot_be_told_is_no_contradiction():
     noise = np.random.default_rng(1).normal(0, 0.02, (3000, 3))
     still = ImuSamples(TIME, noise, noise + np.array([0, 0, 9.81]))

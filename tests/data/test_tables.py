@@ -26,6 +26,13 @@ def test_a_header_is_the_first_line_or_the_last_comment_above_numbers(tmp_path):
     )
 
 
+def test_rows_with_another_number_of_cells_than_the_header_are_told(tmp_path):
+    path = tmp_path / "walk.csv"
+    path.write_text("time,gyro_x,gyro_y\n" + "0.1\t1\t2\n" * 5)
+    with pytest.raises(InputError, match=r"walk\.csv: row 2 has 1 cells, expected 3; correct"):
+        read_text(path)
+
+
 def test_fields_of_binary_files_have_one_length_and_hold_numbers(tmp_path):
     fields = {"time": np.arange(5.0), "imu": np.ones((5, 6)), "short": np.ones((4, 3))}
     fields |= {"words": np.array([b"one"] * 5), "single": np.arange(5, dtype=np.float32)}

@@ -137,15 +137,14 @@ def rows_by_sensor(file: LogFile) -> list[LogFile]:
     layout, content = file.layout, file.content()
     head = [cells for _, cells in islice(rows_of(file.path, layout, content), FIRST_LINES)]
     for index in range(layout.width):
-        label = layout.labels[index] if layout.labels else ""
-        name = labels.plain_name(label)
+        name = labels.plain_name(layout.labels[index] if layout.labels else "")
         tags = _ANDROID if re.fullmatch("sensor(_?(type|id))?|type", name) else {}
         words = {cells[index] for cells in head if len(cells) > index}
         if set(AXES) <= {labels.sensor_named(tags.get(word, word)) for word in words}:
             break
     else:
         return []
-    is_shared = layout.labels and labels.sensor_named(label) is None
+    is_shared = layout.labels and labels.sensor_named(name) is None
     header = [layout.separator.join(layout.labels)] if is_shared else []
     groups: dict[str, list[str]] = {}
     comments = (cells_of(without_mark(line), layout.separator) for line in layout.preamble)

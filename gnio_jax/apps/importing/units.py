@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.data.labels import unit_of
-from gnio_jax.data.physics import DEGREE, ImuSamples, agreement, is_supported
+from gnio_jax.data.physics import DEGREE, ImuSamples, agreement, contradiction, is_supported
 from gnio_jax.errors import InputError
 from gnio_jax.types import GRAVITY, STANDARD_G
 
@@ -23,7 +23,6 @@ UNITS = {
     "accel": TO_METRES_PER_SECOND_SQUARED | {"cm/s2": 1e-2, "mm/s2": 1e-3},
 }
 COUNTS = {"gyro": "131/deg/s", "accel": "16384/g"}
-"""Units of raw counts, as examples."""
 SIGNS = ("android", "ios", "detect")
 GRAVITY_RANGES = {"m/s2": (7.0, 13.0), "g": (0.7, 1.3), "mg": (700.0, 1300.0)}
 """Ranges of the accelerometer's median magnitude, by which its unit is recognised."""
@@ -91,8 +90,7 @@ def accel_scale(
 def gyro_scale(
     imu: ImuSamples, stated: str | None, path: Path, notes: list[str]
 ) -> tuple[float, list[str]]:
-    """Value of one unit in rad/s, and warnings; without a unit it is detected. `imu.accel` is in
-    m/s².
+    """Value of one unit in rad/s, and warnings; without a unit it is detected, with accel in m/s².
 
     Beyond `PHONE_RANGE` it is deg/s. Otherwise the turning of gravity decides, if it supports a
     unit. Otherwise, if the recording has steps and never exceeds `CARRIED_TURN`, it is rad/s.
@@ -120,7 +118,9 @@ def gyro_scale(
         unit, reason = "rad/s", f"it reaches {peak:.3g}, and {reason}"
     else:
         problem = f"the unit of field 'gyro' is ambiguous (it reaches {peak:.3g})"
-        raise InputError(path, problem, "state it: rad/s or deg/s")
+        factor, doubt, _ = contradiction(imu) or (0.0, "", "")
+        doubt = f"; in rad/s {doubt}" if factor else ""
+        raise InputError(path, problem, f"state it: rad/s or deg/s{doubt}")
     notes.append(f"{path.name}: gyro taken as {unit} ({reason})")
     return TO_RAD_PER_SECOND[unit], []
 

@@ -31,8 +31,8 @@ CROWDED = 0.5
 """Samples that follow faster than this share of the mean step come in bursts (ours)."""
 DAY = 86400 * 10**9
 """ns."""
-FEW_ROWS, FEW_SHARE = 5, 0.01
-"""Number and share of damaged rows that are left out; more are an error."""
+FEW_ROWS, FEW_SHARE, MOST_SHARE = 10, 0.01, 0.1
+"""Number of damaged rows that are left out, or the first share of all; at most the second one."""
 
 
 def seconds_of(unit: str) -> Fraction:
@@ -171,7 +171,7 @@ def in_order(
 
 def few(count: int) -> float:
     """Largest number of damaged rows among `count` that are left out."""
-    return max(float(FEW_ROWS), FEW_SHARE * count)
+    return float(max(min(FEW_ROWS, MOST_SHARE * count), FEW_SHARE * count))
 
 
 def parsed_times(cells: pd.Series) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:

@@ -226,7 +226,7 @@ def read_text(
     """
     layout = layout_of(path, content, separator)
     if not header:  # whatever stands above the rows is read as one, and refused by its column
-        with open_text(path, content) as file:
+        with open_text(path, content, layout.encoding) as file:
             before = next((n for n, line in enumerate(file) if is_row(line)), 0)
         layout = layout._replace(before=before)
     frame = strict_frame(path, layout, content)

@@ -24,13 +24,14 @@ from jaxtyping import Bool, Int
 from gnio_jax.data.parsing.stamps import few, parsed_times
 from gnio_jax.errors import InputError
 
-HEAD, FIRST_LINES = 1 << 17, 400
-"""Numbers of bytes and lines in which the shape of a table is searched."""
+HEAD, FIRST_LINES, PUBLISHED_LINES = 1 << 17, 400, 20
+"""Bytes and lines in which the shape of a table is searched, and lines of a published one."""
 MOST_COLUMNS = 2000
 NUMERIC_SHARE = 0.9
 """Share of numbers among the cells of a column from which others are damaged."""
 SEPARATORS = (",", ";", "\t", "|", " ")
 """Separators of cells; " " means any run of blanks."""
+_CONTROLS = bytes({*range(32)} - {*b"\t\n\v\f\r"})
 _MARK = re.compile(r"^\s*(#|//|%|@|!)+\s*")
 _DIGITS = r"[+\-\u2212]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
 _NUMBER = re.compile(_DIGITS, re.IGNORECASE)
@@ -74,7 +75,7 @@ def encoding_of(path: object, head: bytes) -> str:
     if head[1:2] == b"\0" and head[1::2].count(0) > 0.4 * len(head) / 2:
         return "utf-16-le"
     body = head.rstrip(b"\0")
-    if len(re.findall(rb"[\0-\x08\x0e-\x1f]", body)) > 0.01 * len(body):
+    if len(body) - len(body.translate(None, _CONTROLS)) > 0.03 * len(body):
         raise InputError(path, "is no text", "export the recording as CSV")
     try:
         codecs.getincrementaldecoder("utf-8")().decode(body)
@@ -101,9 +102,9 @@ def head_of(path: Path, content: bytes | None = None) -> bytes:
     return head
 
 
-def open_text(path: Path, content: bytes | None = None) -> io.TextIOWrapper:
+def open_text(path: Path, content: bytes | None = None, encoding: str = "") -> io.TextIOWrapper:
     """The text of a file, or `content` instead; a byte order mark is dropped."""
-    encoding = encoding_of(path, head_of(path, content))
+    encoding = encoding or encoding_of(path, head_of(path, content))
     source = path.open("rb") if content is None else io.BytesIO(content)
     return io.TextIOWrapper(source, encoding=encoding, errors="replace")
 
@@ -129,7 +130,7 @@ def without_mark(line: str) -> str:
 
 def rows_of(path: Path, layout: Layout, content: bytes | None) -> Iterator[tuple[int, list[str]]]:
     """(line from 1, cells) of each row below the header."""
-    with open_text(path, content) as file:
+    with open_text(path, content, layout.encoding) as file:
         for number, line in enumerate(file, 1):
             if number > layout.before and is_row(line):
                 yield number, cells_of(line, layout.separator)
@@ -149,7 +150,7 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
     stated = re.match(r'\W*sep=(.)"?\s*$', lines[0], re.IGNORECASE) if lines else None
     marks = [separator] if separator else [stated[1]] if stated else SEPARATORS
     mark, rows, data = marks[0], list[list[str]](), list[int]()
-    for most in sorted({min(FIRST_LINES, len(lines)), len(lines)}):
+    for most in (PUBLISHED_LINES if separator else FIRST_LINES, len(lines)):
         tables = {mark: [cells_of(line, mark) for line in lines[:most]] for mark in marks}
         scores = {mark: _score(rows) for mark, rows in tables.items()}
         mark = max(marks, key=lambda mark: scores[mark][0])

@@ -69,6 +69,9 @@ HEADS = {
     "slashes": "// General information:\n//  Rate: 100.0Hz\n" + table(separator="\t"),
     "percent, as MATLAB and rostopic": "% logger\n% " + table(),
     "a count": f"{COUNT}\n" + table(),
+    "as many words as columns": "Monday,3 May,by Anna,in Bern,with phone,in hand,fast\n" + table(),
+    "more lines than are searched at first": lines(*(f"{n}: value" for n in range(500))) + table(),
+    "two commas end every row": table().replace("\n", ",,\n").replace(",,\n", "\n", 1),
     "a hundred lines": lines(*(f"Device line {n},value {n}" for n in range(100))) + table(),
     "a row of units": table().replace("\n", f"\n{UNITS}\n", 1).replace(",", ","),
     "bars": table(separator="|"),
@@ -131,6 +134,11 @@ def test_any_encoding_and_decimal_mark(tmp_path):
     path = put(tmp_path, lines(";".join(HEADER), *whole))
     sequence, _ = import_recording(path)
     np.testing.assert_allclose(sequence.gyro[501:], WALK[501:, :3], atol=2e-3)
+    check(put(tmp_path, table().replace("-", "\u2212")))  # the minus of typesetting
+    stamps = [f"{n * 10:,}".replace(",", ".") for n in ROWS]  # 1.010 is a thousand and ten
+    text = [row.replace(".", ",") for row in rows(table(separator=";"))[1]]
+    text = [";".join([s, *row.split(";")[1:]]) for s, row in zip(stamps, text, strict=True)]
+    check(put(tmp_path, lines(";".join(HEADER), *text)), "taken as ms")
 
 
 def test_one_table_in_any_container_is_that_table(tmp_path):
@@ -168,6 +176,13 @@ def test_one_table_in_any_container_is_that_table(tmp_path):
 def test_what_is_no_table_is_told_by_its_beginning(tmp_path, content, words):
     for name in ("walk.csv", "walk.zip", "walk.bag"):
         refused(put(tmp_path, content, name), f"{re.escape(name)}: {words}")
+    if isinstance(content, str):  # a folder of such files, a zip of one
+        put(tmp_path / "folder", content, "Gyroscope.csv")
+        put(tmp_path / "folder", content, "Accelerometer.csv")
+        refused(tmp_path / "folder", f"Accelerometer.csv: {words}")
+        with zipfile.ZipFile(tmp_path / "log.zip", "w") as archive:
+            archive.writestr("log.json", content)
+        refused(tmp_path / "log.zip", f"log.json: {words}")
 
 
 # --- damaged rows
@@ -178,6 +193,7 @@ DAMAGE = {
     "a text at the end": lambda r: [*r, "", "stopped after 14 s", f"{COUNT} rows, no error"],
     "a short row": lambda r: [*r[:300], "3.000,0.1", *r[301:]],
     "two rows in one": lambda r: [*r[:300], r[300] + r[301], *r[302:]],
+    "a reboot": lambda r: [*r[:400], *(f"load:0x3fff00{n},len:{n}" for n in range(9)), *r[400:]],
     "an open quote": lambda r: [*r[:300], '"', *r[300:]],
     "infinity": lambda r: [*r[:300], re.sub(",[^,]*", ",inf", r[300], count=1), *r[301:]],
     "NaN": lambda r: [*r[:300], re.sub(",[^,]*", ",NaN", r[300], count=1), *r[301:]],
@@ -222,6 +238,13 @@ NAMES = {
     "Arduino": ("millis", "gx", "gy", "gz", "ax", "ay", "az"),
     "ESP32": ("timestamp_ms", *(f"{n}{a}" for n in ("Gyro", "Acc") for a in "XYZ")),
     "Kaggle": ("Timestamp", *(f"{n}_{a}" for n in ("gyro", "acc") for a in "XYZ")),
+    "a unit behind the axis": (
+        "time_ms",
+        *(f"gyro_{a}_rad_s" for a in "xyz"),
+        *(f"acc_{a}_ms2" for a in "xyz"),
+    ),
+    "the axis first": ("ms", *(f"{a}{n}" for n in ("gyro", "_acc") for a in "xyz")),
+    "specific force": ("t", *(f"{n}_{a}" for n in ("omega", "f") for a in "xyz")),
     "wx": ("t", "wx", "wy", "wz", "ax", "ay", "az"),
     "EuRoC": ("#timestamp", *(f"{n}_RS_S_{a}" for n in "wa" for a in "xyz")),
     "Core Motion": ("time", *(f"{n}{a}" for n in ("rotationRate", "acceleration") for a in "XYZ")),
@@ -283,26 +306,30 @@ def test_a_sign_and_a_reference_can_be_named(tmp_path):
     names = dict(zip(("px", "py", "pz", "qw", "qx", "qy", "qz"), header[7:], strict=True))
     _, notes = import_recording(path, names)
     assert any("the reference given does not fit the IMU" in note for note in notes)
+    refused(path, "column 'pos_X' is missing; .* --columns px=COLUMN", names | {"px": "pos_X"})
+    _, notes = import_recording(path, dict(list(names.items())[:3]))
+    assert any("has no orientation, or no position; a reference has qw" in note for note in notes)
 
 
 def test_a_folder_or_one_of_its_files_is_the_recording(tmp_path):
     """RoNIN's recorder, OpenCamera, EuRoC's layout."""
     ronin = tmp_path / "ronin"
-    for name, axes in (("gyro", slice(0, 3)), ("acce", slice(3, 6)), ("magnet", slice(0, 3))):
+    sensors = {"gyro": slice(0, 3), "acce": slice(3, 6), "magnet": slice(0, 3)}
+    for name, axes in (sensors | {"gyro_uncalib": slice(3, 6)}).items():
         text = [
             f"{stamp} " + " ".join(f"{v:.6f}" for v in row)
             for stamp, row in zip(NS, WALK[:, axes], strict=True)
         ]
         put(ronin, lines("# Created at Wed Dec 27", *text), f"{name}.txt")
+        if name not in sensors:  # RoNIN's recorder has an uncalibrated gyro too
+            continue
         camera = [
             f"{row[0]:.6f},{row[1]:.6f},{row[2]:.6f},{stamp}"
             for stamp, row in zip(NS, WALK[:, axes], strict=True)
         ]
-        put(
-            tmp_path / "camera",
-            lines("X-data,Y-data,Z-data,timestamp (ns)", *camera),
-            f"v_{name}.csv",
-        )
+        header = "X-data,Y-data,Z-data,timestamp (ns)"
+        put(tmp_path / "camera", lines(header, *camera), f"v_{name}.csv")
+        put(tmp_path / "bare", lines(*camera), f"v_{name}.csv")  # axes first, no header
     names = [f"w_RS_S_{a} [rad s^-1]" for a in "xyz"] + [f"a_RS_S_{a} [m s^-2]" for a in "xyz"]
     put(tmp_path / "mav0" / "imu0", table(NS, ("#timestamp [ns]", *names)), "data.csv")
     for path in (
@@ -310,6 +337,7 @@ def test_a_folder_or_one_of_its_files_is_the_recording(tmp_path):
         ronin / "gyro.txt",
         tmp_path / "camera",
         tmp_path / "camera" / "v_acce.csv",
+        tmp_path / "bare" / "v_gyro.csv",
     ):
         check(path)
     check(tmp_path / "mav0" / "imu0" / "data.csv", "EuRoC's layout")
@@ -340,6 +368,7 @@ def test_bursts_and_shared_stamps_are_spread_evenly(tmp_path):
         (np.where(ROWS % 4, "", ROWS * 10), "without a stamp share the last one", 1e-1),
         (ROWS // 5 * 50 + jitter + ROWS % 5, "share the stamp of a burst", 2.0),
         (clock_text(ROWS * 10, "{h:02d}:{m:02d}:{s:02d}"), SHARED, 1e-1),
+        (1_714_720_502 + ROWS // 100, SHARED, 1e-1),
     ):
         path = put(tmp_path, table(stamps))
         sequence = check(path, words, atol=atol)
@@ -365,8 +394,22 @@ def test_rounded_stamps_do_not_change_the_rate(tmp_path):
         assert any("are rounded to" in note for note in notes)
 
 
+def test_a_clock_that_drifts_may_be_rounded(tmp_path):
+    """Half an hour at 400 Hz in whole ms, with a crystal that warms up."""
+    index = np.arange(40_000)
+    stamps = np.floor(index * 2.5 * (1 + 2e-5 * index / len(index))).astype(int)
+    values = np.tile(WALK, (40, 1))[: len(index)]
+    path = put(tmp_path, table(stamps, values=values))
+    sequence, notes = import_recording(path, gyro_unit="rad/s")
+    assert any("are rounded to 0.001 s" in note for note in notes)
+    assert np.median(np.diff(sequence.time)) == pytest.approx(0.0025, rel=1e-4)
+    assert sequence.time[-1] == pytest.approx((stamps[-1] - stamps[0]) / 1000, abs=0.01)
+
+
 def test_lost_samples_are_told(tmp_path):
     header, others = rows(table())
+    third = put(tmp_path, lines(header, *(row for n, row in enumerate(others) if n % 4 != 3)))
+    check(third, r"75\.04 samples a second, but its usual step is that of 100 Hz", 0.2)
     lasting = np.random.default_rng(1).random(COUNT) < 0.75
     path = put(
         tmp_path, lines(header, *(r for r, here in zip(others, lasting, strict=True) if here))
@@ -384,6 +427,9 @@ def test_lost_samples_are_told(tmp_path):
         ((ROWS * 10_000) % 2**16, "us"),
         (((2**31 - 4_000_000 + ROWS * 10_000) + 2**31) % 2**32 - 2**31, "us"),
         (np.round((4294.967296 - 5 + TIME) % 4294.967296, 6), "s"),
+        ((ROWS * 10) % 2**12, "ms"),
+        ((ROWS * 10) % 1000, "ms"),
+        (np.round((57.0 + TIME) % 60.0, 2), "s"),
     ],
 )
 def test_a_clock_that_wraps_goes_on(tmp_path, stamps, period):
@@ -416,6 +462,8 @@ def test_a_clock_that_starts_again_is_never_mixed_in(tmp_path):
         (5000 + ROWS, "counts samples: its steps are 1; give --sample-rate"),
         (ROWS % 256, "counts samples"),
         (ROWS // 4, "counts samples"),
+        (ROWS * 2, "makes it run at 500 Hz, which may be wrong; if that is right, state its unit"),
+        (1000 + ROWS * 4, "makes it run at 250 Hz, which may be wrong"),
         (917352 + ROWS * 100, "samples come 10 times faster .* give --time-unit"),
         (133 * 10**15 + ROWS * 10**5, "samples come 10 times faster"),
         ([f"{t / 60:.8f}" for t in TIME], "unit of field 'time' is ambiguous .* --time-unit"),
@@ -462,6 +510,9 @@ def test_a_rate_at_the_edge_is_believed_if_gravity_turns_as_the_gyro_says(tmp_pa
         ("{h:02d}:{m:02d}:{s:02d}:{ms:03d}", 33_302_250),
         ("{h}:{m:02d}:{s:02d},{ms:03d}", 33_302_250),
         ("{minutes}:{s:02d}.{ms:03d}", 902_250),
+        ("{m:02d}:{s:02d}.{ms:03d}", 3_600_000 - 5_000),
+        ("{h:02d}:{m:02d}:{s:02d} {ms:03d}", 33_302_250),
+        ("2024-05-03_{h:02d}:{m:02d}:{s:02d}.{ms:03d}", 33_302_250),
         ("{h:02d}:{m:02d}:{s:02d}.{ms:03d}", 86_400_000 - 5_000),
         ("2024-05-03 {h:02d}:{m:02d}:{s:02d}.{ms:03d}000", 33_302_250),
         ("2024-05-03T{h:02d}:{m:02d}:{s:02d}.{ms:03d}Z", 33_302_250),
@@ -474,6 +525,18 @@ def test_times_of_day_are_stamps(tmp_path, pattern, start):
     texts = clock_text(start + ROWS * 10, pattern)
     mark = ";" if "," in pattern else ","
     check(put(tmp_path, table(texts, separator=mark)))
+
+
+def test_half_days_end_at_noon_and_midnight(tmp_path):
+    for start, texts in ((43_195_000, ("AM", "PM")), (86_395_000, ("PM", "AM"))):
+        clock = clock_text(start + ROWS * 10, "{h:02d}:{m:02d}:{s:02d}.{ms:03d}")
+        hours = [f"{(int(text[:2]) + 11) % 12 + 1:02d}{text[2:]}" for text in clock]
+        check(put(tmp_path, table([f"{h} {texts[n >= 500]}" for n, h in enumerate(hours)])))
+
+
+def test_an_index_of_times_without_a_name_is_the_time(tmp_path):
+    stamps = clock_text(33_302_250 + ROWS * 10, "2024-05-03 {h:02d}:{m:02d}:{s:02d}.{ms:03d}000")
+    check(put(tmp_path, table(stamps, ("", *AXES))))
 
 
 def test_a_date_and_a_time_are_one_stamp(tmp_path):
@@ -508,6 +571,9 @@ def test_units_of_a_header_and_counts(tmp_path):
     (warning,) = imported(path).warnings
     assert "gravity in mg (1000) as well as in cm/s² (981), which is ambiguous" in warning
     check(path, options={"accel_unit": "cm/s2"})
+    path = put(tmp_path, table())
+    (warning,) = imported(path, gyro_unit="mdps").warnings
+    assert "the gyro never exceeds 0.00" in warning and "check its unit, mdps" in warning
     for option, value in (("gyro_unit", "rpm"), ("accel_unit", "0/g"), ("accel_unit", "x/g")):
         refused(path, f"{option}: unknown value '{value}'; known: ", **{option: value})
 
@@ -548,8 +614,16 @@ def test_rows_that_name_their_sensor(tmp_path):
     both = interleaved(
         by_sensor("accelerometer", stamps, accel), by_sensor("gyroscope", stamps, gyro)
     )
-    swapped = [",".join([c[1], c[0], *c[2:]]) for c in (row.split(",") for row in both)]
+    cells = [row.split(",") for row in both]
+    swapped = [",".join([c[1], c[0], *c[2:]]) for c in cells]
     check(put(tmp_path, lines("time,sensor,x,y,z", *swapped)))
+    check(put(tmp_path, lines("time,x,y,z,sensor", *(",".join([*c[1:], c[0]]) for c in cells))))
+    android = {"accelerometer": "android.sensor.accelerometer", "gyroscope": "x.sensor.gyroscope"}
+    check(put(tmp_path, lines("s,time,x,y,z", *(",".join([android[c[0]], *c[1:]]) for c in cells))))
+    types = {"accelerometer": "1", "gyroscope": "4"}
+    check(
+        put(tmp_path, lines("type,time,x,y,z", *(",".join([types[c[0]], *c[1:]]) for c in cells)))
+    )
 
 
 def test_rows_of_two_imus_are_chosen_by_a_column(tmp_path):
@@ -560,6 +634,9 @@ def test_rows_of_two_imus_are_chosen_by_a_column(tmp_path):
     check(path, options={"where": "I=0"})
     refused(path, "has no row with I=7; there are: 0, 1", where="I=7")
     refused(path, "has no row with J=0; there are: TimeUS, I, gyro_x", where="J=0")
+    path = put(tmp_path, lines(header, *others, *second))  # one after the other
+    refused(path, "rows of several sensors: column 'I' holds 0, 1 in turn; choose one: --where I=0")
+    check(path, options={"where": "I=0"})
 
 
 # --- sensors that contradict each other
@@ -590,6 +667,18 @@ def test_gravity_tells_signs_and_axes(tmp_path, turn, words):
         refused(path, words, gyro_unit="rad/s")  # stated or not
     else:
         check(path)
+
+
+def test_a_unit_in_doubt_tells_what_gravity_says(tmp_path):
+    """Of a phone that is turned without steps, by a gyro with the wrong sign."""
+    angle, rate = 0.6 * np.sin(0.9 * TIME), 0.54 * np.cos(0.9 * TIME)
+    force = 9.81 * np.stack([-np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+    gyro = np.stack([0 * rate, -rate, 0 * rate], axis=1)
+    values = np.hstack([gyro, force]) + np.random.default_rng(0).normal(0, 0.01, WALK.shape)
+    words = "unit of field 'gyro' is ambiguous .* in rad/s gravity turns against the gyro"
+    refused(put(tmp_path, table(values=values)), words)
+    right = put(tmp_path, table(values=values * [1, -1, 1, 1, 1, 1]))
+    assert any("gyro taken as rad/s" in note for note in import_recording(right)[1])
 
 
 def test_the_remedy_for_wrong_axes_works(tmp_path):

@@ -191,6 +191,11 @@ def test_headers_that_do_not_run_as_the_bag_are_not_used(tmp_path):
         assert found.sequence.attributes["start_time"] == pytest.approx(
             (EPOCH + LOGGED) * 1e-9, abs=1e-6
         )
+    make = Maker()  # a few messages without a stamp
+    make.header = lambda time, frame, own=make.header: own(time if time > 0.025 else -1.6e9, frame)
+    found = imported(write(tmp_path, "mcap", imu(make)))
+    compare_imu(found.sequence._replace(time=found.sequence.time + 0.03))
+    assert any("rows of gyro are left out, whose stamps are far" in note for note in found.notes)
     late = np.random.default_rng(0).integers(0, 2 * LOGGED, 600)
     entries = [
         (*row[:2], row[2] + int(delay), row[3])
