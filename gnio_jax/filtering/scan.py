@@ -28,9 +28,8 @@ from gnio_jax.filtering.settings import FilterConfig, YawFrame
 from gnio_jax.filtering.state import (
     FilterState,
     core_covariance,
-    invariant_clones,
+    invariant_errors,
     move_anchor,
-    move_pivot,
     unroll_clones,
 )
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
@@ -147,7 +146,7 @@ def _run(
     )
     history = finished_history(records, age, inputs.state.healthy, config)
     state = state._replace(healthy=history.healthy[-1] > 0)
-    return unroll_clones(state, len(age) % config.clones, config), history
+    return unroll_clones(state, len(age) % config.clones), history
 
 
 def as_given(_: Array, __: Imu, given: Displacement, *___: Any) -> tuple[Displacement, dict]:
@@ -185,7 +184,7 @@ def clone_steps(
         return taken[0], keep(slot, *taken)
 
     rows = jnp.arange(len(age)), by_interval, given, inputs.measurements
-    start = invariant_clones(inputs.state, config)
+    start = invariant_errors(inputs.state, config)
     state, kept = blocked_scan(step, start, rows, config.checkpoint_every, config.truncate_every)
     return state._replace(imu=memory._replace(quiet=state.imu.quiet)), kept, age
 
@@ -224,12 +223,7 @@ def clone_step(
     state = move_anchor(state, anchored)
     interval = _integrate(state.mean._replace(position=state.offset), imu, noise, config.dt)
     decay = correlation_decay(noise.correlation, config.clone_seconds, dtype)
-    lever = pivot_lever = None
-    if config.invariant:
-        if dtype == jnp.float32:
-            state, pivot_lever = move_pivot(state, anchored)
-        lever = state.anchor + interval.position - state.pivot
-    transition = core_transition(interval, decay, anchored, lever, pivot_lever)
+    transition = core_transition(interval, decay, anchored, state.shift)
     state = _propagate(state, interval, transition, slot)
 
     displacement, diagnostics = measure(state, oldest)
@@ -246,7 +240,7 @@ def clone_step(
         state, outcome, correction = update(measurement, state)
         outcomes, corrections = (*outcomes, outcome), (*corrections, correction)
 
-    covariance = core_covariance(state.core_covariance, config)
+    covariance = core_covariance(state, config)
     if config.history == "diagonal":
         covariance = jnp.diagonal(covariance)
     record = StepRecord(state.mean, covariance, displacement, outcomes, diagnostics)

@@ -45,7 +45,7 @@ from gnio_jax.filtering.state import (
     ImuMemory,
     Mean,
     core_covariance,
-    invariant_clones,
+    invariant_errors,
     unroll_clones,
 )
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
@@ -202,7 +202,7 @@ class Tracker:
         if self._core is None:
             return None
         oldest = int(self._core.intervals) % self._config.clones
-        return unroll_clones(_copied(self._core.filter), oldest, self._config)
+        return unroll_clones(_copied(self._core.filter), oldest)
 
     @property
     def delay(self) -> float:
@@ -231,8 +231,8 @@ class Tracker:
         """The filter begins with `state`, at the time of the next sample."""
         state = checked_state(state, self._config, self._noise)
         window = jnp.zeros((self._config.reach, 7), state.offset.dtype)
+        state = invariant_errors(state, self._config)
         tangents = None if self._considered is None else start_tangents(state)
-        state = invariant_clones(state, self._config)
         # Copies, because the compiled step takes the memory of its argument, which no other array,
         # nor two of its fields, may share.
         core = _copied(Core(state, window, jnp.int32(0), tangents))
@@ -350,7 +350,7 @@ def estimated(
     config: FilterConfig,
 ) -> Estimate:
     """The state's estimate; the consider covariance is added to its own."""
-    covariance = core_covariance(state.core_covariance, config)
+    covariance = core_covariance(state, config)
     if tangents is not None and considered is not None:
         sensitivity = core_sensitivity(state.mean, tangents)
         covariance = covariance + considered_covariance(sensitivity[None], considered)[0]
