@@ -27,8 +27,8 @@ from gnio_jax.apps import packages  # noqa: E402
 from gnio_jax.apps.onnx import driver, export_run  # noqa: E402
 from gnio_jax.apps.onnx.programs import start_arrays  # noqa: E402
 from gnio_jax.apps.onnx.run import draw_walk  # noqa: E402
-from gnio_jax.evaluation import Recording  # noqa: E402
-from gnio_jax.filtering.settings import filter_setup  # noqa: E402
+from gnio_jax.evaluation import PreparedRecording  # noqa: E402
+from gnio_jax.filtering import make_filter  # noqa: E402
 from gnio_jax.models import Network  # noqa: E402
 
 
@@ -44,10 +44,10 @@ def main() -> None:
         out = Path(folder) / "models"
         export_run(arguments.run, out)
         models = driver.open_models(out, arguments.threads)
-        setup = filter_setup(run.config.data, run.config.filter)
-        recording = draw_walk(run.config.data, setup, arguments.seconds)
+        ekf = make_filter(run.config.data, run.config.filter)
+        recording = draw_walk(run.config.data, ekf, arguments.seconds)
         times = measure(run, models, recording)
-    period = 1e3 * setup.config.clone_seconds
+    period = 1e3 * ekf.config.clone_seconds
     print(f"\n{'part':>34} {'p50 ms':>8} {'p99 ms':>8} {'of the period':>14}")
     for part, values in times.items():
         p50, p99 = np.percentile(1e3 * np.array(values), [50, 99])
@@ -58,18 +58,20 @@ def main() -> None:
     print(f"ONNX / gnio-jax, network:        {theirs / ours:.2f}")
 
 
-def measure(run: Any, models: driver.Models, recording: Recording) -> dict[str, list[float]]:
+def measure(
+    run: Any, models: driver.Models, recording: PreparedRecording
+) -> dict[str, list[float]]:
     """Seconds of each part of each clone interval that has a window."""
-    setup = filter_setup(run.config.data, run.config.filter)
+    ekf = make_filter(run.config.data, run.config.filter)
     network = Network.of(run.model, run.variables)
     apply = jax.jit(
         lambda window: network.apply(network.variables, window)._replace(diagnostics={})
     )
-    state = recording.start.state(setup.config)
-    tracker = filtering.Tracker(apply, setup.config, setup.noise, state)
-    arrays, dt = start_arrays(state, setup), setup.config.dt
+    state = recording.start.state(ekf)
+    tracker = filtering.Tracker(apply, ekf, state)
+    arrays, dt = start_arrays(state, ekf), ekf.config.dt
     times: dict[str, list[float]] = defaultdict(list)
-    for k, rows in enumerate(clone_intervals(len(recording.gyro), setup.config.samples_per_clone)):
+    for k, rows in enumerate(clone_intervals(len(recording.gyro), ekf.config.samples_per_clone)):
         stride = {"gyro": recording.gyro[rows], "accel": recording.accel[rows]}
         stamps = dt * np.arange(rows.start, rows.stop)
         samples = list(zip(stamps, *stride.values(), strict=True))

@@ -65,12 +65,12 @@ def measure(
     dtype = np.float32 if config.allow_float32 else np.float64
     signals = tuple(signal.astype(dtype) for signal in walk(seconds, config))
     start = (np.eye(3, dtype=dtype), np.array([1.2, 0.0, 0.0], dtype), np.zeros(3, dtype))
-    state = filtering.initial_state(config, *start)
+    state = filtering.initial_state(filtering.Filter(config), *start)
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
 
     def run(gyro, accel, displacement, covariance):
         signals = (gyro, accel, displacement, covariance)
-        return filtering.run_filter(state, *signals, config, noise)
+        return filtering.run_filter(filtering.Filter(config, noise), state, *signals)
 
     if batch > 1:
         signals = tuple(np.tile(signal[None], (batch, *[1] * signal.ndim)) for signal in signals)
@@ -152,10 +152,10 @@ def measure_gradient(
     gyro, accel, displacement, covariance = jax.device_put(walk(seconds, config))
 
     def value_of_piece(logarithms, velocity, displacement):
-        state = filtering.initial_state(config, np.eye(3), velocity, np.zeros(3))
+        state = filtering.initial_state(filtering.Filter(config), np.eye(3), velocity, np.zeros(3))
         noise = filtering.NoiseModel(*jnp.exp(logarithms))
         _, history = filtering.run_filter(
-            state, gyro, accel, displacement, covariance, config, noise
+            filtering.Filter(config, noise), state, gyro, accel, displacement, covariance
         )
         return jnp.sum(history.position**2) + jnp.nansum(history.nis)
 

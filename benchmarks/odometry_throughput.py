@@ -44,7 +44,9 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
     gyro, accel, displacement, covariance = (
         np.tile(signal[None], (batch, *[1] * signal.ndim)) for signal in walk(seconds, config)
     )
-    state = filtering.initial_state(config, np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3))
+    state = filtering.initial_state(
+        filtering.Filter(config), np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3)
+    )
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
     model = models.create("gnio")
     variables = models.initialise(model, jax.random.key(0), config.seen)
@@ -54,11 +56,13 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
         def predict(windows):
             return apply(frozen, windows)._replace(diagnostics={})
 
-        return filtering.run_odometry(predict, state, gyro, accel, config, noise)[1].position
+        return filtering.run_odometry(predict, filtering.Filter(config, noise), state, gyro, accel)[
+            1
+        ].position
 
     def filter_alone(gyro, accel, displacement, covariance):
         signals = (gyro, accel, displacement, covariance)
-        _, history = filtering.run_filter(state, *signals, config, noise)
+        _, history = filtering.run_filter(filtering.Filter(config, noise), state, *signals)
         return history.position
 
     def for_all(function, shared: int):

@@ -87,14 +87,16 @@ def main() -> None:
     arguments = parser.parse_args()
     imu_rate, per_step = arguments.imu_rate, round(PER_CLONE * arguments.imu_rate / RATE)
     config = filtering.FilterConfig(1 / RATE, PER_CLONE, CLONES)
-    state = filtering.initial_state(config, np.eye(3), np.zeros(3), np.zeros(3))
+    state = filtering.initial_state(filtering.Filter(config), np.eye(3), np.zeros(3), np.zeros(3))
     print(
         f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {imu_rate:g} Hz IMU, "
         f"{RATE} Hz filter, {RATE / PER_CLONE:.0f} Hz clones"
     )
     predict = network(arguments.width)
     begin = time.perf_counter()
-    tracker = filtering.Tracker(predict, config, filtering.NoiseModel(), state, imu_rate=imu_rate)
+    tracker = filtering.Tracker(
+        predict, filtering.Filter(config, filtering.NoiseModel()), state, imu_rate=imu_rate
+    )
     print(f"compiled in {time.perf_counter() - begin:.1f} s\n")
     sample_count = WARM_UP * per_step
     measure(tracker, 0, sample_count, imu_rate, True)

@@ -23,10 +23,10 @@ import numpy as np
 from benchmarks import baseline
 from gnio_jax import models
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.data.windows import WindowSource, gather
 from gnio_jax.training.losses import loss_stage, losses
 from gnio_jax.training.task import train_steps
 from gnio_jax.training.window_task import WindowTask, estimate_statistics, statistics_order
+from gnio_jax.training.windows import WindowSource, gather
 
 STEPS, STEPS_PER_EPOCH = 4, 1000
 """Steps per dispatch, as in the training loop, and those of the schedule."""

@@ -2,7 +2,7 @@
 
     git worktree add ../before COMMIT
     taskset -c 0 python -m benchmarks.two_versions ../before
-        [--only filter gradient odometry training] [--widths 16 32 64] [--samples 100 200]
+        [--only filter sequences gradient odometry training] [--widths 16 32 64] [--samples 100 200]
         [--batch 128] [--rounds 20]
 
 Each version is a process of its own, which waits while the other one runs, so that a busy machine
@@ -33,16 +33,29 @@ config = TrainConfig(data=data, model=model, optim=OptimConfig(batch_size=batch)
 work = ours(config)["whole step"]
 """
 """Each of these programs defines `work()`, which computes something and returns how often."""
-FILTER = """
+FORMS = """
+def one(function, config, noise, *arguments):
+    \"""A call of this version, or of one before the filter was one value.\"""
+    if hasattr(filtering, "Filter"):
+        return function(filtering.Filter(config, noise), *arguments)
+    return function(*arguments, config, noise)
+
+def begin(config, *pose):
+    first = filtering.Filter(config) if hasattr(filtering, "Filter") else config
+    return filtering.initial_state(first, *pose)
+"""
+FILTER = (
+    FORMS
+    + """
 from benchmarks.filter_throughput import DT, jax, jnp, np, filtering, walk
 config = filtering.FilterConfig(DT, 10, 20)
 signals = jax.device_put(walk(60.0, config))
 densities = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, DT)[:4]
 
 def value(logarithms, velocity, gyro, accel, displacement, covariance):
-    state = filtering.initial_state(config, np.eye(3), velocity, np.zeros(3))
-    noise, given = filtering.NoiseModel(*jnp.exp(logarithms)), (displacement, covariance)
-    _, history = filtering.run_filter(state, gyro, accel, *given, config, noise)
+    state = begin(config, np.eye(3), velocity, np.zeros(3))
+    noise, rows = filtering.NoiseModel(*jnp.exp(logarithms)), (displacement, covariance)
+    _, history = one(filtering.run_filter, config, noise, state, gyro, accel, *rows)
     return jnp.sum(history.position**2) + jnp.nansum(history.nis)
 
 arguments = jnp.log(jnp.array(densities)), jnp.array([1.2, 0.0, 0.0]), *signals
@@ -53,18 +66,29 @@ def work():
         jax.block_until_ready(program(*arguments))
     return 5
 """
+)
+SEQUENCES = (
+    FILTER
+    + """
+side = [jnp.stack([part] * 16) for part in arguments[1:]]
+program = jax.jit(jax.vmap(value, (None, 0, 0, 0, 0, 0))).lower(arguments[0], *side).compile()
+arguments = arguments[0], *side
+"""
+)
 GRADIENT = (
     FILTER
     + """
 program = jax.jit(jax.value_and_grad(value, (0, 1, 4))).lower(*arguments).compile()
 """
 )
-ODOMETRY = """
+ODOMETRY = (
+    FORMS
+    + """
 from benchmarks.filter_throughput import DT, jax, jnp, np, filtering, walk
 from gnio_jax import models
 config = filtering.FilterConfig(DT, 10, 20)
 gyro, accel, *_ = jax.device_put(walk(10.0, config))
-state = filtering.initial_state(config, np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3))
+state = begin(config, np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3))
 noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, DT)
 model = models.create("gnio")
 frozen = models.inference_variables(model, models.initialise(model, jax.random.key(0), config.seen))
@@ -73,7 +97,9 @@ apply = models.Inference(model)
 def odometry(frozen, gyro, accel):
     def predict(windows):
         return apply(frozen, windows)._replace(diagnostics={})
-    return filtering.run_odometry(predict, state, gyro, accel, config, noise)[1].position
+    def run(*arguments):
+        return filtering.run_odometry(predict, *arguments)
+    return one(run, config, noise, state, gyro, accel)[1].position
 
 program = jax.jit(odometry).lower(frozen, gyro, accel).compile()
 
@@ -81,6 +107,7 @@ def work():
     jax.block_until_ready(program(frozen, gyro, accel))
     return 1
 """
+)
 LOOP = """
 for line in sys.stdin:
     clock, processor = time.perf_counter(), time.process_time()
@@ -90,6 +117,7 @@ for line in sys.stdin:
 """
 PROGRAMS = {
     "filter": ("the filter over 60 s", FILTER),
+    "sequences": ("the filter over 60 s, 16 sequences", SEQUENCES),
     "gradient": ("value and gradient of the filter over 60 s", GRADIENT),
     "odometry": ("the odometry over 10 s, network of full width", ODOMETRY),
 }

@@ -50,10 +50,10 @@ def walk_of(seconds: float) -> tuple[tuple, np.ndarray, np.ndarray, np.ndarray]:
 def filter_positions(log_noise, start, signals, displacement, config):
     """Positions after each interval, (k, 3)."""
     noise = filtering.NoiseModel(*jnp.exp(log_noise))
-    state = filtering.initial_state(config, *start)
+    state = filtering.initial_state(filtering.Filter(config), *start)
     covariance = jnp.tile(SIGMA**2 * jnp.eye(3), (len(displacement), 1, 1))
     measurements = signals[:, :3], signals[:, 3:], displacement, covariance
-    return filtering.run_filter(state, *measurements, config, noise)[1].position
+    return filtering.run_filter(filtering.Filter(config, noise), state, *measurements)[1].position
 
 
 def norms_by_lag(seconds: float, config: filtering.FilterConfig) -> np.ndarray:

@@ -114,8 +114,10 @@ def replay(tracker, recorded: ImuSamples, path: Path, realtime: bool, progress) 
 
 def write_trajectory(out: Path, name: str, poses: list) -> np.ndarray:
     """Write the TUM file and the picture; returns the positions (poses, 3)."""
-    from gnio_jax.evaluation import Estimate, Trajectory, plots
+    from gnio_jax import drawing
+    from gnio_jax.evaluation import SequenceEstimate, Trajectory, plots
     from gnio_jax.evaluation.trajectory import write_tum
+    from gnio_jax.evaluation.views import make_view
     from gnio_jax.files import replacing
 
     position = np.array([pose.position for pose in poses])
@@ -126,8 +128,8 @@ def write_trajectory(out: Path, name: str, poses: list) -> np.ndarray:
     )
     with replacing(out) as temporary:
         write_tum(temporary, trajectory)
-    view = plots.view(Estimate(name, trajectory, no_reference), alignment="none")
-    plots.save(out.with_suffix(".png"), plots.sequence(view))
+    view = make_view(SequenceEstimate(name, trajectory, no_reference), alignment="none")
+    drawing.save(out.with_suffix(".png"), plots.sequence(view))
     return position
 
 

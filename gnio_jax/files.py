@@ -99,6 +99,18 @@ def file_stem(name: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", name).lstrip(".") or "_"
 
 
+def file_stems(names: Iterable[str]) -> list[str]:
+    """The distinct name of a file for each sequence: `file_stem`, with `_` where two are the
+    same."""
+    stems: list[str] = []
+    for name in names:
+        stem = file_stem(name)
+        while stem in stems:
+            stem += "_"
+        stems.append(stem)
+    return stems
+
+
 def shown_name(name: str, length: int = 60) -> str:
     """The name of a file or a recording as text of a picture.
 

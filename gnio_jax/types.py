@@ -34,6 +34,24 @@ class Waypoints(NamedTuple):
     position: Float[np.ndarray, "k 2"]
     """Horizontal position, expressed in the frame of a map, m."""
 
+    def problem(self, clock: Float[np.ndarray, "n"], reach: float, fewest: int) -> str:
+        """The first condition that they do not meet, or an empty text: there are at least `fewest`,
+        they are finite, and they increase from at most `reach` s before the first stamp of the
+        sequence's `clock` to at most `reach` s after its last one."""
+        time, position = self
+        count = len(time)
+        if time.ndim != 1 or position.shape != (count, 2):
+            return f"have the shapes {time.shape} and {position.shape}, expected (k,) and (k, 2)"
+        if count < fewest:
+            return f"are {count}, at least {fewest} are needed"
+        if not (np.isfinite(time).all() and np.isfinite(position).all()):
+            return "are not all finite"
+        if not (np.diff(time) > 0).all():
+            return "do not increase in time"
+        if time[0] < clock[0] - reach or time[-1] > clock[-1] + reach:
+            return f"({time[0]:.2f} to {time[-1]:.2f} s) are not all on the IMU's clock"
+        return ""
+
 
 class Sequence(NamedTuple):
     """One recording: IMU and reference on one uniform clock. Host arrays in float64.

@@ -2,14 +2,16 @@
 
 import ast
 import functools
+import graphlib
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "gnio_jax"
 
-BASE = {"config", "cores", "decimation", "errors", "files", "geometry", "numerics", "reporting"}
-BASE |= {"parallel", "types", "windows"}
+BASE = {"config", "cores", "decimation", "drawing", "errors", "files", "geometry", "numerics"}
+BASE |= {"parallel", "plugins", "reporting", "types", "windows"}
 ROOMS = {
     "data": BASE,
     "models": BASE,
@@ -32,9 +34,9 @@ LIBRARIES = {
     "bokeh": {"evaluation.page"},
     "flax": {"models", "training", "evaluation", "interop"},
     "jax2onnx": {"apps.onnx.conversion"},
-    "loky": {"data.loading"},
+    "loky": {"data.workers"},
     "mcap": {"apps.importing.ros", "apps.export"},
-    "matplotlib": {"data", "evaluation.plots", "tables.plots"},
+    "matplotlib": {"drawing", "data.pictures", "evaluation.plots", "tables.plots"},
     "onnx": ONNX,
     "onnxruntime": ONNX,
     "optax": {"training"},
@@ -51,33 +53,56 @@ LIBRARIES = {
 REFUSED = set("found own each given there known place seen about asked kept told here both".split())
 REFUSED |= set("these those wanted taken laid made left rest apart since late".split())
 """Words that do not say what a variable holds."""
-OLD_NAMES = ("apps/importing", "apps/live", "apps/track", "calibration", "commands/calibrate")
-OLD_NAMES += ("config", "data/parsing", "evaluation", "filtering", "training")
+OLD_NAMES = ("apps/live", "apps/track", "filtering/propagation", "filtering/scan")
+OLD_NAMES += ("filtering/state", "filtering/update", "filtering/waypoints")
 """Rooms and modules whose variables still have such names."""
-TWO_MEANINGS = {"Estimate", "Inputs", "Outcome", "Recording", "Run", "Source", "Summary"}
-"""Names that two classes of these rooms still share."""
+
+
+class Import(NamedTuple):
+    """An import of the package, anywhere in a module."""
+
+    module: str
+    """The module without the package's name."""
+    name: str
+    """What it imports, with the package's name."""
+    late: bool
+    """Whether a function imports it."""
 
 
 @functools.cache
 def imports():
-    """(module without the package's name, what it imports) of every import of the package."""
     return list(read_imports())
 
 
 def read_imports():
     for path in sorted(PACKAGE.rglob("*.py")):
         module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+        late = {node for function in functions for node in ast.walk(function)}
+        for node in ast.walk(tree):
             if isinstance(node, ast.Import):
-                yield from ((module, alias.name) for alias in node.names)
+                yield from (Import(module, alias.name, node in late) for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
                 assert node.level == 0, f"{module}: relative import"
-                yield from ((module, f"{node.module}.{alias.name}") for alias in node.names)
+                for alias in node.names:
+                    yield Import(module, f"{node.module}.{alias.name}", node in late)
+
+
+def imports_of_modules():
+    """The imports of modules of the package, whose names then are those of the modules."""
+    modules = {place.module.removesuffix(".__init__") for place in imports()}
+    for place in imports():
+        name = place.name.removeprefix("gnio_jax.")
+        while name not in modules and "." in name:
+            name = name.rpartition(".")[0]
+        if place.name.startswith("gnio_jax.") and name in modules:
+            yield place._replace(module=place.module.removesuffix(".__init__"), name=name)
 
 
 @pytest.mark.parametrize("room", sorted(ROOMS))
 def test_a_room_imports_only_what_stands_before_it(room):
-    for module, name in imports():
+    for module, name, _ in imports():
         if module.split(".")[0] == room and name.startswith("gnio_jax."):
             other = name.split(".")[1]
             # `python -m gnio_jax.data` is the command of that name.
@@ -87,15 +112,34 @@ def test_a_room_imports_only_what_stands_before_it(room):
 
 @pytest.mark.parametrize("library", sorted(LIBRARIES))
 def test_a_library_stays_in_its_rooms(library):
-    for module, name in imports():
+    for module, name, _ in imports():
         if f"{name}.".startswith(f"{library}."):
             places = {module, module.split(".")[0]}
             assert places & LIBRARIES[library], f"gnio_jax/{module} imports {name}"
 
 
 def test_every_module_has_a_room():
-    rooms = {module.split(".")[0] for module, _ in imports()}
+    rooms = {place.module.split(".")[0] for place in imports()}
     assert rooms - {"__init__", "__main__"} <= ROOMS.keys()
+
+
+def test_imports_have_no_circle():
+    graph = {}
+    for module, name, _ in imports_of_modules():
+        graph.setdefault(module, set()).add(name)
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError with the modules
+
+
+SLOW = {"bokeh", "matplotlib"}
+"""Libraries that take up to a second to import, for which only a picture should wait."""
+
+
+def test_a_late_import_inside_a_room_waits_for_a_slow_library_and_nothing_else():
+    """Any other one hides what the room is made of."""
+    drawing = {place.module for place in imports() if place.name.split(".")[0] in SLOW}
+    for module, name, late in imports_of_modules():
+        if late and module.split(".")[0] == name.split(".")[0]:
+            assert name in drawing, f"gnio_jax/{module} imports {name} in a function"
 
 
 def test_a_variable_is_a_noun():
@@ -114,7 +158,7 @@ def test_the_name_of_a_class_has_one_meaning():
     homes = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef) and node.name not in TWO_MEANINGS:
+            if isinstance(node, ast.ClassDef):
                 home = homes.setdefault(node.name, path)
                 assert home == path, f"{home} and {path} have a class '{node.name}'"
 

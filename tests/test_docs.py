@@ -14,6 +14,7 @@ from gnio_jax import data, models
 from gnio_jax.apps import packages
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.filtering import measurements
 from gnio_jax.models import registry
 from tests.support import pages, tiny_run
 from tests.support.command_lines import understood
@@ -85,9 +86,20 @@ def test_the_loop_of_ones_own(one_walk, capsys):
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     losses = [float(loss) for _, loss in lines[:5]]
     assert losses[-1] < losses[0]
-    nees, without, filtered, smoothed = (float(line[-1]) for line in lines[5:9])
-    assert " ".join(lines[9]) == "taken 3 of 3"
-    assert nees < 3 and smoothed < filtered < without
+    assert float(lines[5][-1]) < 3 and " ".join(lines[6]) == "taken 3 of 3"
+
+
+def test_a_measurement_of_ones_own(capsys):
+    """The car's velocity is found, and turns with it; without the measurement it is not."""
+    try:
+        run("docs/measurements.md", code_of("docs/measurements.md"))
+    finally:
+        measurements._MEASUREMENTS.pop("nonholonomic", None)
+    without, constrained, accepted, heights = capsys.readouterr().out.splitlines()
+    assert abs(float(without.split()[1])) > 0.5 and without.endswith("taken []")
+    assert abs(float(constrained.split()[1])) < 0.1
+    assert constrained.endswith("taken ['nonholonomic']")
+    assert int(accepted.split()[1]) > 390 and heights == "heights 200"
 
 
 def test_weights_that_are_loaded(tmp_path, monkeypatch):
@@ -141,6 +153,7 @@ def test_the_imports_of_the_reference():
 
 def test_every_block_that_runs_has_a_test():
     tested = {"README.md", "docs/differentiable_filter.md", "docs/networks.md", "docs/weights.md"}
+    tested |= {"docs/measurements.md"}
     tested |= {"docs/api/index.md", "CONTRIBUTING.md"}
     assert {block.page for block in RUN} == tested
 
@@ -200,10 +213,10 @@ def test_a_command_line_is_understood(line, monkeypatch):
     for option in ("config", "base"):
         name = getattr(settings, option, None)
         if name is not None and name != "FILE":
-            configuration.find(name)
+            configuration.find_experiment(name)
 
 
-def test_a_command_line_of_yesterday_is_not():
+def test_an_unknown_option_does_not_parse():
     with pytest.raises(InputError, match="unknown option"):
         understood(["track", "walk.zip", "--wieghts", "mine"])
 

@@ -22,7 +22,7 @@ from gnio_jax.config import ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
 from gnio_jax.training import loop, run_folder
-from gnio_jax.training.recordings import Recordings, set_up
+from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.window_task import WindowTask
 from tests.support import tiny_run
 from tests.support.drawn_state import drawn_state
@@ -232,7 +232,7 @@ def test_processes_with_other_samples_or_weights_are_refused(monkeypatch):
 
     def compare(samples, weight, largest):
         monkeypatch.setattr(parallel, "largest", largest)
-        recordings = Recordings({"imu": samples, "start": np.arange(3)}, {}, {"train": ["a"]})
+        recordings = TrainingData({"imu": samples, "start": np.arange(3)}, {}, {"train": ["a"]})
         run_folder.compare_processes(TrainConfig(), recordings, {"scale": jnp.float32(weight)})
 
     compare(samples, 1, lambda *given: sent.append(given) or given)

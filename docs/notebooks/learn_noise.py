@@ -67,7 +67,7 @@ settings = filtering.FilterConfig(
 )
 std_of_start = filtering.InitialStd(accel_bias=0.2)  # a phone's bias, which is no noise
 start = filtering.initial_state(
-    settings, rotation[0], walk.velocity[0], walk.position[0], std=std_of_start
+    filtering.Filter(settings, start=std_of_start), rotation[0], walk.velocity[0], walk.position[0]
 )
 
 
@@ -78,7 +78,9 @@ def loss(log_density):
         accel_density,
         measurement_scale=1.0,  # the errors of these displacements are white
     )
-    _, history = filtering.run_filter(start, gyro, accel, displacement, covariance, settings, noise)
+    _, history = filtering.run_filter(
+        filtering.Filter(settings, noise), start, gyro, accel, displacement, covariance
+    )
     return -jnp.nanmean(history.log_likelihood)
 
 

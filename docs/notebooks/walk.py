@@ -22,8 +22,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from gnio_jax import config, data, evaluation, filtering, geometry
-from gnio_jax.data.windows import gather, window_source
 from gnio_jax.training import checkpoint, loop
+from gnio_jax.training.windows import gather, window_source
 
 jax.config.update("jax_enable_x64", True)  # the filter runs in float64, the network in float32
 
@@ -123,17 +123,21 @@ print("root mean square error of a second:", np.asarray(error).round(3), "m")
 # true pose here; `gnio track` starts from gravity.
 
 # %%
-setup = filtering.filter_setup(run.config.data, run.config.filter)
+ekf = filtering.make_filter(run.config.data, run.config.filter)
 rotation = geometry.matrix_from_quaternion(jnp.asarray(walk.orientation[0]))
-start = filtering.initial_state(setup.config, rotation, walk.velocity[0], walk.position[0])
-n = setup.config.samples_per_clone
+start = filtering.initial_state(ekf, rotation, walk.velocity[0], walk.position[0])
+n = ekf.config.samples_per_clone
 whole = (len(walk.time) - 1) // n * n
 
 
 @jax.jit
 def odometry(variables, gyro, accel):
     return filtering.run_odometry(
-        lambda imu: run.model.apply(variables, imu), start, gyro, accel, setup.config, setup.noise
+        lambda imu: run.model.apply(variables, imu),
+        ekf,
+        start,
+        gyro,
+        accel,
     )
 
 

@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 
 from gnio_jax.config import CompareConfig, EvaluateConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept, statistics, tabulate
-from gnio_jax.evaluation.kept import IDENTITY
+from gnio_jax.evaluation import reuse, statistics, tabulate
+from gnio_jax.evaluation.folder import REMEDY, read
 from gnio_jax.evaluation.metrics import NAMES
-from gnio_jax.evaluation.report import REMEDY, Report, read
+from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation.reuse import IDENTITY, RequestedEvaluation
 from gnio_jax.evaluation.statistics import Cell
 from gnio_jax.files import with_ending
 from gnio_jax.reporting import Lines, Reporter
@@ -40,8 +41,8 @@ class EvaluationSource(NamedTuple):
     run: Path
     folder: Path
     identity: dict[str, Any]
-    """Values of the settings `kept.IDENTITY`."""
-    figures: Report | kept.Kept
+    """Values of the settings `reuse.IDENTITY`."""
+    figures: Report | RequestedEvaluation
     """The figures of a named evaluation, or for a run its requested evaluation."""
 
 
@@ -62,7 +63,7 @@ class ComparedRow(NamedTuple):
         """Recordings that all seeds have, and for which the metric, if given, has a value."""
         seeds = [report.scores for report in self.reports]
         if metric is not None:
-            return set(statistics.values(seeds, metric))
+            return set(statistics.collect_values(seeds, metric))
         return set.intersection(*map(set, seeds))
 
 
@@ -98,11 +99,11 @@ def compare(
     sources = [source for row in sources_by_row for source in row]
     _check_sources(sources)
 
-    def report_of(evaluation: Report | kept.Kept) -> Report:
+    def report_of(evaluation: Report | RequestedEvaluation) -> Report:
         return (
             evaluation
             if isinstance(evaluation, Report)
-            else kept.made(evaluation, reporter, workers)
+            else reuse.load_or_evaluate(evaluation, reporter, workers)
         )
 
     rows = [
@@ -171,12 +172,14 @@ def _source(path: Path, config: CompareConfig) -> EvaluationSource:
     named."""
     if (path / "config.yaml").is_file():
         settings = {"split": config.split, "estimator": config.estimator, "plots": False}
-        evaluation = kept.look(EvaluateConfig(str(path), data_root=config.data_root, **settings))
+        evaluation = reuse.find_existing(
+            EvaluateConfig(str(path), data_root=config.data_root, **settings)
+        )
         identity = {name: getattr(evaluation.config, name) for name in IDENTITY}
         return EvaluationSource(path, path, evaluation.folder, identity, evaluation)
     report = read(path)
     run = Path(os.path.abspath(path)).parent.parent
-    if path.resolve().parent.name == "eval" and (problem := kept.out_of_date(report, run)):
+    if path.resolve().parent.name == "eval" and (problem := reuse.find_missing_step(report, run)):
         raise InputError(path, problem, REMEDY)
     identity = {name: report.settings.get(name) for name in IDENTITY}
     return EvaluationSource(path, run, path, identity, report)
@@ -260,12 +263,14 @@ def lines(comparison: Comparison) -> list[list[str]]:
             row.recordings(metric) == comparison.rows[0].recordings(metric)
             for row in comparison.rows
         )
-        for index, (row, (mean, difference)) in enumerate(zip(comparison.rows, cells, strict=True)):
+        for index, (row, (summary, difference)) in enumerate(
+            zip(comparison.rows, cells, strict=True)
+        ):
             better = ""
             if difference and difference.compared and not difference.withheld:
                 better = f"{difference.better} of {difference.compared}"
-            text = tabulate.mean(mean, column.digits)
-            text += "" if alike else f" over {mean.sequences}"
+            text = tabulate.mean(summary, column.digits)
+            text += "" if alike else f" over {summary.sequences}"
             head = ["" if index else column.title, row.label, text]
             table.append([*head, tabulate.difference(difference, column.digits), better])
     return table
@@ -326,7 +331,8 @@ def filter_options(comparison: Comparison) -> list[str]:
 
 def write(path: Path, comparison: Comparison) -> None:
     """Write `path`.md, `path`.csv and `path`.png."""
-    from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
+    from gnio_jax import drawing  # Matplotlib takes a second to import
+    from gnio_jax.evaluation import plots
 
     text = f"{title(comparison)}\n\n{tabulate.markdown(HEADER, lines(comparison))}\n"
     text += "\n\n".join(explanations(comparison))
@@ -340,8 +346,8 @@ def write(path: Path, comparison: Comparison) -> None:
     drawable = [
         metric
         for metric, cells in comparison.cells.items()
-        if any(cell.mean.seeds for cell in cells)
+        if any(cell.summary.seeds for cell in cells)
     ]
     rows = {row.label: row.reports for row in comparison.rows}
-    picture = plots.paired(rows, next(iter(drawable or comparison.cells)))
-    plots.save(with_ending(path, ".png"), picture)
+    picture = plots.sequence_dots(rows, next(iter(drawable or comparison.cells)))
+    drawing.save(with_ending(path, ".png"), picture)

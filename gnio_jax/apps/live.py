@@ -20,20 +20,19 @@ import time
 from array import array
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.apps.importing import units
+from gnio_jax.data import physics
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory
 from gnio_jax.evaluation.metrics import path_length
 from gnio_jax.evaluation.prepare import ROUGH_START
-from gnio_jax.filtering import Pose, Tracker
-from gnio_jax.filtering.settings import filter_setup
+from gnio_jax.filtering import Pose, Tracker, make_filter
 from gnio_jax.filtering.start import level_state
 from gnio_jax.models import Network
 from gnio_jax.numerics import quaternion_from_matrix
@@ -335,17 +334,13 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
     `Tracker.expect` changes it. If samples are further apart than 1.5 of its intervals, some are
     missing between them. Raises `ValueError` for a rest that is shorter than two samples.
     """
-    setup = filter_setup(run.config.data, run.config.filter)
     network = Network.of(run.model, run.variables)
     return Tracker(
         lambda windows: network.apply(network.variables, windows),
-        setup.config,
-        setup.noise,
+        make_filter(run.config.data, run.config.filter),
         rest_seconds=rest_seconds,
-        std=setup.initial_std,
         hole=longest_interval(run, imu_rate),
         imu_rate=imu_rate or run.config.data.rate,
-        considered=setup.considered,
     )
 
 
@@ -364,15 +359,16 @@ def expect(tracker: Tracker, found: Followed, run: Run, imu_rate: float) -> None
 def begins_at_rest(run: Run) -> Callable[[list[Sample]], bool]:
     """A function that tells whether the first second of some samples is quiet enough for the start
     of the filter."""
-    setup = filter_setup(run.config.data, run.config.filter)
+    ekf = make_filter(run.config.data, run.config.filter)
 
     def at_rest(samples: list[Sample]) -> bool:
         first = [each for each in samples if each.time - samples[0].time < FIRST_SECONDS]
         if len(first) < FIRST_SAMPLES or samples[-1].time - samples[0].time < FIRST_SECONDS:
             return True  # too few samples: the rest may continue
         rows = np.array([(each.time, *each.gyro, *each.accel) for each in first])
-        config = dataclasses.replace(setup.config, dt=float(np.median(np.diff(rows[:, 0]))))
-        state = level_state(config, rows[:, 1:4], rows[:, 4:], setup.initial_std)
+        config = dataclasses.replace(ekf.config, dt=float(np.median(np.diff(rows[:, 0]))))
+        sampled = dataclasses.replace(ekf, config=config)
+        state = level_state(sampled, rows[:, 1:4], rows[:, 4:])
         return float(state.core_covariance[VELOCITY.start, VELOCITY.start]) <= ROUGH_START**2
 
     return at_rest
@@ -443,8 +439,8 @@ def _check_gravity(samples: list[Sample], where: str) -> None:
 def _check_turning(samples: list[Sample], where: str) -> None:
     rows = np.array([[sample.time, *sample.gyro, *sample.accel] for sample in samples])
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]  # in order
-    motion = units.Motion(rows[:, 0] - rows[0, 0], rows[:, 1:4], rows[:, 4:7])
-    units.check_rad_per_second(motion, Path(where))
+    imu = physics.ImuSamples(rows[:, 0] - rows[0, 0], rows[:, 1:4], rows[:, 4:7])
+    physics.check_turning(imu, where)
 
 
 # --- following
@@ -601,7 +597,7 @@ def line(found: Followed) -> str:
     walked = 0.0
     if len(time) > 1:
         walked = path_length(path.position[:, :2], float(np.median(np.diff(time))))
-    health = "" if found.pose.healthy else "  THE FILTER DIVERGED"
+    health = "" if found.pose.healthy else f"  THE FILTER DIVERGED ({found.pose.failure})"
     return (
         f"{found.pose.time - time[0]:7.1f} s  x {x:+8.2f}  y {y:+8.2f}  z {z:+7.2f} m  "
         f"± {sigma:.2f} m  walked {walked:.1f} m{health}"

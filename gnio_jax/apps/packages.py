@@ -28,7 +28,8 @@ from safetensors.numpy import load, save
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.errors import InputError, did_you_mean
-from gnio_jax.evaluation import report, tabulate
+from gnio_jax.evaluation import folder as results
+from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import summarise
 from gnio_jax.files import file_stem, fingerprint, replacing, replacing_folder
@@ -208,14 +209,12 @@ def read_manifest(path: Path) -> PackageManifest:
         raise InputError(path, f"'{MANIFEST}' is no JSON ({error})", _DAMAGED) from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise InputError(path, f"'{MANIFEST}' is not that of a package", _DAMAGED)
-    if manifest.get("version") == 1:
-        manifest = _of_version_1(path, manifest)
-    elif manifest.get("version") != VERSION:
+    if manifest.get("version") != VERSION:
         problem = f"has format version {manifest.get('version')!r}; this program reads {VERSION}"
         raise InputError(
             path, problem, "publish its run again, or install the gnio-jax that made it"
         )
-    elif _digest(manifest) != manifest.get("sha256"):
+    if _digest(manifest) != manifest.get("sha256"):
         raise InputError(path, f"'{MANIFEST}' was changed (SHA-256 differs)", _DAMAGED)
     for name, kind in get_type_hints(PackageManifest).items():
         value = manifest.get(name)
@@ -224,26 +223,6 @@ def read_manifest(path: Path) -> PackageManifest:
     if manifest["weights"].keys() != {"bytes", "sha256"}:
         raise InputError(path, f"'{MANIFEST}' does not describe '{WEIGHTS}'", _DAMAGED)
     return PackageManifest(*(manifest[name] for name in PackageManifest._fields))
-
-
-def _of_version_1(path: Path, manifest: dict[str, Any]) -> dict[str, Any]:
-    """The manifest of an earlier version, whose settings and card were separate files."""
-    files = manifest.get("files")
-    fingerprints = files if isinstance(files, dict) else {}
-    texts = {}
-    for name in ("config.yaml", "README.md"):
-        content = _content(path, name, LARGEST_MANIFEST)
-        if fingerprint(content) != fingerprints.get(name):
-            problem = f"'{name}' is not the file that the manifest describes (SHA-256 differs)"
-            raise InputError(path, problem, _DAMAGED)
-        texts[name] = content.decode("utf-8", "replace")
-    config = configuration.parse(texts["config.yaml"], str(path / "config.yaml"))
-    return manifest | {
-        "measured": "",
-        "card": texts["README.md"].splitlines(),
-        "config": configuration.plain(config),
-        "weights": fingerprints.get(WEIGHTS),
-    }
 
 
 def _digest(manifest: dict[str, Any]) -> str:
@@ -347,7 +326,7 @@ def publish(
         _measured(figures, run.config.datasets),
         f"gnio-jax {version('gnio-jax')}",
         [],
-        configuration.plain(configuration.without_places(run.config)),
+        configuration.to_plain(configuration.without_paths(run.config)),
         fingerprint(weights),
     )
     manifest = manifest._replace(card=_card(manifest, fails, run, figures, workdir).split("\n"))
@@ -378,7 +357,7 @@ def _has_manifest(path: Path) -> bool:
 def _figures(workdir: Path) -> dict[str, Report]:
     """Read every evaluation of a run, by its folder's name. Raises `InputError`."""
     folders = sorted(path.parent for path in workdir.glob("eval/*/metrics.json"))
-    return {folder.name: report.read(folder) for folder in folders}
+    return {folder.name: results.read(folder) for folder in folders}
 
 
 def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:

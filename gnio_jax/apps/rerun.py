@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.drawing import AXES, BLUE, REFERENCE
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.evaluation import Estimate, Recording, Trajectory
-from gnio_jax.evaluation.colours import AXES, BLUE, REFERENCE, SIGMAS
+from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, Trajectory
 from gnio_jax.evaluation.estimate import in_one_frame
-from gnio_jax.evaluation.report import file_names
 from gnio_jax.evaluation.trajectory import Alignment
-from gnio_jax.files import replacing
+from gnio_jax.evaluation.views import SIGMAS
+from gnio_jax.files import file_stems, replacing
 from gnio_jax.filtering import Pose
 from gnio_jax.numerics import finite_rows, quaternion_from_matrix, xyzw_from_wxyz
 
@@ -46,8 +46,8 @@ def check(target: str | Path) -> None:
 
 def write(
     path: Path,
-    estimates: list[Estimate],
-    recordings: list[Recording],
+    estimates: list[SequenceEstimate],
+    recordings: list[PreparedRecording],
     alignment: Alignment | None = None,
 ) -> None:
     """Write sequences as one recording of Rerun, whole or not at all: for each its estimate and its
@@ -58,7 +58,7 @@ def write(
     """
     import rerun
 
-    stems = file_names([original.name for original in estimates])
+    stems = file_stems([original.name for original in estimates])
     with replacing(path) as temporary:
         log = rerun.RecordingStream("gnio-jax", recording_id="gnio")
         log.save(temporary)
@@ -81,7 +81,7 @@ def write(
         log.disconnect()
 
 
-def _log_paths(log: Any, stem: str, estimate: Estimate) -> None:
+def _log_paths(log: Any, stem: str, estimate: SequenceEstimate) -> None:
     """Log both paths as lines, and the pose of the estimate and its 3σ ellipsoid over time."""
     import rerun
 

@@ -23,11 +23,18 @@ from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate, Recording, estimate, metrics, prepare, report
+from gnio_jax.evaluation import (
+    PreparedRecording,
+    SequenceEstimate,
+    estimate,
+    metrics,
+    prepare,
+    report,
+)
 from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
-from gnio_jax.filtering.settings import FilterSetup, filter_setup
+from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.filtering.zero_velocity import quiet_samples
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
@@ -92,7 +99,7 @@ class Summary(NamedTuple):
 class Tracked(NamedTuple):
     """The result of `track` and its folder."""
 
-    estimate: Estimate
+    estimate: SequenceEstimate
     summary: Summary
     folder: Path
 
@@ -120,21 +127,20 @@ def track(
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
     _check_bridged(sequence)
-    ekf = filter_setup(config.data, config.filter)
+    ekf = make_filter(config.data, config.filter)
     ready, left_out = prepare(
         [sequence],
         config.data,
-        ekf.initial_std,
+        ekf,
         init="static",
         gyro_bias="rest",
         from_first=True,
-        raw_gyro_bias=ekf.raw_gyro_bias,
     )
     if not ready:
         raise InputError(sequence.name, left_out[sequence.name], "record for longer")
     if ekf.considered is not None and not ready[0].start.raw_gyro:
         considered = ekf.considered._replace(raw_gyro_bias=0.0)
-        ekf = ekf._replace(considered=considered if any(considered) else None)
+        ekf = dataclasses.replace(ekf, considered=considered if any(considered) else None)
     network = Network.of(weights.run.model, weights.run.variables)
     (found,) = estimate(ready, network, config.data, ekf, 1, progress)
     compared = np.isfinite(found.reference.position).any() or found.waypoints is not None
@@ -174,12 +180,12 @@ def _check_bridged(sequence: Sequence) -> None:
 
 
 def summarise(
-    found: Estimate,
+    found: SequenceEstimate,
     errors: dict[str, float | None],
-    ready: Recording,
+    ready: PreparedRecording,
     recording: Imported,
     weights: Weights,
-    ekf: FilterSetup,
+    ekf: Filter,
 ) -> Summary:
     """The figures of a finished track, up to a divergence if there was one."""
     filtered, sequence = found.filtered, recording.sequence
@@ -268,7 +274,7 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
     return [text for text, applies in found.items() if applies]
 
 
-def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
+def _share_at_rest(ready: PreparedRecording, ekf: Filter) -> float:
     """Share of the strides in which the IMU is as quiet as the filter's rest; strides across a gap
     do not count as rest."""
     rate = ready.gyro - ready.start.gyro_bias
@@ -279,7 +285,7 @@ def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
     return float(quiet.reshape(-1, ekf.config.samples_per_clone).all(axis=1).mean())
 
 
-def _share_running(ready: Recording, ekf: FilterSetup) -> float:
+def _share_running(ready: PreparedRecording, ekf: Filter) -> float:
     """Share of the measured seconds with accelerations as in a run."""
     second = round(1.0 / ekf.config.dt)
     off = np.linalg.norm(ready.accel, axis=1) - GRAVITY
@@ -289,7 +295,7 @@ def _share_running(ready: Recording, ekf: FilterSetup) -> float:
 
 
 def _write_figures(
-    folder: Path, found: Estimate, summary: Summary, formats: tuple[str, ...]
+    folder: Path, found: SequenceEstimate, summary: Summary, formats: tuple[str, ...]
 ) -> None:
     """Write the summary and the trajectories, with the stamps of the recording's own clock."""
     plain = summary._asdict() | {"errors": report.finite(summary.errors)}
@@ -308,16 +314,18 @@ def _write_figures(
 
 
 def _draw(
-    folder: Path, found: Estimate, summary: Summary, config: TrainConfig, command: str
+    folder: Path, found: SequenceEstimate, summary: Summary, config: TrainConfig, command: str
 ) -> None:
     """Draw the picture and write the page, in the form of an evaluation's sequence."""
-    from gnio_jax.evaluation import page, plots, tabulate  # they take a second to import
+    from gnio_jax import drawing  # they take a second to import
+    from gnio_jax.evaluation import page, plots, tabulate
+    from gnio_jax.evaluation.views import make_view
 
-    seen = plots.view(found, alignment=None)
+    seen = make_view(found, alignment=None)
     length = f"{summary.path_length:.1f} m in {summary.seconds:.0f} s"
     expected = f"{summary.expected_error:.1f} m"
     title = f"{shown_name(summary.recording)}: {length}, expected error at the end {expected}"
-    plots.save(folder / "track.png", plots.sequence(seen, title))
+    drawing.save(folder / "track.png", plots.sequence(seen, title))
     aligned = "start position and yaw" if found.waypoints is None else tabulate.TO_WAYPOINTS
     known = np.isfinite(found.reference.position).all(axis=1).mean()
     partly = f"known for {known:.0%} of the time: errors and ratios are of this part"
@@ -334,13 +342,13 @@ def _draw(
     figures = {"accepted": None if summary.accepted is None else 100.0 * summary.accepted}
     # The figures are of the whole track, even if the reference covers only a part of it.
     figures |= summary.errors | {"duration": summary.seconds, "path_length": summary.path_length}
-    run = page.Run(
+    run = page.PageRun(
         "track",
         {name: text for name, text in about.items() if text},
         [seen],
         {seen.name: figures},
         warnings=summary.warnings,
         remarks=(summary.limits, *summary.notes),
-        settings=configuration.text(config),
+        settings=configuration.to_yaml(config),
     )
     page.write(folder / "report.html", summary.recording, [run])

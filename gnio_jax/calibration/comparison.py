@@ -6,12 +6,12 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-from gnio_jax.calibration.fit import evaluated_start
+from gnio_jax.calibration.fit import apply_start_settings
 from gnio_jax.config import ConsideredStd, CorrelatedError, DataConfig, FilterSettings
-from gnio_jax.evaluation import Displacements, Recording, estimate, score
+from gnio_jax.evaluation import Displacements, PreparedRecording, estimate, score
 from gnio_jax.evaluation.statistics import Scores, summarise
 from gnio_jax.evaluation.tabulate import column, number
-from gnio_jax.filtering import filter_setup
+from gnio_jax.filtering import make_filter
 
 METRICS = ("ate", "rpe_1s", "path_length_ratio")
 """Metrics that are compared, by their names in `metrics.json`."""
@@ -47,7 +47,7 @@ class Effect(NamedTuple):
             )
         worse = [metric for metric, change in self.errors.items() if is_worse(metric, change)]
         if worse:
-            figures = ", ".join(_spelled(metric, self.errors[metric]) for metric in worse)
+            figures = ", ".join(_spell_change(metric, self.errors[metric]) for metric in worse)
             lines.append(
                 f"these recordings have larger errors with the calibrated filter: {figures}; "
                 f"{REMEDY}"
@@ -65,14 +65,14 @@ def is_worse(metric: str, change: Change) -> bool:
     return after > before
 
 
-def _spelled(metric: str, change: Change) -> str:
+def _spell_change(metric: str, change: Change) -> str:
     heading, unit, digits, _ = column(metric)
     before, after = (number(mean, digits) for mean in change)
     return f"{heading} {before} -> {after} {unit}".rstrip()
 
 
 def compare_filters(
-    recordings: list[Recording],
+    recordings: list[PreparedRecording],
     displacements: list[Displacements],
     windows: DataConfig,
     before: FilterSettings,
@@ -87,19 +87,21 @@ def compare_filters(
     """
     # Recordings of two datasets may have one name.
     numbered = [recording._replace(name=str(k)) for k, recording in enumerate(recordings)]
-    scores = [_scores(numbered, displacements, windows, settings) for settings in (before, after)]
+    scores = [
+        _score_filter(numbered, displacements, windows, settings) for settings in (before, after)
+    ]
     groups = {recording.name: recording.group for recording in numbered}
     errors = {}
     for metric in METRICS:
         # With the filters as its seeds, a summary is over what has not diverged with either.
         means = summarise(scores, metric, groups).seeds
         errors[metric] = Change(*means) if means else Change(None, None)
-    diverged = (sum(measures.diverged for measures in of.values()) for of in scores)
+    diverged = (sum(measures.diverged for measures in row.values()) for row in scores)
     return Effect(errors, Change(*diverged), len(recordings))
 
 
-def _scores(
-    recordings: list[Recording],
+def _score_filter(
+    recordings: list[PreparedRecording],
     displacements: list[Displacements],
     windows: DataConfig,
     settings: FilterSettings,
@@ -109,8 +111,8 @@ def _scores(
     noise = settings.noise
     noise = noise._replace(correlation=noise.correlation or CorrelatedError(share=0.0))
     settings = dataclasses.replace(settings, noise=noise, considered=ConsideredStd())
-    started = [
-        recording._replace(start=evaluated_start(recording.start, settings))
+    restarted = [
+        recording._replace(start=apply_start_settings(recording.start, settings))
         for recording in recordings
     ]
-    return score(estimate(started, displacements, windows, filter_setup(windows, settings)))
+    return score(estimate(restarted, displacements, windows, make_filter(windows, settings)))

@@ -16,24 +16,24 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flat
+from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flatten
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate
-from gnio_jax.evaluation.estimate import Inputs
+from gnio_jax.evaluation import SequenceEstimate
+from gnio_jax.evaluation.estimate import BatchInputs
 from gnio_jax.evaluation.prepare import Start
 from gnio_jax.filtering import (
     ConsideredStd,
-    FilterConfig,
+    Filter,
     FilterHistory,
     FilterState,
     considered_covariance,
+    make_filter,
     over_sequences,
     run_filter,
     sensitivity,
 )
 from gnio_jax.filtering.history import POSITION
 from gnio_jax.filtering.settings import (
-    filter_config,
     free_parameters,
     with_free_parameters,
     with_written_parameters,
@@ -90,8 +90,8 @@ LEAST_FACTOR = 1e-3
 """Smallest factor of an axis (ours)."""
 
 
-def std_factors(
-    estimates: list[Estimate], truths: list[Float[np.ndarray, "m 3"]]
+def fit_std_factors(
+    estimates: list[SequenceEstimate], truths: list[Float[np.ndarray, "m 3"]]
 ) -> Float[np.ndarray, "3"]:
     """Root mean square of error over standard deviation, for each axis, over all windows.
 
@@ -112,7 +112,7 @@ def std_factors(
     return np.maximum(np.sqrt(np.mean(normalised**2, axis=0)), LEAST_FACTOR)
 
 
-class Fit(NamedTuple):
+class InnovationFit(NamedTuple):
     """The settings with the largest likelihood of the innovations."""
 
     settings: FilterSettings
@@ -134,7 +134,7 @@ def start_of_fit(settings: FilterSettings, paths: Sequence[str]) -> FilterSettin
     if "noise.correlation" in paths and not (correlation and correlation.share):
         noise = settings.noise._replace(correlation=CorrelatedError())
         settings = dataclasses.replace(settings, noise=noise)
-    values = flat(settings)
+    values = flatten(settings)
     for path in paths:
         if values.get(path) == 0:
             remedy = "leave its group out of --fit, or give the run a small value"
@@ -143,13 +143,13 @@ def start_of_fit(settings: FilterSettings, paths: Sequence[str]) -> FilterSettin
 
 
 def fit_innovations(
-    walks: Inputs,
+    walks: BatchInputs,
     windows: DataConfig,
     settings: FilterSettings,
     paths: Sequence[str],
     progress: Callable[[int], None],
     most_steps: int = 60,
-) -> Fit:
+) -> InnovationFit:
     """The settings that make the innovations most likely, by L-BFGS from `settings`; `paths` names
     those that are fitted.
 
@@ -159,16 +159,15 @@ def fit_innovations(
     free = free_parameters(settings, paths)
     names, start = tuple(free), np.array(list(free.values()))
     on_device = jax.device_put((walks, start, settings))
-    config = innovation_config(windows, settings)
-    evidences: list[float] = []
-    """Values of every call, the first of which is at the start."""
+    nlls: list[float] = []
+    """The −log-likelihood per innovation at each call, the first of which is at the start."""
 
     def evaluate(vector: np.ndarray) -> tuple[float, np.ndarray]:
-        call = _value_and_gradient(vector, *on_device, names=names, config=config)
-        (value, evidence), gradient = jax.device_get(call)
+        call = _value_and_gradient(vector, *on_device, names=names, windows=windows)
+        (value, nll), gradient = jax.device_get(call)
         sound = np.isfinite(value) and np.isfinite(gradient).all()
-        evidences.append(float(evidence) if sound else FAILED)
-        progress(len(evidences))
+        nlls.append(float(nll) if sound else FAILED)
+        progress(len(nlls))
         if not sound:
             return FAILED, np.zeros_like(vector)
         return float(value), np.asarray(gradient, float)
@@ -179,17 +178,17 @@ def fit_innovations(
     # from there continues, if the objective can still decrease.
     while True:
         limits = {"maxiter": most_steps - steps, "ftol": 1e-7}
-        search = minimize(evaluate, point, jac=True, method="L-BFGS-B", options=limits)
-        gain, point, least = least - search.fun, search.x, search.fun
-        steps += int(search.nit)
-        converged = search.success or (converged and gain < LEAST_GAIN)
-        if evidences[0] == FAILED:
+        result = minimize(evaluate, point, jac=True, method="L-BFGS-B", options=limits)
+        gain, point, least = least - result.fun, result.x, result.fun
+        steps += int(result.nit)
+        converged = result.success or (converged and gain < LEAST_GAIN)
+        if nlls[0] == FAILED:
             problem = "fails on these recordings with the settings of the run"
             raise InputError("the filter", problem)
         if gain < LEAST_GAIN or steps >= most_steps:
             break
     fitted = with_written_parameters(settings, dict(zip(names, point, strict=True)), DIGITS)
-    before = evidences[0]
+    before = nlls[0]
     evaluate(np.array(list(free_parameters(fitted, names).values())))
     warnings = []
     if steps >= most_steps and gain >= LEAST_GAIN:
@@ -202,13 +201,13 @@ def fit_innovations(
             f"the fit stopped after {steps} steps, because no step along the gradient made the "
             "innovations more likely; the settings are the best ones that it found"
         )
-    warnings += unphysical(fitted, names)
-    return Fit(fitted, before, evidences[-1], steps, tuple(warnings))
+    warnings += find_implausible(fitted, names)
+    return InnovationFit(fitted, before, nlls[-1], steps, tuple(warnings))
 
 
-def unphysical(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
-    """A sentence for each of these numbers that is outside the plausible range."""
-    values, lines = flat(settings), []
+def find_implausible(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
+    """A sentence for each of these settings that is outside its plausible range."""
+    values, lines = flatten(settings), []
     for name in (name for name in names if name in PHYSICAL):
         low, high = PHYSICAL[name]
         if not low <= values[name] <= high:
@@ -219,77 +218,80 @@ def unphysical(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
     return lines
 
 
-def innovation_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig:
+def innovation_filter(windows: DataConfig, settings: FilterSettings) -> Filter:
     """The filter whose innovations are evaluated: its gate accepts everything."""
-    return dataclasses.replace(
-        filter_config(windows, settings),
+    ekf = make_filter(windows, settings)
+    config = dataclasses.replace(
+        ekf.config,
         gate_threshold=NO_GATE,
         history="diagonal",
         checkpoint_every=CHECKPOINT_EVERY,
     )
+    return dataclasses.replace(ekf, config=config)
 
 
 def innovation_objective(
     free: Float[Array, "u"],
-    walks: Inputs,
+    walks: BatchInputs,
     start: Float[Array, "u"],
     settings: FilterSettings,
     *,
     names: tuple[str, ...],
-    config: FilterConfig,
+    windows: DataConfig,
 ) -> tuple[Array, Array]:
     """The objective to be minimised, as a function of the free parameters `names` of the settings,
     and its part that is the −log-likelihood of all innovations divided by their number. The rest is
     the prior about `start`, which keeps parameters in place that the walks do not determine."""
     chex.assert_equal_shape([free, start])
 
-    def of_walk(settings: FilterSettings, walk: Inputs) -> Array:
-        run, displacement = _repeated(walk, settings, config)
-        history = run(_wide_start(walk, settings).state(config), displacement)
+    def of_walk(settings: FilterSettings, walk: BatchInputs) -> Array:
+        ekf = innovation_filter(windows, settings)
+        run, displacement = _make_run(walk, ekf)
+        history = run(_wide_start(walk, settings).state(ekf), displacement)
         # The padding of the walk comes after its last displacement, where the filter may diverge.
         present = jnp.isfinite(displacement).all(axis=1)
         healthy = jnp.all((history.healthy > 0) | ~present)
         return jnp.where(healthy, jnp.nansum(history.log_likelihood), jnp.nan)
 
     settings = with_free_parameters(settings, dict(zip(names, free, strict=True)))
-    evidence = jnp.sum(over_sequences(of_walk, shared=1)(settings, walks))
-    assert walks.given is not None
-    count = jnp.isfinite(walks.given.value).all(axis=2).sum()
-    return (_prior(free, start) - evidence) / count, -evidence / count
+    log_likelihood = jnp.sum(over_sequences(of_walk, shared=1)(settings, walks))
+    assert walks.displacements is not None
+    count = jnp.isfinite(walks.displacements.value).all(axis=2).sum()
+    return (_prior(free, start) - log_likelihood) / count, -log_likelihood / count
 
 
 _value_and_gradient = jax.jit(
-    jax.value_and_grad(innovation_objective, has_aux=True), static_argnames=("names", "config")
+    jax.value_and_grad(innovation_objective, has_aux=True), static_argnames=("names", "windows")
 )
 
 
-def evaluated_start(start: Start, settings: FilterSettings) -> Start:
-    """The start as an evaluation with the settings has it, of a recording that starts from its
-    reference."""
+def apply_start_settings(start: Start, settings: FilterSettings) -> Start:
+    """The start of a recording with the uncertainty that an evaluation gives it, if it starts from
+    its reference."""
     level = settings.start.gyro_bias
     if settings.raw_gyro_bias is not None:
         level = jnp.where(start.raw_gyro, settings.raw_gyro_bias, level)
     return start._replace(std=settings.start, level_gyro_bias=level)
 
 
-def _wide_start(walk: Inputs, settings: FilterSettings) -> Start:
+def _wide_start(walk: BatchInputs, settings: FilterSettings) -> Start:
     """The start with all components of a raw gyro's bias uncertain (ours). Otherwise the fit would
     explain an unknown vertical component by noise."""
-    start = evaluated_start(walk.start, settings)
+    start = apply_start_settings(walk.start, settings)
     return start._replace(std=start.std._replace(gyro_bias=start.level_gyro_bias))
 
 
-def _repeated(
-    walk: Inputs, settings: FilterSettings, config: FilterConfig
+def _make_run(
+    walk: BatchInputs, ekf: Filter
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], Array]:
-    """The run over one walk without the network, as a function of a start and displacements, with
-    the displacements of the walk."""
-    assert walk.given is not None
-    value, covariance, _ = walk.given
-    fixed = config, settings.noise, walk.imu_valid, config.displacement_frame
+    """The function that runs the filter over one walk, given a start and displacements, and the
+    displacements of the walk."""
+    assert walk.displacements is not None
+    value, covariance, _ = walk.displacements
+    options = walk.imu_valid, ekf.config.displacement_frame
 
     def run(state: FilterState, displacement: Array) -> FilterHistory:
-        return run_filter(state, walk.gyro, walk.accel, displacement, covariance, *fixed)[1]
+        return run_filter(ekf, state, walk.gyro, walk.accel, displacement, covariance, *options)[1]
 
     return run, jnp.asarray(value)
 
@@ -299,7 +301,7 @@ def _prior(free: Float[Array, "u"], start: Float[Array, "u"]) -> Float[Array, ""
     return 0.5 * jnp.sum(((free - start) / PRIOR_STD) ** 2)
 
 
-class Considered(NamedTuple):
+class ConsiderFit(NamedTuple):
     """The standard deviations of the errors that the filter does not estimate."""
 
     settings: FilterSettings
@@ -309,8 +311,8 @@ class Considered(NamedTuple):
     """The same with `settings`."""
 
 
-class Positions(NamedTuple):
-    """Positions of all recordings that have a reference, as rows."""
+class PositionErrors(NamedTuple):
+    """The errors of all positions with a reference, in rows over all recordings."""
 
     error: Float[np.ndarray, "k 3"]
     """Truth − estimate, m."""
@@ -323,10 +325,10 @@ class Positions(NamedTuple):
 
 
 def fit_considered(
-    positions: Positions, stride_seconds: float, settings: FilterSettings
-) -> Considered:
-    """The standard deviations of the errors that the filter does not estimate which make the errors
-    of its positions most likely; there is a position every `stride_seconds`.
+    positions: PositionErrors, stride_seconds: float, settings: FilterSettings
+) -> ConsiderFit:
+    """Maximum-likelihood consider standard deviations, given the errors of positions, one every
+    `stride_seconds`.
 
     The search always begins at `CONSIDERED`. Recordings with a raw gyro determine only the further
     error of raw gyros, because the yaw that they lose would be attributed to the displacements. If
@@ -338,15 +340,15 @@ def fit_considered(
     raw = positions.raw_axis.any(axis=1)
     mixed = raw.any() and not raw.all()
     initial = CONSIDERED._replace(raw_gyro_bias=0.0)
-    fitted = _most_likely_considered(
-        Positions(*(part[~raw] for part in positions)) if mixed else positions,
+    fitted = _fit_considered_below(
+        PositionErrors(*(part[~raw] for part in positions)) if mixed else positions,
         stride_seconds,
         dataclasses.replace(settings, considered=initial),
         "considered",
     )
     if mixed:
         initial = fitted.considered._replace(raw_gyro_bias=CONSIDERED.raw_gyro_bias)
-        fitted = _most_likely_considered(
+        fitted = _fit_considered_below(
             positions,
             stride_seconds,
             dataclasses.replace(settings, considered=initial),
@@ -354,13 +356,13 @@ def fit_considered(
         )
     before, after = (
         float(jnp.mean(normalised_squares(positions.error, covariance))) / 3
-        for covariance in (positions.covariance, _reported(positions, fitted.considered))
+        for covariance in (positions.covariance, _add_considered(positions, fitted.considered))
     )
-    return Considered(fitted, before, after)
+    return ConsiderFit(fitted, before, after)
 
 
-def _most_likely_considered(
-    positions: Positions, stride_seconds: float, settings: FilterSettings, path: str
+def _fit_considered_below(
+    positions: PositionErrors, stride_seconds: float, settings: FilterSettings, path: str
 ) -> FilterSettings:
     """`settings` with the most likely values of the numbers below `path`."""
     free = free_parameters(settings, [path])
@@ -369,7 +371,7 @@ def _most_likely_considered(
 
     def objective(free: Float[Array, "u"]) -> Array:
         std = with_free_parameters(settings, dict(zip(names, free, strict=True))).considered
-        likelihood = gaussian_nll(positions.error, _reported(positions, std))
+        likelihood = gaussian_nll(positions.error, _add_considered(positions, std))
         return likelihood + _prior(free, start) / independent
 
     compiled = jax.jit(jax.value_and_grad(objective))
@@ -381,38 +383,40 @@ def _most_likely_considered(
     return with_written_parameters(settings, dict(zip(names, search.x, strict=True)), DIGITS)
 
 
-def _reported(positions: Positions, std: ConsideredStd) -> Array:
+def _add_considered(positions: PositionErrors, std: ConsideredStd) -> Array:
     """The covariances of the positions, with the consider covariance."""
     added = considered_covariance(positions.sensitivity, std, positions.raw_axis)
     return positions.covariance + added
 
 
-def filtered_positions(
-    walks: Inputs, truth: Float[np.ndarray, "w k 3"], windows: DataConfig, settings: FilterSettings
-) -> Positions:
-    """The positions of a filter over the walks, where it is healthy.
+def compare_positions(
+    walks: BatchInputs,
+    truth: Float[np.ndarray, "w k 3"],
+    windows: DataConfig,
+    settings: FilterSettings,
+) -> PositionErrors:
+    """Compare the positions of a filter over the walks with the true ones, where it is healthy.
 
     `truth` has the true positions after each stride, m; NaN where there is none.
     """
-    healthy, position, *parts = jax.device_get(
-        _filtered(walks, settings, config=filter_config(windows, settings))
-    )
+    healthy, position, *parts = jax.device_get(_run_walks(walks, settings, windows=windows))
     error = truth - position
     compared = np.isfinite(error).all(axis=2) & (healthy > 0)
-    return Positions(*(part[compared] for part in (error, *parts)))
+    return PositionErrors(*(part[compared] for part in (error, *parts)))
 
 
-@functools.partial(jax.jit, static_argnames="config")
-def _filtered(
-    walks: Inputs, settings: FilterSettings, *, config: FilterConfig
+@functools.partial(jax.jit, static_argnames="windows")
+def _run_walks(
+    walks: BatchInputs, settings: FilterSettings, *, windows: DataConfig
 ) -> tuple[Array, Array, Array, Array, Array]:
     """For every walk: where the filter is healthy, its positions, their covariances and S, and the
     axis of a raw gyro."""
 
-    def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
-        start = evaluated_start(walk.start, settings)
-        state = start.state(config)
-        run, displacement = _repeated(walk, settings, config)
+    def of_walk(settings: FilterSettings, walk: BatchInputs) -> tuple[Any, ...]:
+        ekf = make_filter(windows, settings)
+        start = apply_start_settings(walk.start, settings)
+        state = start.state(ekf)
+        run, displacement = _make_run(walk, ekf)
         history = run(state, displacement)
         derivatives = sensitivity(run, state, displacement)
         assert history.covariance is not None

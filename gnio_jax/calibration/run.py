@@ -12,18 +12,18 @@ import numpy as np
 
 from gnio_jax import config as configuration
 from gnio_jax.calibration.comparison import Effect, compare_filters
-from gnio_jax.calibration.evidence import OnStage, gather, load_run, sources
 from gnio_jax.calibration.fit import (
     DIGITS,
     GROUPS,
-    Considered,
-    Fit,
-    filtered_positions,
+    ConsiderFit,
+    InnovationFit,
+    compare_positions,
     fit_considered,
     fit_innovations,
+    fit_std_factors,
     start_of_fit,
-    std_factors,
 )
+from gnio_jax.calibration.predictions import OnStage, choose_networks, load_run, predict
 from gnio_jax.config import CalibrateConfig, ConsideredStd, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Displacements
@@ -45,11 +45,11 @@ class Calibration(NamedTuple):
     """The result of `calibrate` and its folder."""
 
     before: FilterSettings
-    fit: Fit
-    considered: Considered
-    """The fit, with the settings of the calibrated run."""
+    innovation_fit: InnovationFit
+    consider_fit: ConsiderFit
+    """The last fit, with the settings of the calibrated run."""
     effect: Effect
-    """What it does to the trajectories of its recordings."""
+    """The errors of the trajectories with both filters."""
     recordings: int
     raw_gyros: int
     """Number of recordings with a raw gyro."""
@@ -66,7 +66,7 @@ class Calibration(NamedTuple):
             for group, count in groups.items()
             if 0 < count < LEAST_RECORDINGS
         )
-        return (*self.fit.warnings, *self.effect.warnings, *few)
+        return (*self.innovation_fit.warnings, *self.effect.warnings, *few)
 
 
 def calibrate(
@@ -92,27 +92,27 @@ def calibrate(
     paths = [path for group in dict.fromkeys(config.fit) for path in GROUPS[group]]
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
     run = load_run(workdir, config)
-    folder = _folder(config, workdir)
-    split, networks = sources(run, config)
+    folder = _choose_folder(config, workdir)
+    split, networks = choose_networks(run, config)
     windows = run.config.data
     noise = run.config.filter.noise._replace(measurement_scale=1.0, std_factor=(1.0, 1.0, 1.0))
     # Consider covariance changes no estimate, and is fitted last.
     uncalibrated = dataclasses.replace(run.config.filter, noise=noise, considered=ConsideredStd())
     start_of_fit(uncalibrated, paths)  # finds mistakes before reading data
-    recordings, estimates = gather(split, networks, config, uncalibrated, progress, workers)
+    recordings, estimates = predict(split, networks, config, uncalibrated, progress, workers)
     try:
-        factors = std_factors(estimates, [recording.displacement for recording in recordings])
+        factors = fit_std_factors(estimates, [recording.displacement for recording in recordings])
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
     x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as written to the settings
     noise = noise._replace(std_factor=(x, y, z))
     settings = start_of_fit(dataclasses.replace(uncalibrated, noise=noise), paths)
     strides = max(recording.strides for recording in recordings)
-    # The first row of an estimate is its start. That of a network has displacements.
+    # The first row of an estimate is its start.
     rows = [estimate.displacements for estimate in estimates if estimate.displacements is not None]
     displacements = [Displacements(value[1:], covariance[1:]) for value, covariance, _ in rows]
     walks = filter_inputs(recordings, displacements, strides, filter_config(windows, settings))
-    fit = fit_innovations(
+    innovation_fit = fit_innovations(
         walks,
         windows,
         settings,
@@ -123,19 +123,19 @@ def calibrate(
     progress("considering", 0.0)
     references = (recording.reference.position[1:] for recording in recordings)
     truth = np.stack([filled_up(reference, strides, np.nan) for reference in references])
-    positions = filtered_positions(walks, truth, windows, fit.settings)
-    considered = fit_considered(positions, windows.stride_seconds, fit.settings)
+    positions = compare_positions(walks, truth, windows, innovation_fit.settings)
+    consider_fit = fit_considered(positions, windows.stride_seconds, innovation_fit.settings)
     progress("comparing", 0.0)
     before = run.config.filter
-    effect = compare_filters(recordings, displacements, windows, before, considered.settings)
+    effect = compare_filters(recordings, displacements, windows, before, consider_fit.settings)
     progress("comparing", 1.0)
-    raw = sum(bool(recording.start.raw_gyro) for recording in recordings)
-    calibration = Calibration(before, fit, considered, effect, len(recordings), raw, folder)
+    counts = len(recordings), sum(bool(recording.start.raw_gyro) for recording in recordings)
+    calibration = Calibration(before, innovation_fit, consider_fit, effect, *counts, folder)
     _write(calibration, workdir, run, config, split)
     return calibration
 
 
-def _folder(config: CalibrateConfig, workdir: Path) -> Path:
+def _choose_folder(config: CalibrateConfig, workdir: Path) -> Path:
     if (workdir / RECORD).exists():
         remedy = "calibrate the run that it was made from"
         raise InputError(workdir, "is a calibrated run", remedy)
@@ -153,9 +153,9 @@ def _write(
     config: CalibrateConfig,
     split: str,
 ) -> None:
-    """The run with its new settings, its checkpoint, and what was fitted."""
-    fit, effect = calibration.fit, calibration.effect
-    settings = calibration.considered.settings
+    """Write the run with its new settings, its checkpoint, and the record of the fit."""
+    fit, effect = calibration.innovation_fit, calibration.effect
+    settings = calibration.consider_fit.settings
     record: dict[str, Any] = {
         "run": str(workdir),
         "split": split,
@@ -168,14 +168,14 @@ def _write(
         "steps": fit.steps,
         "warnings": list(calibration.warnings),
         "position_nees_per_axis": {
-            "before": calibration.considered.before,
-            "after": calibration.considered.after,
+            "before": calibration.consider_fit.before,
+            "after": calibration.consider_fit.after,
         },
         "trajectories": {
             **{metric: change._asdict() for metric, change in effect.errors.items()},
             "diverged": effect.diverged._asdict(),
         },
-        "filter": configuration.plain(settings),
+        "filter": configuration.to_plain(settings),
     }
     with replacing_folder(calibration.folder) as new:
         experiment = dataclasses.replace(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gnio_jax.calibration.comparison import Effect
 
 
-def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
+def calibrate(request: CalibrateConfig, _call: options.Call) -> None:
     """Fit the filter of a run to its validation split, and write a run with it.
 
     A network's errors are smaller on its training walks than on other walks, so the filter is
@@ -37,23 +37,24 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
 
     console.prepare_filter()
     with console.terminal() as terminal:
-        result = calibration.calibrate(asked, terminal.progress, usable_cores())
-    table, before = Table("filter", "before", "calibrated"), configuration.flat(result.before)
-    for name, value in configuration.flat(result.considered.settings).items():
+        result = calibration.calibrate(request, terminal.progress, usable_cores())
+    table, before = Table("filter", "before", "calibrated"), configuration.flatten(result.before)
+    for name, value in configuration.flatten(result.consider_fit.settings).items():
         if value != before.get(name):
-            table.add_row(name, _spelled(before.get(name)), _spelled(value))
+            table.add_row(name, _spell(before.get(name)), _spell(value))
     console.say(table)
     console.say(_trajectories(result.effect))
     others = result.recordings - result.raw_gyros
+    fit, nees = result.innovation_fit, result.consider_fit
     console.say(f"recordings: {result.raw_gyros} with a raw gyro, {others} without")
     console.say(
-        f"negative log-likelihood of an innovation: {result.fit.before:.4f} after the factors of "
-        f"the axes, {result.fit.after:.4f} after the fit ({result.recordings} recordings, "
-        f"{result.fit.steps} steps)"
+        f"negative log-likelihood of an innovation: {fit.before:.4f} after the factors of "
+        f"the axes, {fit.after:.4f} after the fit ({result.recordings} recordings, "
+        f"{fit.steps} steps)"
     )
     console.say(
         "squared error of the position over the variance that the filter reports, per axis: "
-        f"{result.considered.before:.2f} -> {result.considered.after:.2f} with consider covariance"
+        f"{nees.before:.2f} -> {nees.after:.2f} with consider covariance"
     )
     for warning in result.warnings:
         console.warn(warning)
@@ -73,7 +74,7 @@ def _trajectories(effect: Effect) -> Table:
     return table
 
 
-def _spelled(value: Any) -> str:
+def _spell(value: Any) -> str:
     """The text of a setting in a cell: one number, several, or none if it is switched off."""
     if value is None:
         return "none"

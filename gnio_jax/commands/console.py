@@ -37,11 +37,14 @@ def run(main: Callable[[], object]) -> None:
     """Call `main()` and exit with the shell's exit statuses.
 
     A user's mistake (`InputError`), a full disk or a folder that may not be written is one line on
-    stderr and status 2; Ctrl-C gives status 130. SIGTERM ends the program like an exception, so
-    that no incomplete file remains, and gives status 143. A warning is one line on stderr. Any
-    other exception is an error of the program and keeps its traceback.
+    stderr and status 2, and so is a variable of JAX that cannot be followed; Ctrl-C gives status
+    130. SIGTERM ends the program like an exception, so that no incomplete file remains, and gives
+    status 143. A warning is one line on stderr. Any other exception is an error of the program and
+    keeps its traceback.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    # Pictures are files. The backend of a notebook, which its commands inherit, may be missing.
+    os.environ["MPLBACKEND"] = "agg"
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may have any bytes
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -63,6 +66,28 @@ def run(main: Callable[[], object]) -> None:
         if error.errno not in _DISK_ERRORS:
             raise
         _leave(f"{error.filename or 'output'}: {error.strerror}", 2)
+    except FloatingPointError:
+        if not os.environ.get("JAX_DEBUG_NANS"):
+            raise
+        _leave("JAX_DEBUG_NANS: gnio marks missing values by NaN, which it refuses; unset it", 2)
+    except (AssertionError, RuntimeError):
+        if (problem := lacking_device()) is None:
+            raise
+        _leave(problem, 2)
+
+
+def lacking_device() -> str | None:
+    """Why JAX has no device, if JAX_PLATFORMS names a platform that is not here; None if it has
+    one."""
+    import jax
+
+    try:
+        jax.devices()
+        return None
+    except (AssertionError, RuntimeError):  # an assertion where the platform's plugin is missing
+        problem = f"JAX has no device of the platform '{os.environ.get('JAX_PLATFORMS')}' here"
+        remedy = "unset it to use the CPU; a GPU needs pip install -U 'jax[cuda13]'"
+        return f"JAX_PLATFORMS: {problem}; {remedy}"
 
 
 def warn_of_other_sources() -> None:

@@ -77,7 +77,7 @@ def show_list(request: ListOptions, _call: options.Call) -> None:
 
 def _describe_root(dataset: Any) -> str:
     """The folder of a `Dataset`, and the recordings of each split."""
-    from gnio_jax.data.loading import find_recordings
+    from gnio_jax.data.conversion import find_recordings
 
     try:
         _, root = _find(dataset.name, None)
@@ -105,12 +105,12 @@ def check(request: CheckOptions, _call: options.Call) -> None:
       {prog} tlio --data-root ~/tlio --split test
       {prog} csv --data-root ~/walks --plots pictures --json figures.json
     """
-    from gnio_jax.data import loading  # late: mistakes do not wait for JAX
+    from gnio_jax.data import conversion  # late: mistakes do not wait for JAX
 
     dataset, root = _find(request.name, request.data_root)
     with console.terminal() as terminal:
         progress = partial(terminal.progress, "checking")
-        rows, notes = loading.check(dataset, root, request.split, request.plots, None, progress)
+        rows, notes = conversion.check(dataset, root, request.split, request.plots, None, progress)
     location = f" at {root}" if dataset.needs_root else ""
     title = f"{dataset.name}{location}, split {request.split}"
     table = console.columns("sequence", "split", title=title, title_justify="left")
@@ -161,7 +161,7 @@ _FIGURES: dict[str, Callable[[Any], str]] = {
 
 
 def _json(row: Any) -> dict[str, Any]:
-    """A `loading.CheckResult` for a JSON file, which has no arrays and no NaN."""
+    """A `conversion.CheckResult` for a JSON file, which has no arrays and no NaN."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Iterable) and not isinstance(value, str):
@@ -184,12 +184,12 @@ def convert(request: ConvertOptions, _call: options.Call) -> None:
       {prog} tlio ~/converted/tlio_100 --data-root ~/tlio --rate 100
       gnio train --dataset csv --data-root ~/converted/oxiod
     """
-    from gnio_jax.data import loading  # late: mistakes do not wait for JAX
+    from gnio_jax.data import conversion  # late: mistakes do not wait for JAX
 
     dataset, root = _find(request.name, request.data_root)
     with console.terminal() as terminal:
         progress = partial(terminal.progress, "converting")
-        result = loading.convert(
+        result = conversion.convert(
             dataset, root, request.out, request.split, request.rate, None, progress
         )
     _print_reasons(result.left_out, result.notes)

@@ -57,11 +57,10 @@ def _devices() -> dict[str, str]:
     import jax.numpy as jnp
 
     jax.config.update("jax_enable_x64", True)  # as in every command with the filter
-    try:
-        kinds = [f"{device.platform} {device.device_kind}" for device in jax.devices()]
-        third = float(jnp.asarray(1.0, jnp.float64) / 3.0)
-    except RuntimeError as error:  # a requested platform that does not exist
-        return {"devices": f"none: {error}"}
+    if problem := console.lacking_device():
+        return {"devices": f"none: {problem}"}
+    kinds = [f"{device.platform} {device.device_kind}" for device in jax.devices()]
+    third = float(jnp.asarray(1.0, jnp.float64) / 3.0)
     counts = ", ".join(f"{kinds.count(kind)} × {kind}" for kind in dict.fromkeys(kinds))
     facts = {"devices": counts, "float64": "works" if third == 1 / 3 else "does not work"}
     if jax.default_backend() == "cpu" and Path("/proc/driver/nvidia").exists():

@@ -166,7 +166,7 @@ def read(command: Command, call: Call, default: Any = None) -> Any:
         option = options[dest]
         if not isinstance(value, bool):
             words = [value] if isinstance(value, str) else value
-            value = configuration.value_from_words(option.hint, words, option.name)
+            value = configuration.parse_words(option.hint, words, option.name)
         name, *inner = option.path
         if inner:
             section = values.get(name, option.section())
@@ -203,7 +203,7 @@ def _parser(
     command: Command, prog: str, options: dict[str, Option], brief: bool
 ) -> argparse.ArgumentParser:
     """The parser that splits the words of these options and writes their help."""
-    configs = ", ".join(configuration.names())
+    configs = ", ".join(configuration.experiment_names())
     text = (inspect.getdoc(command) or "").format(prog=prog, configs=configs)
     description, _, examples = text.partition("\nexamples:\n")
     width = min(WIDTH, shutil.get_terminal_size().columns)

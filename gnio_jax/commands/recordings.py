@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
@@ -63,7 +63,7 @@ def import_file(request: ImportFile, _call: options.Call) -> None:
     )
     importing.write_imported(request.out, recording)
     sequence = recording.sequence
-    lines = [*recording.notes, *importing.impressions(sequence)]
+    lines = [*recording.notes, *_impressions(sequence)]
     start = "" if sequence.valid.any() else " --init static"
     following = f"gnio evaluate --dataset csv --data-root {folder} --split test{start}"
     lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
@@ -90,6 +90,26 @@ def import_file(request: ImportFile, _call: options.Call) -> None:
     for warning in recording.warnings:
         console.say(f"warning: {warning}")
     console.say(f"next: {following}")
+
+
+def _impressions(sequence: Any) -> list[str]:
+    """Lines that a person can compare with the recording: length, magnitudes, rest."""
+    import numpy as np
+
+    time = sequence.time
+    step = float(np.median(np.diff(time)))
+    accel, gyro = (np.linalg.norm(field, axis=1) for field in (sequence.accel, sequence.gyro))
+    lines = [
+        f"{time[-1] - time[0]:.1f} s at {1.0 / step:.4g} Hz",
+        f"|accel| {np.median(accel):.2f} m/s² in the median, up to {accel.max():.2f}",
+        f"|gyro| {np.median(gyro):.2f} rad/s in the median, up to {gyro.max():.2f}",
+    ]
+    span = max(round(0.5 / step), 1)
+    if count := len(accel) // span:
+        accel, gyro = (norm[: count * span].reshape(count, span) for norm in (accel, gyro))
+        still = (accel.std(axis=1) < 0.2) & (gyro.mean(axis=1) < 0.1)
+        lines.append(f"it rests {still.mean():.0%} of the time")
+    return lines
 
 
 def export_file(request: ExportFile, _call: options.Call) -> None:

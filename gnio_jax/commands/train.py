@@ -95,7 +95,7 @@ def experiment(request: TrainOptions, call: options.Call) -> TrainConfig:
     settings of the file or of --set. The consider covariance of that filter is not used, because it
     belongs to another covariance than the one that will be trained.
     """
-    file = None if request.config is None else configuration.find(request.config)
+    file = None if request.config is None else configuration.find_experiment(request.config)
     content = None if file is None else configuration.read(file)  # once, as it may be a pipe
 
     def combine(base: TrainConfig) -> TrainConfig:
@@ -110,7 +110,7 @@ def experiment(request: TrainOptions, call: options.Call) -> TrainConfig:
     if request.resume and saved.exists():
         earlier = configuration.load(saved)
         if file is None:
-            file, content = saved, configuration.text(earlier)
+            file, content = saved, configuration.to_yaml(earlier)
         resumed = combine(TrainConfig(filter=earlier.filter))
         return dataclasses.replace(resumed, workdir=config.workdir)  # not that of the first seed
     if not config.through_filter.learn or config.init_from is None:

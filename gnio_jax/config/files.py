@@ -4,12 +4,11 @@ runs and of the experiments that come with the package."""
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 import reprlib
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -19,10 +18,8 @@ from yaml.constructor import ConstructorError
 
 from gnio_jax.config.schema import (
     Bound,
-    ConsideredStd,
-    InitialStd,
-    NoiseModel,
-    Place,
+    Entries,
+    Location,
     TrainConfig,
 )
 from gnio_jax.errors import InputError, did_you_mean
@@ -44,17 +41,17 @@ _SPELLING = {
 # ------------------------------------------------------------------------------------------------
 
 
-def names() -> list[str]:
+def experiment_names() -> list[str]:
     """Names of the experiments that come with the package, such as quickstart, baselines/tlio."""
-    return list(_packaged())
+    return list(_package_files())
 
 
-def find(config: str | Path) -> Path:
-    """The file of `config`: a path, the folder of a run, or a name of `names()`.
+def find_experiment(config: str | Path) -> Path:
+    """The file of `config`: a path, the folder of a run, or a name of `experiment_names()`.
 
     Raises `InputError` that suggests the closest name if it is none of these.
     """
-    path, packaged = Path(config), _packaged()
+    path, packaged = Path(config), _package_files()
     if path.is_file():
         return path
     if str(config) in packaged:
@@ -62,12 +59,12 @@ def find(config: str | Path) -> Path:
     if path.exists():  # a pipe is read; a folder without a run is refused later
         return path / "config.yaml" if (path / "config.yaml").is_file() else path
     by_stem = {Path(name).stem: name for name in packaged}
-    known = f"give a file, or one of the package's own: {', '.join(packaged)}"
+    choices = f"give a file, or one of the package's own: {', '.join(packaged)}"
     hint = did_you_mean(path.stem, by_stem, by_stem.get)
-    raise InputError(config, "no such config file", hint + known)
+    raise InputError(config, "no such config file", hint + choices)
 
 
-def _packaged() -> dict[str, Path]:
+def _package_files() -> dict[str, Path]:
     """Files of the package's experiments by name: beside the modules of an installed package, or at
     the top of a checkout."""
     package = Path(__file__).parents[1]
@@ -94,7 +91,7 @@ def with_seeds(config: TrainConfig, seeds: Sequence[int]) -> list[TrainConfig]:
     return [dataclasses.replace(config, seed=seed, workdir=f"{folder}_s{seed}") for seed in seeds]
 
 
-def without_places(config: TrainConfig) -> TrainConfig:
+def without_paths(config: TrainConfig) -> TrainConfig:
     """The experiment without the paths of its folders and of the runs that it begins with: a
     resumed run may have other paths, and a package has none."""
     windows = dataclasses.replace(config.data, poses_by=None)
@@ -105,8 +102,8 @@ def without_places(config: TrainConfig) -> TrainConfig:
 def newest_run(folder: str | Path = "runs") -> Path:
     """The run below `folder` that was trained last; calibrated copies of a run do not count. Raises
     `InputError` if there is none."""
-    found = [path.parent for path in Path(folder).glob("*/config.yaml")]
-    runs = [run for run in found if not (run / "calibration.json").exists()]
+    folders = [path.parent for path in Path(folder).glob("*/config.yaml")]
+    runs = [run for run in folders if not (run / "calibration.json").exists()]
     if not runs:
         remedy = "train one with gnio train, or name its folder with --workdir"
         raise InputError(folder, "holds no run", remedy)
@@ -136,18 +133,16 @@ def load(path: str | Path, base: TrainConfig | None = None) -> TrainConfig:
 
     Raises `InputError` on a missing or empty file, an unknown key or a wrong type.
     """
-    path = find(path)
+    path = find_experiment(path)
     return parse(read(path), str(path), base)
 
 
 def parse(content: str, source: str, base: TrainConfig | None = None) -> TrainConfig:
     """`load` of a file's text; `source` names the file in errors."""
-    fields = _yaml(content, source)
+    fields = _parse_yaml(content, source)
     if fields is None:
         raise InputError(source, "is empty", "write settings into it, e.g. seed: 0")
-    if _is_of_earlier_version(fields):
-        fields = _of_earlier_version(fields, source)
-    return _section(base or TrainConfig(), fields, Place(source))
+    return _read_section(base or TrainConfig(), fields, Location(source))
 
 
 def assign(config: Section, assignments: Sequence[str]) -> Section:
@@ -161,14 +156,14 @@ def assign(config: Section, assignments: Sequence[str]) -> Section:
         if not (equals and name):
             remedy = "write section.field=value, e.g. optim.epochs=3"
             raise InputError(f"'{assignment}'", "is not a setting", remedy)
-        content = _yaml(text, assignment)
+        content = _parse_yaml(text, assignment)
         for part in reversed(name.strip().split(".")):
             content = {part: content}
-        config = _section(config, content, Place(assignment))
+        config = _read_section(config, content, Location(assignment))
     return config
 
 
-def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
+def parse_words(hint: Any, words: Sequence[str], name: str) -> Any:
     """The value of a field of the type `hint` from the words after the option `name` on a command
     line: one word, or as many as a tuple has values. Texts are the words themselves, numbers are
     read as in YAML, and null is None.
@@ -180,26 +175,28 @@ def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
         return None
     several = typing.get_origin(kind) is tuple
     item = kind_of(typing.get_args(kind)[0]) if several else kind
-    is_text = item in (str, Path) or any(isinstance(each, str) for each in typing.get_args(item))
-    content = [word if is_text else _yaml(word, name) for word in words]
+    is_text = item in (str, Path) or any(
+        isinstance(choice, str) for choice in typing.get_args(item)
+    )
+    content = [word if is_text else _parse_yaml(word, name) for word in words]
     one = len(content) == 1 and item in kinds
-    return checked_value(hint, content[0] if one else content, Place(name))
+    return check_value(hint, content[0] if one else content, Location(name))
 
 
-def _section(base: Any, content: Any, place: Place) -> Any:
+def _read_section(base: Any, content: Any, location: Location) -> Any:
     """The section `base` with the fields of a mapping."""
     if not isinstance(content, dict):
-        problem = f"{place.field or 'the file'} must be a mapping of fields"
-        raise InputError(place.source, f"{problem}, found {_shown(content)}")
+        problem = f"{location.field or 'the file'} must be a mapping of fields"
+        raise InputError(location.source, f"{problem}, found {_show(content)}")
     hints = typing.get_type_hints(type(base), include_extras=True)
     for key in content:
         if key not in hints:
-            hint = did_you_mean(str(key), hints, lambda name: place.below(name).field)
-            name = place.below(_shown(key).strip("'")).field
-            known = f"known fields: {', '.join(hints)}"
-            raise InputError(place.source, f"unknown field '{name}'", hint.strip() or known)
+            hint = did_you_mean(str(key), hints, lambda name: location.child(name).field)
+            name = location.child(_show(key).strip("'")).field
+            choices = f"known fields: {', '.join(hints)}"
+            raise InputError(location.source, f"unknown field '{name}'", hint.strip() or choices)
     fields = {
-        key: checked_value(hints[key], value, place.below(key), getattr(base, key))
+        key: check_value(hints[key], value, location.child(key), getattr(base, key))
         for key, value in content.items()
     }
     if isinstance(base, tuple):
@@ -207,52 +204,68 @@ def _section(base: Any, content: Any, place: Place) -> Any:
     return dataclasses.replace(base, **fields)
 
 
-def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> Any:
+def check_value(hint: Any, content: Any, location: Location, base: Any = None) -> Any:
     """The value of a field of the type `hint`, if it has this type and is within its bounds. A
     section takes fields that are not in `content` from `base`. Raises `InputError`."""
     kinds, is_list = kinds_of(hint), isinstance(content, list | tuple)
     if content is None and type(None) in kinds:
         return None
-    kind = next((each for each in kinds if (typing.get_origin(each) is tuple) == is_list), kinds[0])
+    fitting = (kind for kind in kinds if (typing.get_origin(kind) is tuple) == is_list)
+    kind = type(content) if type(content) in kinds else next(fitting, kinds[0])
     origin, members = typing.get_origin(kind), typing.get_args(kind)
     if is_section(kind):
-        return _section(kind() if base is None else base, content, place)
+        return _read_section(kind() if base is None else base, content, location)
+    if origin is Mapping:
+        return _read_mapping(members[1], content, location, base or {})
     if origin is tuple and isinstance(content, list | tuple):
         if ... not in members and len(content) != len(members):
-            place.refuse(f"must be a list of {len(members)} values, found {_shown(content)}")
-        value = tuple(checked_value(members[0], each, place) for each in content)
+            location.refuse(f"must be a list of {len(members)} values, found {_show(content)}")
+        value = tuple(check_value(members[0], item, location) for item in content)
     elif kind in (float, Any) and type(content) in (int, float):
         try:
             value = float(content)
         except OverflowError:
-            place.refuse("is larger than any number of floating point")
+            location.refuse("is larger than any number of floating point")
     elif kind is Path and isinstance(content, str):
         value = Path(content)
     elif type(content) is kind or any(content == m and type(content) is type(m) for m in members):
         value = content
     else:
         remedy = did_you_mean(str(content), map(str, members)) if origin is Literal else ""
-        problem = f"must be {' or '.join(map(_spelled, kinds))}, found {_shown(content)}"
-        place.refuse(problem, remedy.strip())
-    _check_bounds(hint, value, place)
+        problem = f"must be {' or '.join(map(_spell, kinds))}, found {_show(content)}"
+        location.refuse(problem, remedy.strip())
+    _check_bounds(hint, value, location)
     return value
 
 
-def _check_bounds(hint: Any, value: Any, place: Place) -> None:
+def _read_mapping(hint: Any, content: Any, location: Location, base: Mapping) -> Entries:
+    """The mapping `base` with the entries of another one, whose values have the type `hint`; an
+    entry that is null goes."""
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        location.refuse(f"must be a mapping of names, found {_show(content)}")
+    entries = dict(base)
+    for key, value in content.items():
+        entries[key] = check_value(hint, value, location.child(key), entries.get(key))
+        if entries[key] is None:
+            del entries[key]
+    return Entries(entries)
+
+
+def _check_bounds(hint: Any, value: Any, location: Location) -> None:
     for bound in bounds(hint):
         for number in value if isinstance(value, tuple) else (value,):
             if number is not None and not bound.holds(number):
-                place.refuse(f"{bound.problem}, found {_shown(value)}")
+                location.refuse(f"{bound.problem}, found {_show(value)}")
 
 
-def _shown(value: Any) -> str:
+def _show(value: Any) -> str:
     """A value as text for a message, shortened if it is long or deeply nested."""
     if isinstance(value, tuple | Path):
         value = list(value) if isinstance(value, tuple) else str(value)
     return "null" if value is None else reprlib.repr(value)
 
 
-def _spelled(kind: Any) -> str:
+def _spell(kind: Any) -> str:
     """A type in words."""
     origin, members = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
@@ -295,19 +308,31 @@ def bounds(hint: Any) -> Iterator[Bound]:
             yield from bounds(argument)
 
 
-def named(section: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+def iterate_settings(section: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Name, such as noise.gyro_density, type and value of each setting of a section."""
     for field, hint in typing.get_type_hints(type(section), include_extras=True).items():
         name, value = prefix + field, getattr(section, field)
         if is_section(type(value)):
-            yield from named(value, f"{name}.")
+            yield from iterate_settings(value, f"{name}.")
+        elif isinstance(value, Mapping):
+            yield from _iterate_entries(value, kind_of(hint), f"{name}.")
         else:
             yield name, hint, value
 
 
-def flat(section: Any) -> dict[str, Any]:
+def _iterate_entries(entries: Mapping, hint: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
+    """`iterate_settings` of a mapping whose type is `hint`."""
+    inner = typing.get_args(hint)[1]
+    for key, value in entries.items():
+        if isinstance(value, Mapping):
+            yield from _iterate_entries(value, kind_of(inner), f"{prefix}{key}.")
+        else:
+            yield prefix + key, inner, value
+
+
+def flatten(section: Any) -> dict[str, Any]:
     """The settings of a section by names such as noise.gyro_density."""
-    return {name: value for name, _, value in named(section)}
+    return {name: value for name, _, value in iterate_settings(section)}
 
 
 def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
@@ -315,12 +340,12 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
 
     Raises `InputError` naming `source` and the first field that makes no sense.
     """
-    place = Place(source)
-    for name, hint, value in named(config):
-        _check_bounds(hint, value, place.below(name))
-    config.data.check(place.below("data"))
-    config.augment.check(place.below("augment"))
-    config.check(place)
+    location = Location(source)
+    for name, hint, value in iterate_settings(config):
+        _check_bounds(hint, value, location.child(name))
+    config.data.check(location.child("data"))
+    config.augment.check(location.child("augment"))
+    config.check(location)
     return config
 
 
@@ -330,18 +355,20 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
 
 def save(path: str | Path, config: TrainConfig) -> None:
     """Write `config` as YAML that `load` reads back to an equal value."""
-    write_text(path, text(config))
+    write_text(path, to_yaml(config))
 
 
-def text(config: TrainConfig) -> str:
+def to_yaml(config: TrainConfig) -> str:
     """`config` as YAML that `parse` reads back to an equal value."""
-    return yaml.dump(plain(config), Dumper=_Dumper, sort_keys=False)
+    return yaml.dump(to_plain(config), Dumper=_Dumper, sort_keys=False)
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Settings as the dictionaries, lists and numbers that YAML and JSON know."""
     if is_section(type(value)):
-        return {name: plain(getattr(value, name)) for name in typing.get_type_hints(type(value))}
+        return {name: to_plain(getattr(value, name)) for name in typing.get_type_hints(type(value))}
+    if isinstance(value, Mapping):
+        return {name: to_plain(entry) for name, entry in value.items()}
     return list(value) if isinstance(value, tuple) else value
 
 
@@ -364,12 +391,12 @@ class _Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict:
         """A mapping without repeated keys."""
-        seen: set[str] = set()
+        keys: set[str] = set()
         for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode) or key.value in seen:
-                problem = f"the key {_shown(key.value)} is repeated, or it is not a word"
+            if not isinstance(key, yaml.ScalarNode) or key.value in keys:
+                problem = f"the key {_show(key.value)} is repeated, or it is not a word"
                 raise ConstructorError(None, None, problem, key.start_mark)
-            seen.add(key.value)
+            keys.add(key.value)
         return super().construct_mapping(node, deep)
 
 
@@ -390,7 +417,7 @@ for _tag, _form in {
         _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^({_form})$"), None)
 
 
-def _yaml(content: str, source: str) -> Any:
+def _parse_yaml(content: str, source: str) -> Any:
     """The value of a YAML text. Raises `InputError`."""
     try:
         return yaml.load(content, Loader=_Loader)
@@ -401,73 +428,3 @@ def _yaml(content: str, source: str) -> Any:
     except (AttributeError, LookupError, TypeError):  # from PyYAML, if a tag has other content
         problem = "a tag does not fit its value"
     raise InputError(source, f"is not YAML ({problem})")
-
-
-# Files of earlier versions
-# ------------------------------------------------------------------------------------------------
-
-_MOVED: dict[str, str] = {
-    **{name: f"noise.{name}" for name in NoiseModel._fields},
-    **{f"{name}_std": f"start.{name}" for name in InitialStd._fields},
-    # The first four; no version wrote raw_gyro_bias in this form.
-    **{f"considered_{name}_std": f"considered.{name}" for name in ConsideredStd._fields[:4]},
-}
-"""Settings of the filter, which was a flat section with angles in degrees."""
-_GONE = {
-    "data.residency": ...,
-    "model.dtype": "float32",
-    "model.bank_heads": None,
-    "model.dropout": None,
-    "optim.accumulate": 1,
-    "optim.ema_decay": 0.0,
-    "optim.end_learning_rate": 1e-6,
-    "optim.plateau_epochs": 10,
-    "optim.plateau_factor": 0.1,
-    "filter.scale_error_std": 0.0,
-    "filter.heading_error_std_degrees": 0.0,
-    "filter.walk_error_seconds": ...,
-    "through_filter.truncate_seconds": 10.0,
-    "through_filter.start_spread": 1.0,
-    "through_filter.gate_softness": 2.0,
-    "through_filter.skip_above": 1000.0,
-}
-"""Settings that no longer exist, and for each the value without effect; `...` is any value."""
-
-
-def _is_of_earlier_version(fields: Any) -> bool:
-    """Whether it is a complete config.yaml that an earlier version wrote."""
-    if not isinstance(fields, dict) or "checkpoint_every_seconds" not in fields:
-        return False
-    sections = (name for name, value in vars(TrainConfig()).items() if is_section(type(value)))
-    return all(isinstance(fields.get(name), dict) for name in sections)
-
-
-def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
-    """The settings of an earlier version's config.yaml in this version's names. Raises `InputError`
-    if they ask for something that no longer exists."""
-    new = {name: dict(each) if isinstance(each, dict) else each for name, each in old.items()}
-    del new["checkpoint_every_seconds"]
-    for path, neutral in _GONE.items():
-        section, field = path.split(".")
-        value = new[section].pop(field, neutral)
-        if neutral is not ... and value != neutral:
-            problem = f"is {_shown(value)}, and there is no such setting any more"
-            Place(source, path).refuse(problem, "train the run again without it")
-    data, augment, flat = new["data"], new["augment"], new["filter"]
-    count, left_out = data.pop("folds", 1), data.pop("left_out", 0)
-    if count != 1:
-        data["train_split"] = f"{data.get('train_split', 'train')}-{left_out}of{count}"
-    augment["noise"] = [augment.pop("gyro_noise", 0.0), augment.pop("accel_noise", 0.0)]
-    new["loss"]["outlier_sigmas"] = 10.0  # the likelihood always had this bound
-    new["filter"] = sections = {"noise": {}, "start": {}, "considered": {}}
-    share, seconds = flat.pop("window_error_share", 0.0), flat.pop("window_error_seconds", 0.5)
-    sections["noise"]["std_factor"] = [flat.pop(f"std_factor_{axis}", 1.0) for axis in "xyz"]
-    if share:
-        sections["noise"]["correlation"] = {"share": share, "seconds": seconds}
-    for name, value in flat.items():
-        path = _MOVED.get(str(name).removesuffix("_degrees"), str(name))
-        section, _, field = path.rpartition(".")
-        if str(name).endswith("_degrees"):
-            value = checked_value(float, value, Place(source, f"filter.{name}")) * (math.pi / 180)
-        (sections[section] if section else sections)[field] = value
-    return new

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from gnio_jax.config.schema import FILE_ONLY, Count, FilterSettings, Folder, Words
+from gnio_jax.config.schema import FILE_ONLY, Count, FilterSettings, Folder, Rate, Words
 
 Table = Literal[
     "complexity",
@@ -154,12 +154,19 @@ class ImportOptions:
     file without a header, columns are numbered from 0."""
     accel_path: Path | None = None
     """CSV of the accelerometer, if it is another file than the gyro's."""
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None
-    """Unit of the stamps; detected by the rate of an IMU, 10 to 2000 Hz."""
-    gyro_unit: Literal["rad/s", "deg/s"] | None = None
-    """Unit of the gyro."""
-    accel_unit: Literal["m/s2", "g", "mg"] | None = None
-    """Unit of the accelerometer; detected by the magnitude of gravity."""
+    where: str | None = None
+    """For a CSV with rows of several sensors: COLUMN=VALUE of the rows to take."""
+    sample_rate: Rate | None = None
+    """For a CSV without stamps: rows are samples, so many in a second, Hz."""
+    time_unit: str | None = None
+    """Unit of the stamps: s, ms, us, ns, or the seconds of one stamp, as 1e-4; detected by the rate
+    of an IMU, 10 to 2000 Hz."""
+    gyro_unit: str | None = None
+    """Unit of the gyro: rad/s, deg/s, mdps, counts in a unit as 131/deg/s, or their size as
+    0.00875*deg/s."""
+    accel_unit: str | None = None
+    """Unit of the accelerometer: m/s2, g, mg, cm/s2, counts in a unit as 16384/g, or their size as
+    0.061*mg; detected by the magnitude of gravity."""
     accel_sign: Literal["android", "ios", "detect"] | None = None
     """At rest and level, the up axis reads +1 g (android) or −1 g (ios: all axes are negated).
     detect assumes that the screen points up more than down. A CSV has android's sign by default,

@@ -7,7 +7,7 @@ A section that relates several fields to each other checks them in `check`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn
@@ -15,21 +15,21 @@ from typing import Annotated, Any, Literal, NamedTuple, NoReturn
 from gnio_jax.errors import InputError
 
 
-class Place(NamedTuple):
-    """The place of a setting or a section in a file or on the command line."""
+class Location(NamedTuple):
+    """The location of a setting or a section in a file or on the command line."""
 
     source: str
     field: str = ""
     """Names joined by dots; empty at the top."""
 
-    def below(self, name: str) -> Place:
+    def child(self, name: str) -> Location:
         """The field `name` of this section."""
-        return Place(self.source, f"{self.field}.{name}" if self.field else name)
+        return Location(self.source, f"{self.field}.{name}" if self.field else name)
 
     def refuse(self, problem: str, remedy: str = "") -> NoReturn:
-        """Raise an `InputError` about this place."""
-        named = f"field '{self.field}' {problem}" if self.field else problem
-        raise InputError(self.source, named, remedy)
+        """Raise an `InputError` about this location."""
+        text = f"field '{self.field}' {problem}" if self.field else problem
+        raise InputError(self.source, text, remedy)
 
 
 class Bound(NamedTuple):
@@ -58,6 +58,35 @@ FILE_ONLY = "file only"
 UNNAMED = Words(named=False)
 Number = Any
 """A float in a file. Inside a JAX program it may be an array, so type checkers accept any type."""
+
+
+class Entries(Mapping[str, Any]):
+    """A mapping that cannot change, with its entries in the order in which they are written."""
+
+    def __init__(self, entries: Mapping[str, Any] | None = None) -> None:
+        self._entries = {
+            name: Entries(value) if isinstance(value, dict) else value
+            for name, value in (entries or {}).items()
+        }
+
+    def __getitem__(self, name: str) -> Any:
+        return self._entries[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self._entries.items()))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Mapping) and list(self.items()) == list(other.items())
+
+    def __repr__(self) -> str:
+        return repr(self._entries)
+
 
 ABOVE_ZERO = Bound(lambda value: 0 < value < math.inf, "must be positive and finite")
 NOT_NEGATIVE = Bound(lambda value: 0 <= value < math.inf, "must be finite and not negative")
@@ -141,20 +170,20 @@ class DataConfig:
         """Samples between window starts in training."""
         return round(self.train_stride_seconds * self.rate)
 
-    def check(self, at: Place) -> None:
+    def check(self, location: Location) -> None:
         """Check that window, context and strides are whole samples, and that strides fill window
         and context."""
         for name in ("window_seconds", "context_seconds", "stride_seconds", "train_stride_seconds"):
             samples = getattr(self, name) * self.rate
             if not _is_whole(samples):
                 problem = f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
-                at.below(name).refuse(problem)
+                location.child(name).refuse(problem)
         if self.window % self.stride:
-            at.below("stride_seconds").refuse(
+            location.child("stride_seconds").refuse(
                 f"must divide the window of {self.window_seconds:g} s"
             )
         if self.context % self.stride:
-            at.below("stride_seconds").refuse(
+            location.child("stride_seconds").refuse(
                 f"must divide the context of {self.context_seconds:g} s"
             )
 
@@ -189,18 +218,19 @@ class AugmentConfig:
     rest_share: Annotated[Probability, FILE_ONLY] = 0.0
     """Share of the windows that are replaced by windows of a phone at rest (ours)."""
 
-    def check(self, at: Place) -> None:
+    def check(self, location: Location) -> None:
         """Check that the lowest cut-off is not above the highest."""
         if self.low_pass_hertz[0] > self.low_pass_hertz[1]:
-            at.below("low_pass_hertz").refuse(
+            location.child("low_pass_hertz").refuse(
                 "has the higher frequency first", "give the lower one first"
             )
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The network and its options. An option that is not given takes the network's own default,
-    which is the published one. An option that the network does not have is refused."""
+    """The network and its options: those that networks of this package have, and `options`. An
+    option that is not given takes the network's own default, which is the published one. An option
+    that the network does not have is refused."""
 
     name: str = "gnio"
     """Network in the registry of `gnio_jax.models`."""
@@ -229,6 +259,15 @@ class ModelConfig:
     """How a network is made equivariant, so that its displacement turns with a window that is
     turned about the vertical. four_headings is the mean over four headings of the window, at
     inference; canonical_frame uses a frame that a small network finds in the window (EqNIO)."""
+    options: Annotated[Mapping[str, float | int | bool | str | None], FILE_ONLY] = field(
+        default_factory=Entries
+    )
+    """Options that only a network of a plugin has, by their names; --set model.options.NAME=VALUE
+    gives one."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.options, dict):
+            object.__setattr__(self, "options", Entries(self.options))
 
 
 @dataclass(frozen=True)
@@ -396,17 +435,12 @@ class FilterOptions:
     """When the last success is older than this, the gate pauses: everything passes, s."""
     pause_seconds: NonNegative = 1.0
     """Length of such a pause, s."""
-    zero_velocity_std: NonNegative = 0.0
-    """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
-    quiet; 0 for no such update. If a displacement is tested in the same interval and its gate is
-    active, a rest that fails the χ² test is refused, independently of `mahalanobis_fail_scale` and
-    `gate_softness`."""
     rest_gyro: NonNegative = 0.05
     """Bound of |gyro − b_g| in every sample of a quiet IMU, rad/s."""
     rest_accel: NonNegative = 0.3
     """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
     rest_seconds: NonNegative = 0.5
-    """How long the IMU is quiet before its velocity is measured as zero, s."""
+    """How long the IMU is quiet before it rests, s."""
     bridge_seconds: NonNegative = 0.1
     """For this long, s, the last IMU sample stands in for missing ones; then the filter coasts with
     constant attitude and velocity, and windows are no measurements."""
@@ -436,16 +470,24 @@ class FilterSettings(FilterOptions):
     """Standard deviations of the initial state."""
     considered: ConsideredStd = field(default_factory=ConsideredStd)
     """Errors that are not estimated but included in the covariance (Schmidt's consider states)."""
+    measurements: Mapping[str, Mapping[str, float] | None] = field(default_factory=Entries)
+    """Measurements besides the displacement, by their names, each with its numbers; they are taken
+    after the displacement of a clone interval, in this order. zero_velocity: {std: 0.02} measures a
+    velocity of zero with a standard deviation of 0.02 m/s while the IMU rests. `null` takes one
+    away. Others are those that a plugin registers (ours)."""
     window_rotation: Literal["per_sample", "single", "tlio"] | None = None
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
     for weights trained that way."""
     raw_gyro_bias: NonNegative | None = None
-    """Standard deviation of the gyro's first bias if its phone subtracts no bias, rad/s; the
-    recording then has `imu_compensated: no` (ours). In evaluation and tracking it is that of the
-    two components that are level at the start, and the vertical one keeps that of `start`. In
-    calibration, and for the poses of walks with waypoints, it is that of each axis. By default that
-    of `start` is taken for every IMU."""
+    """Standard deviation of the first gyro bias for phones that subtract no bias, rad/s (ours):
+    recordings with `imu_compensated: no`. By default it is that of `start`. Evaluation and tracking
+    apply it to the two components that are level at the start; calibration, and the poses of walks
+    with waypoints, to all three."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.measurements, dict):  # A hash needs entries that cannot change.
+            object.__setattr__(self, "measurements", Entries(self.measurements))
 
 
 SHORTEST_HORIZON = 1.0
@@ -463,9 +505,9 @@ class ThroughFilter:
     learn: Annotated[tuple[Part, ...], Words("PART")] = ()
     """Parts that are trained through the filter. Without this option the network is trained on
     windows. noise: the filter's densities and bias walks; measurement: the factors of the network's
-    covariance and the correlation of its errors; start: the standard deviations at the start;
-    uncertainty, head, encoder: the network's; all: everything. A filter option that is 0 stays
-    0."""
+    covariance, the correlation of its errors, and the numbers of `filter.measurements`; start: the
+    standard deviations at the start; uncertainty, head, encoder: the network's; all: everything.
+    Options of the filter that are 0 are not trained."""
     piece_seconds: Positive = 60.0
     """Length of the segments of recordings that are filtered, s."""
     filter_learning_rate: Positive = 0.03
@@ -516,7 +558,7 @@ class TrainConfig:
         """The datasets to learn from, one or several."""
         return (self.dataset,) if isinstance(self.dataset, str) else self.dataset
 
-    def check(self, at: Place) -> None:
+    def check(self, location: Location) -> None:
         """Check the sections together. Several datasets must differ, be in their usual folders and
         have a weight each, or none. Four headings are averaged only if training shows windows of
         every heading. Training through the filter needs weights to start from, and segments of
@@ -524,37 +566,37 @@ class TrainConfig:
         sample takes no context."""
         names, weights = self.datasets, self.data.weights
         if len(set(names)) < len(names) or not names:
-            at.below("dataset").refuse("is empty, or names a dataset twice", "name each once")
+            location.child("dataset").refuse("is empty, or names a dataset twice", "name each once")
         if len(names) > 1 and self.data_root is not None:
             problem = f"is the folder of one dataset, and there are {len(names)}"
             remedy = "leave it out and set $GNIO_DATA to the folder that holds theirs"
-            at.below("data_root").refuse(problem, remedy)
+            location.child("data_root").refuse(problem, remedy)
         if weights and len(weights) != len(names):
             problem = f"has {len(weights)} values for {len(names)} datasets"
-            at.below("data.weights").refuse(problem, "give one for each, or none")
+            location.child("data.weights").refuse(problem, "give one for each, or none")
         if self.data.context and self.model.name == "ctin":
             remedy = "it predicts every sample it sees: set it to 0"
-            at.below("data.context_seconds").refuse("is not for ctin", remedy)
+            location.child("data.context_seconds").refuse("is not for ctin", remedy)
         if self.model.equivariance == "four_headings" and not self.augment.yaw:
             problem = "is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"
-            at.below("model.equivariance").refuse(problem, remedy)
-        self._check_through_filter(at)
+            location.child("model.equivariance").refuse(problem, remedy)
+        self._check_through_filter(location)
 
-    def _check_through_filter(self, at: Place) -> None:
+    def _check_through_filter(self, location: Location) -> None:
         through = self.through_filter
         if not through.learn:
             return
         if not _is_whole(through.piece_seconds / self.data.stride_seconds):
             problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
-            at.below("through_filter.piece_seconds").refuse(problem)
+            location.child("through_filter.piece_seconds").refuse(problem)
         if through.piece_seconds < SHORTEST_HORIZON:
             problem = f"must be at least {SHORTEST_HORIZON:g} s, the shortest horizon of its losses"
-            at.below("through_filter.piece_seconds").refuse(problem)
+            location.child("through_filter.piece_seconds").refuse(problem)
         if self.filter.mahalanobis_fail_scale > 0:
             problem = "makes no sense beside the soft gate of training through the filter"
-            at.below("filter.mahalanobis_fail_scale").refuse(problem, "set it to 0")
-        seen = self.data.context_seconds + self.data.window_seconds
-        if through.piece_seconds < seen + 2 * self.data.stride_seconds:
-            problem = f"must be longer than the {seen:g} s that the network sees"
-            at.below("through_filter.piece_seconds").refuse(problem)
+            location.child("filter.mahalanobis_fail_scale").refuse(problem, "set it to 0")
+        input_seconds = self.data.context_seconds + self.data.window_seconds
+        if through.piece_seconds < input_seconds + 2 * self.data.stride_seconds:
+            problem = f"must be longer than the {input_seconds:g} s that the network sees"
+            location.child("through_filter.piece_seconds").refuse(problem)

@@ -56,7 +56,7 @@ class Dataset:
     rate: float
     """Native IMU rate, Hz."""
     source: str
-    """Place of the public set."""
+    """Location of the public set."""
     layout: str
     """The expected layout below the root, in one line."""
     licence: str

@@ -4,41 +4,25 @@ only imported if a picture is requested."""
 from __future__ import annotations
 
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 
+from gnio_jax import drawing
 from gnio_jax.data.self_check import WINDOW_SECONDS, SelfCheck, gyro_windows
 from gnio_jax.data.waypoints import with_poses
 from gnio_jax.errors import InputError
-from gnio_jax.files import replacing, shown_name
-from gnio_jax.numerics import finite_rows, spans
+from gnio_jax.files import shown_name
+from gnio_jax.numerics import finite_rows
 from gnio_jax.types import Sequence
 
-BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
 UNTRUSTED = "#F3D9CC"
 POINTS = 3000
 """Largest number of points of a line: more points than pixels only make the file larger."""
-COLOURS = 96
-
-
-def save(path: Path, figure: Figure) -> None:
-    """Write one figure as PNG, whole or not at all. Few colours reduce the file to a third, because
-    there may be hundreds of files."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    picture = (
-        Image.fromarray(np.asarray(canvas.buffer_rgba()))
-        .convert("RGB")
-        .quantize(COLOURS, dither=Image.Dither.NONE)
-    )
-    with replacing(path) as temporary:
-        picture.save(temporary, format="PNG", optimize=True)
+PALETTE = 96
+"""Number of colours of a picture's file."""
 
 
 def overview(sequence: Sequence, check: SelfCheck) -> Figure:
@@ -53,20 +37,22 @@ def overview(sequence: Sequence, check: SelfCheck) -> Figure:
     grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.25))
     plan = figure.add_subplot(grid[:, 0])
     if waypoints is not None:
-        plan.plot(*waypoints.position.T, "o", ls="none", color=VERMILION, ms=4, label="waypoint")
+        plan.plot(
+            *waypoints.position.T, "o", ls="none", color=drawing.VERMILION, ms=4, label="waypoint"
+        )
     _plan(plan, sequence)
     speed = figure.add_subplot(grid[0, 1])
     accel, gyro = (figure.add_subplot(grid[row, 1], sharex=speed) for row in (1, 2))
     _speed(speed, sequence)
     size = np.linalg.norm(sequence.accel, axis=1)
-    _over_time(accel, sequence, size, color=VERMILION, lw=0.5)
+    _over_time(accel, sequence, size, color=drawing.VERMILION, lw=0.5)
     accel.set_ylabel("|accel| (m/s²)")
     _gyro(gyro, sequence)
     for panel in (speed, accel):
         panel.tick_params(labelbottom=False)
     for panel in (speed, accel, gyro):
-        _shade(panel, sequence)
-        _finish(panel)
+        drawing.shade(panel, sequence.time - sequence.time[0], ~sequence.valid, UNTRUSTED)
+        drawing.finish(panel)
     gyro.set_xlabel("time (s)")
     gyro.set_xlim(0.0, float(sequence.time[-1] - sequence.time[0]))
     used = f"{sequence.valid.mean():.1%} valid"
@@ -87,7 +73,7 @@ def _over_time(axes: Axes, sequence: Sequence, values: np.ndarray, **style: Any)
 
 def _speed(axes: Axes, sequence: Sequence) -> None:
     speed = np.where(sequence.valid, np.linalg.norm(sequence.velocity, axis=1), np.nan)
-    _over_time(axes, sequence, speed, color=BLUE, lw=0.9)
+    _over_time(axes, sequence, speed, color=drawing.BLUE, lw=0.9)
     axes.set_ylabel("speed (m/s)")
     axes.set_ylim(bottom=0.0)
     if not sequence.valid.all():
@@ -99,7 +85,7 @@ def _gyro(axes: Axes, sequence: Sequence) -> None:
     window = min(WINDOW_SECONDS, float(sequence.time[-1] - sequence.time[0]) / 4)
     starts, degrees = gyro_windows(sequence, window)
     middle = starts - sequence.time[0] + window / 2
-    axes.plot(middle, degrees, "o-", color=GREEN, ms=2.5, lw=0.7)
+    axes.plot(middle, degrees, "o-", color=drawing.GREEN, ms=2.5, lw=0.7)
     axes.set_ylabel(f"gyro vs. reference\nover {window:.3g} s (°)")
     axes.set_ylim(bottom=0.0)
 
@@ -110,27 +96,16 @@ def _plan(axes: Axes, sequence: Sequence) -> None:
     finite = position[finite_rows(position)]
     if len(finite):
         stride = max(len(position) // POINTS, 1)
-        axes.plot(position[::stride, 0], position[::stride, 1], color=BLUE, lw=0.9)
-        marks: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 4}
-        axes.plot(*finite[0], "o", mfc="white", ms=8, mew=1.8, label="start", **marks)
-        axes.plot(*finite[-1], "s", ms=7, label="end", **marks)
+        axes.plot(position[::stride, 0], position[::stride, 1], color=drawing.BLUE, lw=0.9)
+        axes.plot(*finite[0], color=drawing.GREY, zorder=4, label="start", **drawing.START)
+        axes.plot(*finite[-1], color=drawing.GREY, zorder=4, label="end", **drawing.END)
         axes.legend(loc="best", fontsize=8, framealpha=0.9)
         axes.margins(0.08)
     else:
-        axes.text(0.5, 0.5, "no reference", transform=axes.transAxes, ha="center", color=GREY)
+        axes.text(
+            0.5, 0.5, "no reference", transform=axes.transAxes, ha="center", color=drawing.GREY
+        )
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
-    _finish(axes)
-
-
-def _shade(axes: Axes, sequence: Sequence) -> None:
-    time = sequence.time - sequence.time[0]
-    for start, stop in spans(~sequence.valid):
-        axes.axvspan(float(time[start]), float(time[stop - 1]), color=UNTRUSTED, lw=0, zorder=0)
-
-
-def _finish(axes: Axes) -> None:
-    axes.grid(True, color="#D9D9D9", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    drawing.finish(axes)

@@ -1,7 +1,7 @@
 """The datasets by name, and their folders.
 
 A new dataset is one module in `readers` that ends with `DATASET = Dataset(...)`, and two lines in
-`readers/__init__.py`. A program of your own calls `register` with its `Dataset` instead.
+`readers/__init__.py`. A plugin (`gnio_jax.plugins`) calls `register` with its `Dataset` instead.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from gnio_jax import plugins
 from gnio_jax.data.dataset import Dataset
 from gnio_jax.data.readers import DATASETS
 from gnio_jax.errors import InputError, did_you_mean
@@ -29,12 +30,15 @@ def register(dataset: Dataset) -> None:
 
 
 def names() -> list[str]:
-    """Names of the known datasets."""
+    """Names of the known datasets, with those of plugins."""
+    plugins.load()
     return sorted(DATASETS)
 
 
 def get(name: str) -> Dataset:
     """The dataset of that name; raises `InputError` that lists the known ones."""
+    if name not in DATASETS:
+        plugins.load()
     if name not in DATASETS:
         remedy = f"known datasets: {', '.join(names())}"
         raise InputError(

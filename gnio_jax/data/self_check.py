@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset
+from gnio_jax.data.physics import implausible
 from gnio_jax.numerics import (
     convolve,
     integrate_gyro,
@@ -120,8 +121,9 @@ def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
     check = self_check(
         sequence, pedestrian, bool(attributes.get("check_correlation", dataset.correlates))
     )
-    needed = dataset.needs_reference or sequence.valid.any()
-    return check if needed else check._replace(failures=())
+    if dataset.needs_reference or sequence.valid.any():
+        return check
+    return check._replace(failures=implausible(sequence))
 
 
 def _with_reference(

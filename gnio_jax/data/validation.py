@@ -119,20 +119,8 @@ def _check_waypoints(sequence: Sequence, source: object) -> None:
     to a sample."""
     if sequence.waypoints is None:
         return
-    time, position = sequence.waypoints
-    count, clock, step = len(time), sequence.time, sequence.time[1] - sequence.time[0]
-    problem = ""
-    if time.ndim != 1 or position.shape != (count, 2):
-        problem = f"have the shapes {time.shape} and {position.shape}, expected (k,) and (k, 2)"
-    elif count < FEWEST_WAYPOINTS:
-        problem = f"are {count}, at least {FEWEST_WAYPOINTS} are needed"
-    elif not (np.isfinite(time).all() and np.isfinite(position).all()):
-        problem = "are not all finite"
-    elif not (np.diff(time) > 0).all():
-        problem = "do not increase in time"
-    elif time[0] < clock[0] - step or time[-1] > clock[-1] + step:
-        problem = f"({time[0]:.2f} to {time[-1]:.2f} s) are not all on the IMU's clock"
-    if problem:
+    step = float(sequence.time[1] - sequence.time[0])
+    if problem := sequence.waypoints.problem(sequence.time, step, FEWEST_WAYPOINTS):
         raise InputError(source, f"field 'waypoints' {problem}", "repair or leave out these")
 
 

@@ -8,6 +8,7 @@ trajectory has a row at the start and one at the end of every stride. The filter
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -21,14 +22,13 @@ from jaxtyping import Float
 from gnio_jax.config import DataConfig
 from gnio_jax.evaluation.infer import Displacements, keep
 from gnio_jax.evaluation.metrics import Filtered
-from gnio_jax.evaluation.prepare import Recording, Start
-from gnio_jax.evaluation.trajectory import Alignment, Trajectory, in_frame_of, relative_yaw
+from gnio_jax.evaluation.prepare import PreparedRecording, Start
+from gnio_jax.evaluation.trajectory import Alignment, Trajectory, align_if_possible, relative_yaw
 from gnio_jax.filtering import (
-    ConsideredStd,
+    Filter,
     FilterConfig,
     FilterHistory,
     FilterState,
-    NoiseModel,
     considered_covariance,
     over_sequences,
     run_filter,
@@ -36,8 +36,7 @@ from gnio_jax.filtering import (
     sensitivity,
 )
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
-from gnio_jax.filtering.history import GYRO_BIAS, POSITION
-from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.filtering.history import GYRO_BIAS, POSITION, explain_failure
 from gnio_jax.filtering.state import gyro_bias_covariance
 from gnio_jax.models import Network
 from gnio_jax.numerics import (
@@ -73,11 +72,11 @@ class States(NamedTuple):
     """Measured minus predicted displacement, m; NaN where there was no measurement."""
 
 
-class Estimate(NamedTuple):
+class SequenceEstimate(NamedTuple):
     """A trajectory with the estimator's other results: K + 1 rows for K strides.
 
-    Row k is at the end of stride k, which is `Recording.time[k]`. A measurement is in the row at
-    the end of its window.
+    Row k is at the end of stride k, which is `PreparedRecording.time[k]`. A measurement is in the
+    row at the end of its window.
     """
 
     name: str
@@ -97,13 +96,13 @@ class Estimate(NamedTuple):
 
 
 def estimate(
-    recordings: list[Recording],
+    recordings: list[PreparedRecording],
     source: Network | list[Displacements],
     windows: DataConfig,
-    ekf: FilterSetup | None,
+    ekf: Filter | None,
     batch_size: int = 16,
     progress: Progress = silent,
-) -> list[Estimate]:
+) -> list[SequenceEstimate]:
     """Trajectories of the recordings, by the filter, or by the sum of displacements if `ekf` is
     None.
 
@@ -114,57 +113,60 @@ def estimate(
     if ekf is None:
         assert not isinstance(source, Network)
         return [integrate(*pair, windows) for pair in zip(recordings, source, strict=True)]
-    network, given = (
+    network, displacements = (
         (source, None) if isinstance(source, Network) else (Network(None, None), source)
     )
-    found: dict[int, Estimate] = {}
-    strides = [each.strides for each in recordings]
+    estimates: dict[int, SequenceEstimate] = {}
+    strides = [recording.strides for recording in recordings]
     for batch in _batches(strides, batch_size):
-        displacements = None if given is None else [given[i] for i in batch.members]
         members = [recordings[i] for i in batch.members]
-        inputs = filter_inputs(members, displacements, batch.intervals, ekf.config)
-        fixed = {"apply": network.apply, "config": ekf.config}
-        history = _run(network.variables, inputs, ekf.noise, ekf.considered, **fixed)
-        history = jax.device_get(history)
-        for place, i in enumerate(dict.fromkeys(batch.members)):
-            own = jax.tree.map(lambda leaf, p=place, k=strides[i]: leaf[p, :k], history)
-            if given is not None:
-                own = own._replace(diagnostics=given[i].diagnostics)
-            found[i] = _of_history(recordings[i], own, ekf)
-        progress(sum(strides[i] for i in found) / sum(strides))
-    return [found[i] for i in range(len(recordings))]
+        rows = None if displacements is None else [displacements[i] for i in batch.members]
+        inputs = filter_inputs(members, rows, batch.intervals, ekf.config)
+        histories = _run(network.variables, inputs, ekf, apply=network.apply)
+        histories = jax.device_get(histories)
+        for row, i in enumerate(dict.fromkeys(batch.members)):
+            history = jax.tree.map(lambda leaf, row=row, k=strides[i]: leaf[row, :k], histories)
+            if displacements is not None:
+                history = history._replace(diagnostics=displacements[i].diagnostics)
+            estimates[i] = _convert_history(recordings[i], history, ekf)
+        progress(sum(strides[i] for i in estimates) / sum(strides))
+    return [estimates[i] for i in range(len(recordings))]
 
 
-def never_moves(estimates: list[Estimate]) -> list[Estimate]:
+def never_moves(estimates: list[SequenceEstimate]) -> list[SequenceEstimate]:
     """Estimates that stay at the start pose. An estimator must be better than these, above all in a
     small room."""
     still = []
-    for each in estimates:
-        time, *poses = each.trajectory
+    for original in estimates:
+        name, (time, *poses) = original.name, original.trajectory
         path = Trajectory(time, *(np.repeat(part[:1], len(part), 0) for part in poses))
-        still.append(Estimate(each.name, path, each.reference, waypoints=each.waypoints))
+        still.append(SequenceEstimate(name, path, original.reference, waypoints=original.waypoints))
     return still
 
 
-def perfect(ekf: FilterSetup) -> FilterSetup:
+def perfect(ekf: Filter) -> Filter:
     """The filter for true displacements: without the settings that were calibrated for a
     network."""
     noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), measurement_scale=1.0, correlation=None)
     considered = ekf.considered and ekf.considered._replace(scale=0.0, heading=0.0, slope=0.0)
-    return ekf._replace(noise=noise, considered=considered)
+    return dataclasses.replace(ekf, noise=noise, considered=considered)
 
 
-def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> Estimate:
+def in_one_frame(
+    estimate: SequenceEstimate, alignment: Alignment | None = "origin"
+) -> SequenceEstimate:
     """Estimate and reference in one frame, for drawing: the estimate is aligned with its
     covariance, or without an `alignment` the reference is moved to the start of the estimate. An
     estimate with waypoints is aligned with these. If that is impossible, nothing changes.
     Covariances are turned only about the vertical, because an alignment of a level world turns
     about it."""
     if alignment is None and estimate.waypoints is None:
-        return estimate._replace(reference=in_frame_of(estimate.reference, estimate.trajectory))
+        return estimate._replace(
+            reference=align_if_possible(estimate.reference, estimate.trajectory)
+        )
     reference = estimate.waypoints or estimate.reference
     path, filtered = estimate.trajectory, estimate.filtered
-    aligned = in_frame_of(path, reference, alignment or "origin")
+    aligned = align_if_possible(path, reference, alignment or "origin")
     if filtered is not None and aligned is not path:
         turn = rotation_z(relative_yaw(aligned.orientation, path.orientation))
         covariance = turn @ filtered.covariance @ np.swapaxes(turn, 1, 2)
@@ -175,7 +177,7 @@ def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> 
 # --- the filter over many recordings
 
 
-class Inputs(NamedTuple):
+class BatchInputs(NamedTuple):
     """The inputs of the filter, with the recordings along the leading axis."""
 
     start: Start
@@ -185,7 +187,7 @@ class Inputs(NamedTuple):
     """(b, K·n, 3), m/s²."""
     imu_valid: Array | None
     """(b, K·n); None: every sample was measured."""
-    given: Displacements | None
+    displacements: Displacements | None
     """(b, K, 3); None where the network is in the filter."""
 
 
@@ -194,76 +196,72 @@ def _batches(strides: list[int], batch_size: int) -> list[Batch]:
     recording times powers of 0.8), and none is padded by more than a quarter."""
     count = max(1, math.ceil(len(strides) / batch_size))
 
-    def padded(longest: int) -> int:
+    def pad(longest: int) -> int:
         length = max(strides)
         while 0.8 * length >= longest and length > SHORTEST:
             length = math.ceil(0.8 * length)
         return length
 
-    return batches(strides, max(1, math.ceil(len(strides) / count)), padded)
+    return batches(strides, max(1, math.ceil(len(strides) / count)), pad)
 
 
 def filter_inputs(
-    recordings: list[Recording],
-    given: list[Displacements] | None,
+    recordings: list[PreparedRecording],
+    displacements: list[Displacements] | None,
     strides: int,
     config: FilterConfig,
-) -> Inputs:
+) -> BatchInputs:
     """The recordings side by side, padded to the given number of strides by samples that change
-    nothing before them. Rows of `given` without a displacement get a covariance of 1 m², which has
-    a derivative but no effect."""
+    nothing before them. Rows without a displacement get a covariance of 1 m², so that derivatives
+    stay finite; the filter never applies it."""
     samples, stacked = strides * config.samples_per_clone, None
-    if given is not None:
+    if displacements is not None:
         rows = []
-        for each in given:
-            known = np.isfinite(each.covariance).all((1, 2), keepdims=True)
-            covariance = filled_up(np.where(known, each.covariance, np.eye(3)), strides)
-            rows.append(Displacements(filled_up(each.value, strides, np.nan), covariance))
-        stacked = _stacked(rows)
-    return Inputs(
-        _stacked([each.start for each in recordings]),
-        *padded_signals(((each.gyro, each.accel) for each in recordings), samples),
-        padded_masks((each.imu_valid for each in recordings), samples),
+        for value, covariance, _ in displacements:
+            finite = np.isfinite(covariance).all((1, 2), keepdims=True)
+            covariance = filled_up(np.where(finite, covariance, np.eye(3)), strides)
+            rows.append(Displacements(filled_up(value, strides, np.nan), covariance))
+        stacked = _stack(rows)
+    return BatchInputs(
+        _stack([recording.start for recording in recordings]),
+        *padded_signals(((recording.gyro, recording.accel) for recording in recordings), samples),
+        padded_masks((recording.imu_valid for recording in recordings), samples),
         stacked,
     )
 
 
-@functools.partial(jax.jit, static_argnames=("apply", "config"))
+@functools.partial(jax.jit, static_argnames="apply")
 def _run(
-    variables: Any,
-    inputs: Inputs,
-    noise: NoiseModel,
-    considered: ConsideredStd | None,
-    *,
-    apply: Callable | None,
-    config: FilterConfig,
+    variables: Any, inputs: BatchInputs, ekf: Filter, *, apply: Callable | None
 ) -> FilterHistory:
     """One compiled run over all recordings of a batch. Of its covariances only that of the position
     is kept, including the consider covariance."""
 
-    def run(own: Inputs) -> FilterHistory:
-        signals, fixed = (own.gyro, own.accel), (config, noise, own.imu_valid)
-        state = own.start.state(config)
+    def run(inputs: BatchInputs) -> FilterHistory:
+        signals, valid = (inputs.gyro, inputs.accel), inputs.imu_valid
+        state = inputs.start.state(ekf)
         if apply is None:
-            assert own.given is not None
-            frame, covariance = "given", own.given.covariance
-            history = run_filter(state, *signals, own.given.value, covariance, *fixed)[1]
+            assert inputs.displacements is not None
+            frame, displacement = "given", inputs.displacements.value
+            covariance = inputs.displacements.covariance
+            history = run_filter(ekf, state, *signals, displacement, covariance, valid)[1]
         else:
-            frame = config.displacement_frame
+            frame = ekf.config.displacement_frame
             predict = functools.partial(_predict, apply, variables)
-            history = run_odometry(predict, state, *signals, *fixed)[1]
+            history = run_odometry(predict, ekf, state, *signals, valid)[1]
         diagonal, whole = history.covariance_diagonal, history.covariance
         assert whole is not None
         position = whole[:, POSITION, POSITION]
-        if considered is not None:
-            displacement, covariance = history.given(noise)
+        if ekf.considered is not None:
+            displacement, covariance = history.given(ekf.noise)
 
-            def repeated(state: FilterState, displacement: Array) -> FilterHistory:
-                return run_filter(state, *signals, displacement, covariance, *fixed, frame)[1]
+            def repeat_run(state: FilterState, displacement: Array) -> FilterHistory:
+                rows = displacement, covariance, valid, frame
+                return run_filter(ekf, state, *signals, *rows)[1]
 
-            found = sensitivity(repeated, state, displacement)
-            axis = jnp.tile(own.start.raw_axis[None], (len(found), 1))
-            added = considered_covariance(found, considered, axis)
+            derivatives = sensitivity(repeat_run, state, displacement)
+            axis = jnp.tile(inputs.start.raw_axis[None], (len(derivatives), 1))
+            added = considered_covariance(derivatives, ekf.considered, axis)
             diagonal = diagonal + jnp.diagonal(added, axis1=1, axis2=2)
             position = position + added[:, POSITION, POSITION]
         return history._replace(covariance_diagonal=diagonal, covariance=position)
@@ -275,16 +273,20 @@ def _predict(apply: Callable, variables: Any, windows: Array) -> Prediction:
     return keep(apply(variables, windows))
 
 
-def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) -> Estimate:
+def _convert_history(
+    recording: PreparedRecording, history: FilterHistory, ekf: Filter
+) -> SequenceEstimate:
     """The estimate from the history of one recording, with a row for its start. It is invalid where
     the history is not healthy."""
     start, notes = recording.start, recording.notes
-    healthy = _after(1.0, history.healthy) > 0
+    healthy = _prepend(1.0, history.healthy) > 0
     if not healthy.all():
-        since = recording.time[np.argmin(healthy)] - recording.time[0]
-        notes = (*notes, f"filter: diverged at {since:.1f} s; the poses from then on are invalid")
-    position = _after(start.position, history.position)
-    orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
+        seconds = recording.time[np.argmin(healthy)] - recording.time[0]
+        cause = explain_failure(history, ekf.config)
+        problem = f"filter: diverged at {seconds:.1f} s ({cause})"
+        notes = (*notes, f"{problem}; the poses from then on are invalid")
+    position = _prepend(start.position, history.position)
+    orientation = quaternion_from_matrix(_prepend(start.rotation, history.rotation))
     poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
     std = np.repeat(np.array(start.std), [2, 1, 3, 3, 3, 3])
     of_bias = gyro_bias_covariance(start.rotation, start.std.gyro_bias, start.level_gyro_bias)
@@ -292,61 +294,63 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) 
     if (considered := ekf.considered) is not None:
         std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], considered.gyro_bias)
         std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], considered.raw_gyro_bias * start.raw_axis)
-    return Estimate(
+    return SequenceEstimate(
         recording.name,
         Trajectory(recording.time, *poses),
         recording.reference,
         Displacements(
-            _after(np.nan, history.displacement),
-            _after(np.nan, history.measurement_covariance),
-            {name: _after(np.nan, value) for name, value in history.diagnostics.items()},
+            _prepend(np.nan, history.displacement),
+            _prepend(np.nan, history.measurement_covariance),
+            {name: _prepend(np.nan, value) for name, value in history.diagnostics.items()},
         ),
         Filtered(
-            _after(np.diag(std[POSITION] ** 2), history.covariance),
-            _after(np.nan, history.nis),
-            _after(np.nan, history.accepted),
+            _prepend(np.diag(std[POSITION] ** 2), history.covariance),
+            _prepend(np.nan, history.nis),
+            _prepend(np.nan, history.accepted),
         ),
         States(
-            _after(start.velocity, history.velocity),
-            _after(start.gyro_bias, history.gyro_bias),
-            _after(0.0, history.accel_bias),
-            _after(std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
-            _after(np.nan, history.innovation),
+            _prepend(start.velocity, history.velocity),
+            _prepend(start.gyro_bias, history.gyro_bias),
+            _prepend(0.0, history.accel_bias),
+            _prepend(std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
+            _prepend(np.nan, history.innovation),
         ),
         notes=notes,
         waypoints=recording.waypoints,
     )
 
 
-def _after(first: Any, rest: Any) -> np.ndarray:
-    """`rest` after a row of `first`."""
-    row = np.broadcast_to(np.asarray(first, float), rest.shape[1:])
-    return np.concatenate([row[None], rest])
+def _prepend(first: Any, rows: Any) -> np.ndarray:
+    """A row of `first`, then the rows."""
+    row = np.broadcast_to(np.asarray(first, float), rows.shape[1:])
+    return np.concatenate([row[None], rows])
 
 
-def _stacked(trees: list[Any]) -> Any:
+def _stack(trees: list[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 # --- the sum of displacements
 
 
-def integrate(recording: Recording, found: Displacements, windows: DataConfig) -> Estimate:
+def integrate(
+    recording: PreparedRecording, displacements: Displacements, windows: DataConfig
+) -> SequenceEstimate:
     """The path in which every stride is the mean of the windows that cover it, as in RoNIN-type
     baselines."""
     n, clones = windows.stride, windows.window // windows.stride
     assert recording.attitude is not None
     ends = n * np.arange(clones, recording.strides + 1)  # ends of the windows, in samples
     to_world = yaw_rotation(recording.attitude[ends - windows.window])
-    steps = np.einsum("mij,mj->mi", to_world, found.value[clones - 1 :]) / clones
+    steps = np.einsum("mij,mj->mi", to_world, displacements.value[clones - 1 :]) / clones
     moved = np.cumsum(mean_over_windows(steps, clones), 0)
     position = recording.start.position + np.concatenate([np.zeros((1, 3)), moved])
     orientation = quaternion_from_matrix(recording.attitude[::n])
-    return Estimate(
+    return SequenceEstimate(
         recording.name,
         Trajectory(recording.time, position, orientation),
         recording.reference,
-        jax.tree.map(lambda leaf: _after(np.nan, leaf), found),
+        jax.tree.map(lambda leaf: _prepend(np.nan, leaf), displacements),
         notes=recording.notes,
         waypoints=recording.waypoints,
     )

@@ -24,13 +24,20 @@ from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.config import EvaluateConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.estimate import PERFECT_STD, Estimate, estimate, never_moves, perfect
-from gnio_jax.evaluation.infer import given_displacements, infer, no_displacements
+from gnio_jax.evaluation.estimate import (
+    PERFECT_STD,
+    SequenceEstimate,
+    estimate,
+    never_moves,
+    perfect,
+)
+from gnio_jax.evaluation.folder import write
+from gnio_jax.evaluation.infer import infer, no_displacements, reference_displacements
 from gnio_jax.evaluation.metrics import score
-from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
-from gnio_jax.evaluation.report import DEFINITIONS, Report, write
-from gnio_jax.evaluation.trajectory import Alignment, Undefined, paired, read_tum
-from gnio_jax.filtering.settings import filter_setup
+from gnio_jax.evaluation.prepare import Orientation, PreparedRecording, prepare
+from gnio_jax.evaluation.report import DEFINITIONS, Report
+from gnio_jax.evaluation.trajectory import Alignment, Undefined, pair, read_tum
+from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
@@ -53,8 +60,8 @@ class Evaluation(NamedTuple):
     """The result of `evaluate`."""
 
     report: Report
-    estimates: list[Estimate]
-    recordings: list[Recording]
+    estimates: list[SequenceEstimate]
+    recordings: list[PreparedRecording]
     folder: Path
     """Folder of the results."""
 
@@ -76,34 +83,36 @@ def evaluate(
     missing data, and a split of which no sequence can be estimated.
     """
     _check(config)
-    from gnio_jax.training.checkpoint import learnt_from, load_run  # Orbax takes seconds to import
+    from gnio_jax.training.checkpoint import (  # Orbax takes seconds to import
+        load_run,
+        training_recordings,
+    )
 
     workdir = Path(config.workdir or configuration.newest_run())
     run = run or load_run(workdir, config.checkpoint)
     config = resolve(config, run.config)
-    windows, ekf = run.config.data, filter_setup(run.config.data, config.filter)
+    windows, ekf = run.config.data, make_filter(run.config.data, config.filter)
 
     def stage(name: str) -> Progress:
         return functools.partial(reporter.progress, name)
 
     sequences = data.load(config.dataset, config.data_root, config.split, workers, stage("reading"))
-    for each in sequences:
-        if each.waypoints is not None and config.alignment not in ("origin", "yaw_position"):
+    for sequence in sequences:
+        if sequence.waypoints is not None and config.alignment not in ("origin", "yaw_position"):
             problem = f"has waypoints, and no --alignment {config.alignment}"
             remedy = "leave it out: one turn about z and one shift are fitted"
-            raise InputError(each.name, problem, remedy)
-    learnt = learnt_from(workdir, run.config, config.dataset)
-    if seen := [each.name for each in sequences if each.name in learnt]:
-        count = f"{len(seen)} of {len(sequences)} recordings, e.g. {seen[0]}"
+            raise InputError(sequence.name, problem, remedy)
+    learnt = training_recordings(workdir, run.config, config.dataset)
+    if overlap := [sequence.name for sequence in sequences if sequence.name in learnt]:
+        count = f"{len(overlap)} of {len(sequences)} recordings, e.g. {overlap[0]}"
         reporter.line(f"warning: the network has learnt from {count}: its errors there are smaller")
     recordings, left_out = prepare(
         sequences,
         windows,
-        ekf.initial_std,
+        ekf,
         init=config.init,
         gyro_bias=config.gyro_bias,
         orientation=config.orientation if _infers(config) else None,
-        raw_gyro_bias=ekf.raw_gyro_bias,
     )
     if not recordings:
         name, reason = next(iter(left_out.items()))
@@ -115,26 +124,26 @@ def evaluate(
         least_std = math.exp(ekf.config.log_std_min) if config.estimator == "ekf" else 0.0
         source = infer(network, recordings, windows, stage("inferring"), least_std=least_std)
     elif config.estimator == "imu_only":
-        source = [no_displacements(each) for each in recordings]
+        source = [no_displacements(recording) for recording in recordings]
     else:
         source = network
-    posed = [each for each in recordings if each.waypoints is None]
-    truth = [given_displacements(each, PERFECT_STD) for each in posed]
+    posed = [recording for recording in recordings if recording.waypoints is None]
+    truth = [reference_displacements(recording, PERFECT_STD) for recording in posed]
 
-    own, ideal = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
+    actual, ideal = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
     batch, perfecting = config.batch_size, stage("estimating with perfect displacements")
-    estimates = estimate(recordings, source, windows, own, batch, stage("estimating"))
+    estimates = estimate(recordings, source, windows, actual, batch, stage("estimating"))
     floor = estimate(posed, truth, windows, ideal, batch, perfecting)
     compared = {"never_moves": never_moves(estimates), "perfect_displacements": floor}
 
     report = Report(
-        {**_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
+        {**_describe_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
         score(estimates, config.alignment),
         {row: score(of, config.alignment) for row, of in compared.items() if of},
-        {each.name: each.group for each in recordings},
-        {each.name: list(each.notes) for each in estimates if each.notes},
+        {recording.name: recording.group for recording in recordings},
+        {result.name: list(result.notes) for result in estimates if result.notes},
         left_out,
-        {each.name: each.placement for each in recordings if each.placement},
+        {recording.name: recording.placement for recording in recordings if recording.placement},
     )
     folder = folder_of(workdir, config, run.config)
     write(folder, report, estimates, run.config, command, config.plots, stage("drawing"))
@@ -145,17 +154,17 @@ def score_files(reference: Path, estimate: Path, alignment: Alignment = "origin"
     """The report about two trajectories in TUM format, written by any program, at the stamps that
     they share. Raises `InputError` if these are too few."""
     try:
-        path, truth = paired(read_tum(estimate), read_tum(reference))
+        path, truth = pair(read_tum(estimate), read_tum(reference))
     except Undefined as problem:
         remedy = "give both the stamps of one clock, in s"
         raise InputError(estimate, f"{problem} as in {reference}", remedy) from None
-    found = [Estimate(estimate.stem, path, truth)]
+    estimates = [SequenceEstimate(estimate.stem, path, truth)]
     count = f"{np.isfinite(truth.position).all(axis=1).sum():,} poses"
     settings = {"dataset": estimate.name, "split": f"against {count} of {reference.name}"}
     settings |= {"estimator": "given poses", "alignment": alignment}
-    still = {"never_moves": score(never_moves(found), alignment)}
+    still = {"never_moves": score(never_moves(estimates), alignment)}
     groups = {estimate.stem: estimate.stem}
-    return Report(settings, score(found, alignment), still, groups, {}, {})
+    return Report(settings, score(estimates, alignment), still, groups, {}, {})
 
 
 def _check(config: EvaluateConfig) -> None:
@@ -186,14 +195,14 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
             config.workdir or "the run", f"has learnt from {', '.join(run.datasets)}", remedy
         )
     if data.get(dataset).needs_root:
-        given = config.data_root or (run.data_root if dataset in run.datasets else None)
-        root = str(data.find_root(dataset, given).resolve())
+        data_root = config.data_root or (run.data_root if dataset in run.datasets else None)
+        root = str(data.find_root(dataset, data_root).resolve())
     return dataclasses.replace(
         config,
         dataset=dataset,
         data_root=root,
         coupling=config.coupling if config.estimator == "ekf" else "tight",
-        orientation=config.orientation or _usual_orientation(config),
+        orientation=config.orientation or _default_orientation(config),
         filter=changed.filter,
         set=(),
     )
@@ -205,55 +214,58 @@ def _infers(config: EvaluateConfig) -> bool:
     return loose or config.estimator == "integrate"
 
 
-def _usual_orientation(config: EvaluateConfig) -> Orientation:
+def _default_orientation(config: EvaluateConfig) -> Orientation:
     return "reference" if _infers(config) else "filter"
 
 
 def folder_of(workdir: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
-    """The folder of a run for the results of a resolved `config`. If that folder holds figures of
-    other recordings, it keeps them: the name then ends with the place of the recordings, in this
-    and in later evaluations."""
+    """The folder of a run for the results of a resolved `config`.
+
+    If it already holds the results of another `data_root`, they stay: from then on the folder of
+    this data root has a suffix of its name and a digest of its path."""
     folder = workdir / "eval" / folder_name(config, run)
     if config.data_root is None:
         return folder
-    place = Path(config.data_root)
-    own = folder.with_name(f"{folder.name}_{place.name}-{zlib.crc32(bytes(place)):08x}-root")
+    root = Path(config.data_root)
+    with_root = folder.with_name(f"{folder.name}_{root.name}-{zlib.crc32(bytes(root)):08x}-root")
     try:
-        there = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        taken = there["settings"]["data_root"] != config.data_root
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        occupied = metrics["settings"]["data_root"] != config.data_root
     except (OSError, ValueError, LookupError, TypeError):  # the file names no recordings
-        taken = False
-    return own if taken or own.exists() else folder
+        occupied = False
+    return with_root if occupied or with_root.exists() else folder
 
 
 def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     """<dataset>_<split>_<estimator>, then every choice of a resolved `config` other than the
     default."""
-    usual = vars(EvaluateConfig(orientation=_usual_orientation(config)))
-    own = vars(config)
+    defaults = vars(EvaluateConfig(orientation=_default_orientation(config)))
+    choices = vars(config)
     parts = [config.dataset, config.split, config.estimator]
-    parts += [text.format(own[x]) for x, text in NAMED.items() if own[x] != usual[x]]
+    parts += [text.format(choices[x]) for x, text in NAMED.items() if choices[x] != defaults[x]]
     if config.estimator != "integrate":
-        trained, own = configuration.flat(run.filter), configuration.flat(config.filter)
-        for name in {**trained, **own}:
-            if (value := own.get(name)) != trained.get(name):
+        trained, chosen = configuration.flatten(run.filter), configuration.flatten(config.filter)
+        for name in {**trained, **chosen}:
+            if (value := chosen.get(name)) != trained.get(name):
                 numbers = value if isinstance(value, tuple) else (value,)
                 text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
                 parts.append(f"{name}-{text}")
     return "_".join(map(str, parts))
 
 
-def _settings(
+def _describe_settings(
     config: EvaluateConfig, run: TrainConfig, sequences: list[Sequence]
 ) -> dict[str, Any]:
     """The settings that define the meaning of the figures and their subject."""
-    compensated = {str(each.attributes.get("imu_compensated", "no")) for each in sequences}
-    tapped = all(each.waypoints is not None for each in sequences)
+    compensated = {str(sequence.attributes.get("imu_compensated", "no")) for sequence in sequences}
+    tapped = all(sequence.waypoints is not None for sequence in sequences)
     return {
         "dataset": config.dataset,
         "data_root": config.data_root,
         "split": config.split,
-        "recordings": {each.name: round(float(np.ptp(each.time)), 3) for each in sequences},
+        "recordings": {
+            sequence.name: round(float(np.ptp(sequence.time)), 3) for sequence in sequences
+        },
         "estimator": config.estimator,
         "coupling": config.coupling if config.estimator == "ekf" else None,
         "orientation_source": config.orientation,
@@ -265,7 +277,7 @@ def _settings(
         "model": run.model.name,
         "checkpoint": config.checkpoint,
         **{name: getattr(run.data, name) for name in WINDOWS},
-        "filter": configuration.plain(config.filter),
+        "filter": configuration.to_plain(config.filter),
         "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,
         "definitions": DEFINITIONS,
         "device": jax.devices()[0].device_kind,

@@ -1,4 +1,4 @@
-"""The network's displacement of every window of the recordings, cut with a given attitude."""
+"""The network's displacement of every window of the recordings, cut with their attitudes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.config import DataConfig
-from gnio_jax.evaluation.prepare import Recording
+from gnio_jax.evaluation.prepare import PreparedRecording
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.types import Array, Prediction
@@ -20,7 +20,7 @@ from gnio_jax.windows import align_recording, cut_windows, window_starts, withou
 
 WINDOWS_PER_CALL = 512
 DIAGNOSTICS = ("gate", "scale")
-"""The network's diagnostics that are kept for every window. Attention is too large for that."""
+"""Diagnostics of the network that are stored for every window. Attention is too large."""
 
 
 class Displacements(NamedTuple):
@@ -39,40 +39,40 @@ class Displacements(NamedTuple):
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
 
-def given_displacements(recording: Recording, std: float) -> Displacements:
+def reference_displacements(recording: PreparedRecording, std: float) -> Displacements:
     """The displacements of the reference, with a standard deviation in m."""
     value = _at_window_ends(recording.displacement, recording)
     return Displacements(value, np.tile(std**2 * np.eye(3), (len(value), 1, 1)))
 
 
-def no_displacements(recording: Recording) -> Displacements:
+def no_displacements(recording: PreparedRecording) -> Displacements:
     rows = recording.strides
     return Displacements(np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan))
 
 
 def infer(
     network: Network,
-    recordings: list[Recording],
+    recordings: list[PreparedRecording],
     windows: DataConfig,
     progress: Progress = silent,
     diagnostics: tuple[str, ...] = DIAGNOSTICS,
     least_std: float = 0.0,
 ) -> list[Displacements]:
-    """The network's predictions for every window of the recordings, which are cut with
-    `Recording.attitude`, in large batches over all recordings. The results are float64 on the host.
+    """The network's predictions for every window of the recordings, in large batches over all of
+    them. `PreparedRecording.attitude` turns the windows. The results are float64 on the host.
 
     A window that touches a sample which was not measured has no displacement. `diagnostics` names
-    those that are kept, if the network has them. `least_std` is the smallest standard deviation
+    those that are stored, if the network has them. `least_std` is the smallest standard deviation
     that the estimator uses, m (`FilterConfig.log_std_min`).
     """
     parts, starts, turns = [], [], []
-    for each in recordings:
-        assert each.attitude is not None
-        start = window_starts(len(each.gyro) + 1, windows.seen, windows.stride)
+    for recording in recordings:
+        assert recording.attitude is not None
+        start = window_starts(len(recording.gyro) + 1, windows.seen, windows.stride)
         imu, turn = align_recording(
-            each.accel,
-            each.gyro - each.start.gyro_bias,
-            each.attitude[:-1],
+            recording.accel,
+            recording.gyro - recording.start.gyro_bias,
+            recording.attitude[:-1],
             start + windows.context,
             windows.window_rotation,
         )
@@ -81,19 +81,26 @@ def infer(
         turns.append(turn)
     samples = jnp.asarray(np.concatenate(parts))
     start, turn = np.concatenate(starts).astype(np.int32), np.concatenate(turns)
-    total, size, found = len(start), min(WINDOWS_PER_CALL, len(start)), []
+    total, size, predictions = len(start), min(WINDOWS_PER_CALL, len(start)), []
     for begin in range(0, total, size):
         # The last batch is filled up with the last window, so that all batches use one program.
         batch = np.minimum(np.arange(begin, begin + size), total - 1)
         arguments = network.variables, samples, start[batch], turn[batch]
         fixed = {"apply": network.apply, "length": windows.seen, "diagnostics": diagnostics}
-        found.append(jax.device_get(_predict(*arguments, **fixed)))
+        predictions.append(jax.device_get(_predict(*arguments, **fixed)))
         progress(min(1.0, (begin + size) / total))
-    whole = jax.tree.map(lambda *x: np.concatenate(x)[:total].astype(np.float64), *found)
+    prediction = jax.tree.map(
+        lambda *parts: np.concatenate(parts)[:total].astype(np.float64), *predictions
+    )
     ends = np.cumsum([0, *map(len, starts)])
     return [
-        _of_recording(each, jax.tree.map(lambda x, own=own: x[own], whole), windows, least_std)
-        for each, own in zip(recordings, map(slice, ends[:-1], ends[1:]), strict=True)
+        _displacements_of(
+            recording,
+            jax.tree.map(lambda leaf, rows=rows: leaf[rows], prediction),
+            windows,
+            least_std,
+        )
+        for recording, rows in zip(recordings, map(slice, ends[:-1], ends[1:]), strict=True)
     ]
 
 
@@ -112,16 +119,16 @@ def _predict(
 
 
 def keep(prediction: Prediction, names: tuple[str, ...] = DIAGNOSTICS) -> Prediction:
-    """The prediction with only the named diagnostics, if it has them."""
-    kept = {name: value for name, value in prediction.diagnostics.items() if name in names}
-    return prediction._replace(diagnostics=kept)
+    """The prediction with only the named diagnostics, of those that it has."""
+    diagnostics = {name: value for name, value in prediction.diagnostics.items() if name in names}
+    return prediction._replace(diagnostics=diagnostics)
 
 
-def _of_recording(
-    recording: Recording, found: Prediction, windows: DataConfig, least_std: float
+def _displacements_of(
+    recording: PreparedRecording, prediction: Prediction, windows: DataConfig, least_std: float
 ) -> Displacements:
     """The predictions for the windows of one recording."""
-    value = np.asarray(found.displacement)
+    value = np.asarray(prediction.displacement)
     if recording.imu_valid is not None:
         start = window_starts(len(recording.gyro) + 1, windows.seen, windows.stride)
         whole = without_any(~recording.imu_valid, start, windows.seen)
@@ -130,13 +137,16 @@ def _of_recording(
         least = np.log(least_std)
     return Displacements(
         _at_window_ends(value, recording),
-        _at_window_ends(np.asarray(found.covariance(least, np.float64)), recording),
-        {name: _at_window_ends(each, recording) for name, each in found.diagnostics.items()},
+        _at_window_ends(np.asarray(prediction.covariance(least, np.float64)), recording),
+        {
+            name: _at_window_ends(diagnostic, recording)
+            for name, diagnostic in prediction.diagnostics.items()
+        },
     )
 
 
 def _at_window_ends(
-    values: Float[Array, "m *d"], recording: Recording
+    values: Float[Array, "m *d"], recording: PreparedRecording
 ) -> Float[np.ndarray, "k *d"]:
     """Values of the last m windows in the last m rows of a recording, NaN before."""
     missing = np.full((recording.strides - len(values), *values.shape[1:]), np.nan)

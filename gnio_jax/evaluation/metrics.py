@@ -55,8 +55,8 @@ def drift(estimate: Positions, reference: Positions, step: float) -> float:
     error, PDE). The error has grown over the whole path, so holes of the reference are bridged by
     straight lines."""
     error, rows = _trusted_errors(estimate, reference)[-1], np.arange(len(reference))
-    known = finite_rows(reference)
-    bridged = [np.interp(rows, rows[known], axis[known]) for axis in reference.T]
+    trusted = finite_rows(reference)
+    bridged = [np.interp(rows, rows[trusted], axis[trusted]) for axis in reference.T]
     return float(100 * np.linalg.norm(error) / _path_of_reference(np.stack(bridged, 1), step))
 
 
@@ -68,14 +68,14 @@ def rte(estimate: Positions, reference: Positions, step: float, seconds: float =
     span less than `seconds`, it is the error at their end relative to their start, scaled to
     `seconds` (RoNIN's rule).
     """
-    error, apart = estimate - reference, round(seconds / step)
+    error, lag = estimate - reference, round(seconds / step)
     rows = np.flatnonzero(finite_rows(reference))
     if len(rows) < 2:
         raise Undefined("a single trusted row" if len(rows) else "no trusted reference")
     span = int(rows[-1] - rows[0])
-    if span < apart:
-        return float(np.linalg.norm(error[rows[-1]] - error[rows[0]]) * apart / span)
-    return _rms_of_pairs(error[apart:] - error[:-apart], finite_rows(reference), apart, seconds)
+    if span < lag:
+        return float(np.linalg.norm(error[rows[-1]] - error[rows[0]]) * lag / span)
+    return _rms_of_pairs(error[lag:] - error[:-lag], finite_rows(reference), lag, seconds)
 
 
 def rte_distance(estimate: Positions, reference: Positions, metres: float) -> float:
@@ -112,27 +112,29 @@ def rpe(
     part.
     """
     if full:
-        ours, true = (matrix_from_quaternion(each.orientation) for each in (estimate, reference))
+        ours, true = (matrix_from_quaternion(path.orientation) for path in (estimate, reference))
         turn = true @ np.swapaxes(ours, 1, 2)
     else:
         turn = rotation_z(-relative_yaw(estimate.orientation, reference.orientation))
-    apart = round(seconds / step)
-    if apart >= len(estimate.time):
+    lag = round(seconds / step)
+    if lag >= len(estimate.time):
         raise Undefined(f"no two trusted rows {seconds:g} s apart")
-    moved, true = (x.position[apart:] - x.position[:-apart] for x in (estimate, reference))
-    error = (np.einsum("nij,nj->ni", turn[:-apart], moved) - true)[:, :dims]
-    known = finite_rows(reference.orientation[:-apart])
-    return _rms_of_pairs(error, finite_rows(reference.position), apart, seconds, known)
+    displacement, true = (
+        path.position[lag:] - path.position[:-lag] for path in (estimate, reference)
+    )
+    error = (np.einsum("nij,nj->ni", turn[:-lag], displacement) - true)[:, :dims]
+    oriented = finite_rows(reference.orientation[:-lag])
+    return _rms_of_pairs(error, finite_rows(reference.position), lag, seconds, oriented)
 
 
 def _rms_of_pairs(
     error: Float[np.ndarray, "m d"],
     trusted: Bool[np.ndarray, "n"],
-    apart: int,
+    lag: int,
     seconds: float,
     counted: Bool[np.ndarray, "m"] | bool = True,
 ) -> float:
-    pairs = trusted[apart:] & trusted[:-apart] & counted
+    pairs = trusted[lag:] & trusted[:-lag] & counted
     return _rms(error[pairs], f"no two trusted rows {seconds:g} s apart")
 
 
@@ -162,11 +164,11 @@ def path_length(position: Positions, step: float, seconds: float = 1.0) -> float
     """
     if len(position) < 2:
         raise Undefined("a single row")
-    apart, trusted = max(1, round(seconds / step)), np.flatnonzero(finite_rows(position))
-    _, first = np.unique(trusted // apart, return_index=True)
+    stretch, trusted = max(1, round(seconds / step)), np.flatnonzero(finite_rows(position))
+    _, first = np.unique(trusted // stretch, return_index=True)
     corners = np.unique(np.append(trusted[first], trusted[-1:]))
     sides = np.linalg.norm(np.diff(position[corners], axis=0), axis=1)
-    return float(sides[np.diff(corners) <= 2 * apart].sum())
+    return float(sides[np.diff(corners) <= 2 * stretch].sum())
 
 
 def path_length_ratio(estimate: Positions, reference: Positions, step: float) -> float:
@@ -188,22 +190,23 @@ def standing(reference: Positions, step: float) -> Bool[np.ndarray, "n"]:
     """Rows of stretches of at least 2 s in which every displacement over 1 s is below 0.05 m. The
     interval of one second tolerates the noise of the reference and the swaying of a person who
     stands (ours)."""
-    apart, still = max(1, round(1.0 / step)), np.zeros(len(reference), bool)
-    if len(reference) <= apart:
+    lag, still = max(1, round(1.0 / step)), np.zeros(len(reference), bool)
+    if len(reference) <= lag:
         return still
     with np.errstate(invalid="ignore"):
-        moved = np.linalg.norm(reference[apart:] - reference[:-apart], axis=1)
-        slow = moved < STANDING_SPEED * apart * step
+        distance = np.linalg.norm(reference[lag:] - reference[:-lag], axis=1)
+        slow = distance < STANDING_SPEED * lag * step
     for start, stop in spans(slow):
-        if (stop - 1 - start + apart) * step >= STANDING_SECONDS - 1e-9:
-            still[start : stop + apart] = True
+        if (stop - 1 - start + lag) * step >= STANDING_SECONDS - 1e-9:
+            still[start : stop + lag] = True
     return still & finite_rows(reference)
 
 
 def stationary_drift(estimate: Positions, reference: Positions, step: float) -> float:
     """Metres that the estimate walks (`path_length`) per minute in which the reference stands still
     (`standing`). A gate on the displacement should reduce this drift (GNIO)."""
-    stretches = [each for each in spans(standing(reference, step)) if each[1] - each[0] > 1]
+    rests = spans(standing(reference, step))
+    stretches = [(start, stop) for start, stop in rests if stop - start > 1]
     if not stretches:
         raise Undefined(f"the reference never stands still for {STANDING_SECONDS:g} s")
     walked = sum(path_length(estimate[start:stop], step) for start, stop in stretches)
@@ -219,10 +222,10 @@ def leg_ratio(estimate: Positions, waypoints: Positions) -> float:
     is the straight line between its positions at the two times. A late tap makes one leg longer and
     the next one shorter, which hardly changes a median. Legs under 1 m are left out."""
     ours, true = (np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (estimate, waypoints))
-    long = true >= LEAST_LEG
-    if not long.any():
+    counted = true >= LEAST_LEG
+    if not counted.any():
         raise Undefined(f"no leg of {LEAST_LEG:g} m")
-    return float(np.median(ours[long] / true[long]))
+    return float(np.median(ours[counted] / true[counted]))
 
 
 def leg_path_ratio(estimate: Positions, waypoints: Positions) -> float:
@@ -326,7 +329,7 @@ class Filtered(NamedTuple):
     """1 if the measurement was used, 0 if it was rejected, NaN if there was none."""
 
 
-class Compared(NamedTuple):
+class MetricInputs(NamedTuple):
     """An estimate and its reference, in the form that the metrics need."""
 
     raw: Trajectory
@@ -356,11 +359,11 @@ class Compared(NamedTuple):
     def at_waypoints(self) -> tuple[Positions, Positions]:
         """The aligned estimate's positions, and the waypoints that are within it."""
         assert self.waypoints is not None
-        passed = positions_at(self.aligned, self.waypoints.time)
-        known = finite_rows(passed)
-        return passed[known], self.waypoints.position[known]
+        position = positions_at(self.aligned, self.waypoints.time)
+        rows = finite_rows(position)
+        return position[rows], self.waypoints.position[rows]
 
-    def of_filter(self) -> Filtered:
+    def filter_results(self) -> Filtered:
         assert self.filtered is not None
         return self.filtered
 
@@ -370,14 +373,14 @@ class Compared(NamedTuple):
         as exact."""
         yaw = relative_yaw(self.raw.orientation[:1], self.started.orientation[:1])[0]
         error = (self.started.position - self.reference.position) @ rotation_z(yaw).T
-        covariance, dims = self.of_filter().covariance, self.dims
-        good = finite_rows(error) & (np.einsum("nii->ni", covariance) != 0).all(1)
+        covariance, dims = self.filter_results().covariance, self.dims
+        rows = finite_rows(error) & (np.einsum("nii->ni", covariance) != 0).all(1)
         squared = np.full(len(error), np.nan)
-        squared[good] = normalised_squared(error[good, :dims], covariance[good, :dims, :dims])
+        squared[rows] = normalised_squared(error[rows, :dims], covariance[rows, :dims, :dims])
         return squared
 
 
-Metric = Callable[[Compared], float]
+Metric = Callable[[MetricInputs], float]
 
 PATH: dict[str, Metric] = {"path_length": lambda c: path_length(c.paths[1], c.step)}
 SPATIAL: dict[str, Metric] = {
@@ -409,9 +412,9 @@ OTHERS: dict[str, Metric] = {
     "yaw_drift": lambda c: yaw_drift(c.raw.orientation, c.reference.orientation, c.step),
 }
 OF_FILTER: dict[str, Metric] = {
-    "nis": lambda c: mean_normalised(c.of_filter().nis, 3),
-    "nis_coverage": lambda c: coverage(c.of_filter().nis, 3),
-    "accepted": lambda c: 100.0 * mean_normalised(c.of_filter().accepted, 1),
+    "nis": lambda c: mean_normalised(c.filter_results().nis, 3),
+    "nis_coverage": lambda c: coverage(c.filter_results().nis, 3),
+    "accepted": lambda c: 100.0 * mean_normalised(c.filter_results().accepted, 1),
 }
 """Metrics that need no reference."""
 LEGS: dict[str, Metric] = {
@@ -479,8 +482,8 @@ def measure(
     reference = Trajectory(reference.time, *poses)
     path, lost = estimate, ""
     if not estimate.known.all():
-        since = estimate.time[np.argmin(estimate.known)] - estimate.time[0]
-        lost = f"the estimate is not finite from {since:.1f} s on"
+        seconds = estimate.time[np.argmin(estimate.known)] - estimate.time[0]
+        lost = f"the estimate is not finite from {seconds:.1f} s on"
         # The reference decides which metrics exist, so an estimate at rest is measured to find
         # them.
         level = np.tile([1.0, 0, 0, 0], (len(estimate.time), 1))
@@ -492,15 +495,15 @@ def measure(
     except Undefined as undefined:
         missing = str(undefined)
     step = float(np.median(np.diff(path.time))) if len(path.time) > 1 else 1.0
-    compared = Compared(path, aligned, started, reference, step, filtered, waypoints)
+    inputs = MetricInputs(path, aligned, started, reference, step, filtered, waypoints)
     values: dict[str, float | None] = {"duration": float(path.time[-1] - path.time[0])}
     reasons: dict[str, str] = {}
-    for name, metric, seen in _metrics(compared):
+    for name, metric, metric_inputs in _metrics(inputs):
         try:
             if missing and name not in OF_FILTER:
                 raise Undefined(missing)
             with np.errstate(over="ignore", invalid="ignore"):
-                value = metric(seen)
+                value = metric(metric_inputs)
             reason = "" if name in OF_REFERENCE else lost
             if not reason and not math.isfinite(value):
                 reason = "the error is too large for a number"
@@ -515,24 +518,28 @@ def measure(
     return Measures(values, reasons, bool(lost) or far)
 
 
-def _metrics(compared: Compared) -> Iterator[tuple[str, Metric, Compared]]:
+def _metrics(inputs: MetricInputs) -> Iterator[tuple[str, Metric, MetricInputs]]:
     """Name, metric and its data, in the order of the files."""
-    nees, of_filter = ({}, {}) if compared.filtered is None else (NEES, OF_FILTER)
-    if compared.waypoints is None:
+    nees, filter_metrics = ({}, {}) if inputs.filtered is None else (NEES, OF_FILTER)
+    if inputs.waypoints is None:
         spatial = SPATIAL | nees
-        groups = [(3, "", PATH | spatial), (2, "_2d", spatial), (3, "", OTHERS | of_filter)]
+        groups = [(3, "", PATH | spatial), (2, "_2d", spatial), (3, "", OTHERS | filter_metrics)]
     else:
-        groups = [(3, "", LEGS | OF_WAYPOINTS | of_filter)]
+        groups = [(3, "", LEGS | OF_WAYPOINTS | filter_metrics)]
     for dims, tag, metrics in groups:
         for name, metric in metrics.items():
-            yield name + tag, metric, compared._replace(dims=dims)
+            yield name + tag, metric, inputs._replace(dims=dims)
 
 
 def score(estimates: Iterable[Any], alignment: Alignment = "origin") -> dict[str, Measures]:
-    """Every metric of every `Estimate`, by sequence."""
+    """Every metric of every `SequenceEstimate`, by sequence."""
     return {
-        each.name: measure(
-            each.trajectory, each.reference, alignment, each.filtered, each.waypoints
+        estimate.name: measure(
+            estimate.trajectory,
+            estimate.reference,
+            alignment,
+            estimate.filtered,
+            estimate.waypoints,
         )
-        for each in estimates
+        for estimate in estimates
     }

@@ -8,33 +8,25 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import PercentFormatter
 
-from gnio_jax.evaluation import colours, metrics, statistics, tabulate
-from gnio_jax.evaluation.estimate import Estimate, in_one_frame
-from gnio_jax.evaluation.infer import Displacements
-from gnio_jax.evaluation.metrics import Filtered
-from gnio_jax.evaluation.report import Report, file_names
-from gnio_jax.evaluation.trajectory import Alignment, positions_at
-from gnio_jax.files import replacing, shown_name
-from gnio_jax.numerics import finite_rows, spans
+from gnio_jax import drawing
+from gnio_jax.evaluation import metrics, statistics, tabulate
+from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation.views import SIGMAS, View, ellipses
+from gnio_jax.files import file_stems, shown_name
+from gnio_jax.numerics import finite_rows
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Waypoints
 
 STANDING = "#E8E8E8"
-GRID = "#DDDDDD"
-DOTS_PER_INCH = 120
-START: dict[str, Any] = {"marker": "o", "ls": "", "mfc": "white", "ms": 8, "mew": 1.8}
-END: dict[str, Any] = {"marker": "s", "ls": "", "ms": 7}
 TAP: dict[str, Any] = {"marker": "x", "ls": "", "ms": 7, "mew": 1.8}
 MARKERS = "os^Dv"
 """Markers; the next one is used when there are more rows than colours."""
@@ -44,217 +36,133 @@ TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
 """Errors that the title of a sequence names."""
 
 
-# --- the data that a picture draws
-
-
-class View(NamedTuple):
-    """A trajectory and its reference in one frame, with the curves of network and filter.
-
-    There are n rows, one for each row of the estimate. Unknown values are NaN.
-    """
-
-    name: str
-    time: Float[np.ndarray, "n"]
-    """Time from the start, s."""
-    position: Float[np.ndarray, "n 3"]
-    """Position of the estimate, m."""
-    reference: Float[np.ndarray, "n 3"]
-    """Position of the reference, m."""
-    network: Displacements
-    filtered: Filtered
-    waypoints: Waypoints
-    """Waypoints, at times from the start; none if the sequence has poses."""
-    passed: Float[np.ndarray, "k 2"]
-    """Horizontal position of the estimate at the times of the waypoints, m."""
-
-    @property
-    def step(self) -> float:
-        """Time between two rows, s."""
-        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
-
-    @property
-    def known(self) -> bool:
-        """Whether there is a reference."""
-        return bool(np.isfinite(self.reference).any())
-
-    @property
-    def errors(self) -> Float[np.ndarray, "_"]:
-        """Horizontal errors where there is a reference, or at the waypoints, m."""
-        if not self.known:
-            return np.linalg.norm(self.passed - self.waypoints.position, axis=1)
-        error = (self.position - self.reference)[finite_rows(self.reference), :2]
-        return np.linalg.norm(error, axis=1)
-
-
-def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
-    """An estimate in the frame of its reference; without an `alignment` the reference is moved to
-    the start of the estimate."""
-    seen = in_one_frame(estimate, alignment)
-    rows = len(seen.trajectory.time)
-    none, blank = np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan)
-    begin = seen.trajectory.time[0]
-    stamps, places = seen.waypoints or Waypoints(np.zeros(0), np.zeros((0, 2)))
-    return View(
-        seen.name,
-        seen.trajectory.time - begin,
-        seen.trajectory.position,
-        seen.reference.position,
-        seen.displacements or Displacements(none, blank),
-        seen.filtered or Filtered(blank, none[:, 0], none[:, 0]),
-        Waypoints(stamps - begin, places),
-        positions_at(seen.trajectory, stamps),
-    )
-
-
-class Ellipses(NamedTuple):
-    """Contours of horizontal covariances at `SIGMAS`, one for each row; NaN where one is not
-    finite."""
-
-    major: Float[np.ndarray, "n"]
-    """Semi-axis, m."""
-    minor: Float[np.ndarray, "n"]
-    """Semi-axis, m."""
-    angle: Float[np.ndarray, "n"]
-    """Angle of the major axis, from x towards y, rad."""
-
-
-def ellipses(covariance: Float[np.ndarray, "n 3 3"]) -> Ellipses:
-    """The contours of the horizontal parts of covariances of positions, m²."""
-    horizontal = covariance[:, :2, :2]
-    known = finite_rows(horizontal.reshape(-1, 4))
-    variance, axes = np.linalg.eigh(np.where(known[:, None, None], horizontal, np.eye(2)))
-    minor, major = colours.SIGMAS * np.sqrt(np.maximum(variance, 0.0)).T
-    angle = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
-    return Ellipses(*(np.where(known, part, np.nan) for part in (major, minor, angle)))
+# --- one sequence
 
 
 def speed(position: Float[np.ndarray, "n 3"], step: float) -> Float[np.ndarray, "n"]:
     """Horizontal speed, m/s, as a mean over the second around each row."""
-    apart = max(1, round(1.0 / step))
-    found = np.full(len(position), np.nan)
-    if len(position) > apart:
-        moved = np.linalg.norm((position[apart:] - position[:-apart])[:, :2], axis=1)
-        found[apart // 2 :][: len(moved)] = moved / (apart * step)
-    return found
+    lag = max(1, round(1.0 / step))
+    speeds = np.full(len(position), np.nan)
+    if len(position) > lag:
+        distance = np.linalg.norm((position[lag:] - position[:-lag])[:, :2], axis=1)
+        speeds[lag // 2 :][: len(distance)] = distance / (lag * step)
+    return speeds
 
 
-# --- one sequence
-
-
-def sequence(seen: View, title: str = "") -> Figure:
+def sequence(view: View, title: str = "") -> Figure:
     """A picture with a map on the left and curves over time on the right: the errors with the
     filter's 3σ, the speed, and the gate of the network, or if there is none, which displacements
     the filter used."""
     strips: list[Callable[[Axes, View], None]] = [_draw_speed]
-    if seen.known or np.isfinite(seen.filtered.covariance).any():
+    if view.has_reference or np.isfinite(view.filtered.covariance).any():
         strips = [_draw_error, functools.partial(_draw_error, vertical=True), *strips]
-    elif len(seen.passed):
+    elif len(view.at_waypoints):
         strips = [_draw_error, *strips]
-    if np.isfinite(seen.network.diagnostics.get("gate", np.nan)).any():
+    if np.isfinite(view.network.diagnostics.get("gate", np.nan)).any():
         strips.append(_draw_gate)
-    elif np.isfinite(seen.filtered.accepted).any():
+    elif np.isfinite(view.filtered.accepted).any():
         strips.append(_draw_accepted)
     figure = Figure(figsize=(12.6, 6.8), layout="constrained")
     grid = figure.add_gridspec(len(strips), 2, width_ratios=(1.1, 1.0))
-    _draw_map(figure.add_subplot(grid[:, 0]), seen)
-    still = metrics.standing(seen.reference, seen.step)
+    _draw_map(figure.add_subplot(grid[:, 0]), view)
+    standing = metrics.standing(view.reference, view.step)
     for row, draw in enumerate(strips):
         axes = figure.add_subplot(grid[row, 1])
-        _shade(axes, seen.time, still)
-        draw(axes, seen)
-        axes.set_xlim(seen.time[0], max(seen.time[-1], seen.time[0] + 1e-3))
+        drawing.shade(axes, view.time, standing, STANDING, "standing still")
+        draw(axes, view)
+        axes.set_xlim(view.time[0], max(view.time[-1], view.time[0] + 1e-3))
         axes.tick_params(labelbottom=draw is strips[-1])
         # The legend is beside the curves, where it hides nothing.
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
-        finish(axes)
+        drawing.finish(axes)
     figure.axes[-1].set_xlabel("time (s)")
-    figure.suptitle(title or shown_name(seen.name), fontsize=11)
+    figure.suptitle(title or shown_name(view.name), fontsize=11)
     return figure
 
 
-def _draw_map(axes: Axes, seen: View) -> None:
+def _draw_map(axes: Axes, view: View) -> None:
     """Plan view, both axes to the same scale."""
-    if seen.known:
-        axes.plot(*seen.reference[:, :2].T, color=colours.REFERENCE, lw=1.6, label="reference")
-    axes.plot(*seen.position[:, :2].T, color=colours.BLUE, lw=1.4, label="estimate")
-    if len(seen.passed):
+    if view.has_reference:
+        axes.plot(*view.reference[:, :2].T, color=drawing.REFERENCE, lw=1.6, label="reference")
+    axes.plot(*view.position[:, :2].T, color=drawing.BLUE, lw=1.4, label="estimate")
+    if len(view.at_waypoints):
         axes.plot(
-            *seen.waypoints.position.T, color=colours.REFERENCE, zorder=5, label="waypoint", **TAP
+            *view.waypoints.position.T, color=drawing.REFERENCE, zorder=5, label="waypoint", **TAP
         )
-        for ends in np.stack([seen.waypoints.position, seen.passed], 1):
-            axes.plot(*ends.T, color=colours.VERMILION, lw=1.0, zorder=3)
-        axes.plot([], [], color=colours.VERMILION, lw=1.0, label="error at its time")
-    shapes = ellipses(seen.filtered.covariance)
-    there = np.flatnonzero(np.isfinite(shapes.major) & finite_rows(seen.position))
-    if len(there):
-        outline: dict[str, Any] = {"color": colours.BLUE, "lw": 0.9, "alpha": 0.55}
-        for row in there[np.linspace(0, len(there) - 1, ELLIPSES + 1).astype(int)[1:]]:
+        for ends in np.stack([view.waypoints.position, view.at_waypoints], 1):
+            axes.plot(*ends.T, color=drawing.VERMILION, lw=1.0, zorder=3)
+        axes.plot([], [], color=drawing.VERMILION, lw=1.0, label="error at its time")
+    shapes = ellipses(view.filtered.covariance)
+    rows = np.flatnonzero(np.isfinite(shapes.major) & finite_rows(view.position))
+    if len(rows):
+        outline: dict[str, Any] = {"color": drawing.BLUE, "lw": 0.9, "alpha": 0.55}
+        for row in rows[np.linspace(0, len(rows) - 1, ELLIPSES + 1).astype(int)[1:]]:
             size, angle = (2 * shapes.major[row], 2 * shapes.minor[row]), shapes.angle[row]
-            shape = Ellipse(tuple(seen.position[row, :2]), *size, angle=float(np.degrees(angle)))
+            shape = Ellipse(tuple(view.position[row, :2]), *size, angle=float(np.degrees(angle)))
             shape.set(fill=False, **outline)
             axes.add_patch(shape)
         axes.plot([], [], label="3σ", **outline)
-    for path, colour in ((seen.reference, colours.REFERENCE), (seen.position, colours.BLUE)):
-        good = path[finite_rows(path)]
-        if len(good):
-            axes.plot(*good[0, :2], color=colour, zorder=4, **START)
-            axes.plot(*good[-1, :2], color=colour, zorder=4, **END)
-    axes.plot([], [], color=colours.GREY, label="start", **START)
-    axes.plot([], [], color=colours.GREY, label="end", **END)
+    for path, colour in ((view.reference, drawing.REFERENCE), (view.position, drawing.BLUE)):
+        points = path[finite_rows(path)]
+        if len(points):
+            axes.plot(*points[0, :2], color=colour, zorder=4, **drawing.START)
+            axes.plot(*points[-1, :2], color=colour, zorder=4, **drawing.END)
+    axes.plot([], [], color=drawing.GREY, label="start", **drawing.START)
+    axes.plot([], [], color=drawing.GREY, label="end", **drawing.END)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.legend(loc="best", ncols=2, fontsize=9, framealpha=0.9)
-    finish(axes)
+    drawing.finish(axes)
 
 
-def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
+def _draw_error(axes: Axes, view: View, vertical: bool = False) -> None:
     """Draw the error of the position, with the filter's 3σ behind it; without a reference only the
     3σ."""
-    bound, colour, name = ellipses(seen.filtered.covariance).major, colours.BLUE, "horizontal"
-    error = np.linalg.norm((seen.position - seen.reference)[:, :2], axis=1)
+    bound, colour, name = ellipses(view.filtered.covariance).major, drawing.BLUE, "horizontal"
+    error = np.linalg.norm((view.position - view.reference)[:, :2], axis=1)
     if vertical:
-        bound = colours.SIGMAS * np.sqrt(np.maximum(seen.filtered.covariance[:, 2, 2], 0.0))
-        error, colour, name = (seen.position - seen.reference)[:, 2], colours.GREEN, "vertical"
+        bound = SIGMAS * np.sqrt(np.maximum(view.filtered.covariance[:, 2, 2], 0.0))
+        error, colour, name = (view.position - view.reference)[:, 2], drawing.GREEN, "vertical"
     if np.isfinite(bound).any():
         low = -bound if vertical else np.zeros_like(bound)
-        axes.fill_between(seen.time, low, bound, color=colour, alpha=0.16, lw=0, label="3σ")
-    if seen.known:
-        axes.plot(seen.time, error, color=colour, lw=1.2, label="error")
-    tapped = len(seen.passed) > 0 and not vertical
-    if tapped:
-        style = {"color": colours.REFERENCE, "label": "at waypoints", "clip_on": False, **TAP}
-        axes.plot(seen.waypoints.time, seen.errors, **style)
-    axes.axhline(0, color=colours.REFERENCE, lw=0.6)
-    axes.set_ylabel(f"{name}\n{'error' if seen.known or tapped else '3σ'} (m)")
+        axes.fill_between(view.time, low, bound, color=colour, alpha=0.16, lw=0, label="3σ")
+    if view.has_reference:
+        axes.plot(view.time, error, color=colour, lw=1.2, label="error")
+    has_waypoints = len(view.at_waypoints) > 0 and not vertical
+    if has_waypoints:
+        style = {"color": drawing.REFERENCE, "label": "at waypoints", "clip_on": False, **TAP}
+        axes.plot(view.waypoints.time, view.errors, **style)
+    axes.axhline(0, color=drawing.REFERENCE, lw=0.6)
+    axes.set_ylabel(f"{name}\n{'error' if view.has_reference or has_waypoints else '3σ'} (m)")
 
 
-def _draw_speed(axes: Axes, seen: View) -> None:
-    black = {"color": colours.REFERENCE, "lw": 1.4}
-    if seen.known:
-        axes.plot(seen.time, speed(seen.reference, seen.step), label="reference", **black)
-    if len(seen.passed):
-        times, places = seen.waypoints
-        legs = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times)
+def _draw_speed(axes: Axes, view: View) -> None:
+    black = {"color": drawing.REFERENCE, "lw": 1.4}
+    if view.has_reference:
+        axes.plot(view.time, speed(view.reference, view.step), label="reference", **black)
+    if len(view.at_waypoints):
+        times, positions = view.waypoints
+        legs = np.linalg.norm(np.diff(positions, axis=0), axis=1) / np.diff(times)
         axes.stairs(legs, times, baseline=None, label="legs", **black)
-    own = speed(seen.position, seen.step)
-    axes.plot(seen.time, own, color=colours.BLUE, lw=1.1, label="estimate")
+    estimated = speed(view.position, view.step)
+    axes.plot(view.time, estimated, color=drawing.BLUE, lw=1.1, label="estimate")
     axes.set_ylabel("horizontal\nspeed (m/s)")
     axes.set_ylim(bottom=0)
 
 
-def _draw_gate(axes: Axes, seen: View) -> None:
-    gate = seen.network.diagnostics["gate"]
-    for k, (name, colour) in enumerate(colours.AXES.items()):
-        axes.plot(seen.time, gate[:, k], color=colour, lw=1.1, label=name)
-    axes.axhline(0, color=colours.REFERENCE, lw=0.6)
+def _draw_gate(axes: Axes, view: View) -> None:
+    gate = view.network.diagnostics["gate"]
+    for k, (name, colour) in enumerate(drawing.AXES.items()):
+        axes.plot(view.time, gate[:, k], color=colour, lw=1.1, label=name)
+    axes.axhline(0, color=drawing.REFERENCE, lw=0.6)
     axes.set_ylim(-1.05 if np.nanmin(gate) < 0 else -0.05, 1.05)
     axes.set_ylabel("gate γ (–)")
 
 
-def _draw_accepted(axes: Axes, seen: View) -> None:
-    axes.plot(seen.time, seen.filtered.accepted, color=colours.BLUE, lw=1.0, label="used")
+def _draw_accepted(axes: Axes, view: View) -> None:
+    axes.plot(view.time, view.filtered.accepted, color=drawing.BLUE, lw=1.0, label="used")
     axes.set_ylim(-0.05, 1.05)
     axes.set_ylabel("displacement")
 
@@ -267,35 +175,36 @@ def error_cdf(views: list[View], report: Report) -> Figure:
     sequences' ATE with the reference rows. For a sequence with waypoints these are its errors there
     and their root mean square."""
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    errors = [seen.errors for seen in views if len(seen.errors)]
-    posed = any(seen.known for seen in views)
-    tapped = any(len(seen.passed) for seen in views)
+    sample_axes, sequence_axes = figure.subplots(1, 2, sharey=True)
+    errors = [view.errors for view in views if len(view.errors)]
+    has_references = any(view.has_reference for view in views)
+    has_waypoints = any(len(view.at_waypoints) for view in views)
     for error in errors:
-        _step(left, error, color=colours.BLUE, lw=0.7, alpha=0.25)
+        _step(sample_axes, error, color=drawing.BLUE, lw=0.7, alpha=0.25)
     if errors:
-        label = "all samples" if posed else "all waypoints"
-        _step(left, np.concatenate(errors), color=colours.BLUE, lw=2.2, label=label)
-    left.plot([], [], color=colours.BLUE, lw=0.7, alpha=0.5, label="one sequence")
-    left.set_xlabel("horizontal position error (m)")
-    left.set_ylabel("share with at most this error")
-    left.yaxis.set_major_formatter(PercentFormatter(1.0))
-    scored = {"this network": report.scores, **report.reference_rows}
-    styles = ((colours.BLUE, "-"), (colours.VERMILION, "--"), (colours.GREEN, "-."))
-    for (name, scores), (colour, style) in zip(scored.items(), styles, strict=False):
-        found = [own.values.get(x) for own in scores.values() for x in ("ate_2d", "waypoint_rms")]
-        values = np.array([value for value in found if value is not None])
+        label = "all samples" if has_references else "all waypoints"
+        _step(sample_axes, np.concatenate(errors), color=drawing.BLUE, lw=2.2, label=label)
+    sample_axes.plot([], [], color=drawing.BLUE, lw=0.7, alpha=0.5, label="one sequence")
+    sample_axes.set_xlabel("horizontal position error (m)")
+    sample_axes.set_ylabel("share with at most this error")
+    sample_axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    rows = {"this network": report.scores, **report.reference_rows}
+    styles = ((drawing.BLUE, "-"), (drawing.VERMILION, "--"), (drawing.GREEN, "-."))
+    for (name, scores), (colour, style) in zip(rows.items(), styles, strict=False):
+        metrics_of = [measures.values for measures in scores.values()]
+        figures = [row.get(metric) for row in metrics_of for metric in ("ate_2d", "waypoint_rms")]
+        values = np.array([value for value in figures if value is not None])
         if len(values):
             label = f"{name.replace('_', ' ')} (median {np.median(values):.2f} m)"
-            _step(right, values, color=colour, lw=1.8, ls=style, label=label)
-    errors_of = {"ATE in 2-D": posed, "rms at waypoints": tapped}
-    shown = " or ".join(text for text, there in errors_of.items() if there)
-    right.set_xlabel(f"{shown} of a sequence (m)")
-    for axes in (left, right):
+            _step(sequence_axes, values, color=colour, lw=1.8, ls=style, label=label)
+    kinds = {"ATE in 2-D": has_references, "rms at waypoints": has_waypoints}
+    shown = " or ".join(text for text, applies in kinds.items() if applies)
+    sequence_axes.set_xlabel(f"{shown} of a sequence (m)")
+    for axes in (sample_axes, sequence_axes):
         axes.set_ylim(0, 1.02)
         axes.set_xlim(left=0)
         axes.legend(loc="lower right", fontsize=9, framealpha=0.9)
-        finish(axes)
+        drawing.finish(axes)
     settings = report.settings
     subject = f"{settings['dataset']} {settings['split']}: {settings['estimator']}"
     figure.suptitle(f"{subject}, {len(errors)} sequences", fontsize=11)
@@ -310,41 +219,48 @@ def _step(axes: Axes, values: Float[np.ndarray, "k"], **style: Any) -> None:
     axes.step(np.concatenate([[0.0], x]), share, where="post", **style)
 
 
-def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
+def sequence_dots(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
     """A metric of every sequence for every row. A dot is the mean over seeds, and a fainter stroke
     is one seed; rows are one below the other. Each sequence has a line, sorted by the first row,
     with its name and its person or session. A mark shows that a row diverged; this row then has no
     dot."""
     seeds = [[report.scores for report in row] for row in rows.values()]
-    lost = [statistics.lost(row) for row in seeds]
-    tables = [statistics.values(row, metric) for row in seeds]
-    groups = {n: own for row in rows.values() for each in row for n, own in each.groups.items()}
+    divergences = [statistics.count_divergences(row) for row in seeds]
+    tables = [statistics.collect_values(row, metric) for row in seeds]
+    groups = {
+        name: group
+        for row in rows.values()
+        for report in row
+        for name, group in report.groups.items()
+    }
     settings = next(iter(rows.values()))[0].settings
-    first = {name: float(np.mean(own)) for name, own in tables[0].items()}
+    first = {name: float(np.mean(values)) for name, values in tables[0].items()}
     names = sorted(
         dict.fromkeys(name for table in tables for name in table),
         key=lambda name: (name in first, first.get(name, 0.0), name),
     )
-    height = 0.24 + 0.08 * len(rows)
-    figure = Figure(figsize=(8.0, 2.0 + height * len(names)), layout="constrained")
+    size = 8.0, 2.0 + (0.24 + 0.08 * len(rows)) * len(names)
+    figure = Figure(figsize=size, layout="constrained")
     axes, legend = figure.add_subplot(), {}
-    palette = (colours.GREY, *colours.COLOURS)
-    for number, (label, table, diverged) in enumerate(zip(rows, tables, lost, strict=True)):
+    palette = (drawing.GREY, *drawing.COLOURS)
+    for number, (label, table, diverged) in enumerate(zip(rows, tables, divergences, strict=True)):
         colour = palette[number % len(palette)]
         marker = MARKERS[number // len(palette) % len(MARKERS)]
         shift = 0.6 * (0.5 - number / max(len(rows) - 1, 1))  # equal values would hide each other
-        places = [place + shift for place, name in enumerate(names) if name in table]
-        values = [table[n] * (np.nan if n in diverged else 1.0) for n in names if n in table]
-        means = [np.mean(own) if np.isfinite(own).all() else np.nan for own in values]
-        (dots,) = axes.plot(means, places, marker, ms=6, color=colour, zorder=3)
-        for place, own in zip(places, values, strict=True):
-            if len(own) > 1:
-                axes.plot(own, [place] * len(own), "|", ms=8, color=colour, alpha=0.6)
+        heights = [line + shift for line, name in enumerate(names) if name in table]
+        rows_of_seeds = [
+            table[name] * (np.nan if name in diverged else 1.0) for name in names if name in table
+        ]
+        means = [np.mean(row) if np.isfinite(row).all() else np.nan for row in rows_of_seeds]
+        (dots,) = axes.plot(means, heights, marker, ms=6, color=colour, zorder=3)
+        for height, row in zip(heights, rows_of_seeds, strict=True):
+            if len(row) > 1:
+                axes.plot(row, [height] * len(row), "|", ms=8, color=colour, alpha=0.6)
         # Matplotlib ignores labels that begin with an underscore, so a zero-width space goes before
         # it.
         text = shown_name(label, 100)
         legend["\u200b" + text if text.startswith("_") else text] = dots
-    marked = {name for diverged in lost for name in diverged}
+    marked = {name for diverged in divergences for name in diverged}
     ticks = [
         f"{shown_name(name, 40)}  ({shown_name(groups[name], 20)}){' †' if name in marked else ''}"
         for name in names
@@ -357,45 +273,20 @@ def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
     columns = 2 if max(map(len, legend)) < 40 else 1
     style = {"fontsize": 8, "frameon": False, "loc": "outside lower center", "ncols": columns}
     figure.legend(legend.values(), legend.keys(), **style)
-    finish(axes)
+    drawing.finish(axes)
     return figure
 
 
 def save_all(folder: Path, views: list[View], report: Report, progress: Progress = silent) -> None:
     """Every picture as a PNG in `folder`: one for each sequence, and `error_cdf`."""
     folder.mkdir(parents=True, exist_ok=True)
-    stems = file_names([seen.name for seen in views])
-    for done, (stem, seen) in enumerate(zip(stems, views, strict=True)):
-        progress(done / len(views))
-        values = report.scores[seen.name].values
-        known = {x: text for x, text in TITLE.items() if values.get(x) is not None}
-        errors = [f"{heading} {values[name]:.2f} m" for name, heading in known.items()]
-        title = ": ".join(filter(None, (shown_name(seen.name), ", ".join(errors))))
-        save(folder / f"{stem}.png", sequence(seen, title))
-    if any(len(seen.errors) for seen in views):
-        save(folder / "error_cdf.png", error_cdf(views, report))
-
-
-# --- parts of a picture
-
-
-def save(path: Path, figure: Figure) -> None:
-    """Write one figure as a PNG, whole or not at all."""
-    FigureCanvasAgg(figure)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=DOTS_PER_INCH)
-
-
-def finish(axes: Axes) -> None:
-    """Put the grid behind the lines, and remove the frame above and to the right."""
-    axes.grid(True, color=GRID, lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _shade(axes: Axes, time: Float[np.ndarray, "n"], still: Bool[np.ndarray, "n"]) -> None:
-    """Shade the times at which the reference stands still, with one entry in the legend."""
-    for number, (start, stop) in enumerate(spans(still)):
-        begin, end = float(time[start]), float(time[stop - 1])
-        label = "standing still" if not number else None
-        axes.axvspan(begin, end, color=STANDING, lw=0, zorder=0, label=label)
+    stems = file_stems([view.name for view in views])
+    for number, (stem, view) in enumerate(zip(stems, views, strict=True)):
+        progress(number / len(views))
+        values = report.scores[view.name].values
+        headings = {name: text for name, text in TITLE.items() if values.get(name) is not None}
+        errors = [f"{heading} {values[name]:.2f} m" for name, heading in headings.items()]
+        title = ": ".join(filter(None, (shown_name(view.name), ", ".join(errors))))
+        drawing.save(folder / f"{stem}.png", sequence(view, title))
+    if any(len(view.errors) for view in views):
+        drawing.save(folder / "error_cdf.png", error_cdf(views, report))

@@ -3,6 +3,7 @@ start."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
@@ -12,11 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterSettings
-from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import Trajectory
-from gnio_jax.filtering import FilterConfig, FilterState, InitialStd, initial_state, level_state
-from gnio_jax.filtering.settings import filter_config
+from gnio_jax.filtering import (
+    Filter,
+    FilterState,
+    InitialStd,
+    initial_state,
+    level_state,
+    make_filter,
+)
 from gnio_jax.filtering.start import rest_at_start
 from gnio_jax.numerics import (
     cumulative_rotation,
@@ -69,13 +75,14 @@ class Start(NamedTuple):
         along it is considered."""
         return self.raw_gyro * self.rotation[2]
 
-    def state(self, config: FilterConfig) -> FilterState:
-        """The start as a state of the filter."""
-        known = self.rotation, self.velocity, self.position, self.gyro_bias
-        return initial_state(config, *known, 0, self.std, self.level_gyro_bias)
+    def state(self, ekf: Filter) -> FilterState:
+        """The start as a state of the filter, with the standard deviations of this start."""
+        ekf = dataclasses.replace(ekf, start=self.std)
+        pose = self.rotation, self.velocity, self.position
+        return initial_state(ekf, *pose, self.gyro_bias, 0, self.level_gyro_bias)
 
 
-class Recording(NamedTuple):
+class PreparedRecording(NamedTuple):
     """A sequence prepared for an estimator: K strides of n samples."""
 
     name: str
@@ -114,30 +121,30 @@ class Recording(NamedTuple):
 def prepare(
     sequences: Iterable[Sequence],
     windows: DataConfig,
-    std: InitialStd = TLIO_STD,
+    ekf: Filter | None = None,
     *,
     init: Init = "reference",
     gyro_bias: BiasSource = "zero",
     orientation: Orientation | None = None,
     from_first: bool = False,
-    raw_gyro_bias: float | None = None,
-) -> tuple[list[Recording], dict[str, str]]:
+) -> tuple[list[PreparedRecording], dict[str, str]]:
     """Recordings to estimate, and the names of the sequences that are left out with the reason.
 
     A recording begins at the first sample with a trusted reference. With `from_first`, or without a
-    reference, it begins at its first sample. `std` is the filter's initial uncertainty; a static
-    start replaces that of tilt and velocity. A sequence with waypoints has no pose to start from,
-    so its start is always static. `raw_gyro_bias` replaces the standard deviation of the level
-    components of the gyro's bias if neither the phone nor a rest gives a first estimate of it: if
-    `imu_compensated` is "no" and the bias starts from zero. `orientation` is the source of
-    `Recording.attitude`; None: there is none. Raises `InputError` for a sequence that lacks what
-    these choices need.
+    reference, it begins at its first sample. `ekf` has the uncertainty of the start; None: the
+    defaults. A static start replaces the standard deviations of tilt and velocity. A sequence with
+    waypoints has no pose to start from, so its start is always static. `ekf.raw_gyro_bias` replaces
+    the standard deviation of the level components of the gyro's bias if neither the phone nor a
+    rest gives a first estimate of it: if `imu_compensated` is "no" and the bias starts from zero.
+    `orientation` is the source of `PreparedRecording.attitude`; None: there is none. Raises
+    `InputError` for a sequence that lacks what these choices need.
     """
+    ekf = ekf or make_filter(windows, FilterSettings())
     recordings, left_out = [], {}
     for sequence in sequences:
         sequence = data.resample(sequence, windows.rate)
-        known = finite_rows(sequence.position) & finite_rows(sequence.orientation)
-        sequence = sequence._replace(valid=sequence.valid & known)
+        posed = finite_rows(sequence.position) & finite_rows(sequence.orientation)
+        sequence = sequence._replace(valid=sequence.valid & posed)
         _check(sequence, init, gyro_bias, orientation)
         first = 0 if from_first else int(np.argmax(sequence.valid))
         strides = (len(sequence.time) - 1 - first) // windows.stride
@@ -148,22 +155,24 @@ def prepare(
             problem = f"{seconds:.2f} s measured from its first trusted sample on"
             left_out[sequence.name] = f"{problem}, too short for a window and a stride"
             continue
-        bias, bias_note = _gyro_bias(whole, measured, windows.rate, gyro_bias)
+        bias, bias_note = _estimate_gyro_bias(whole, measured, windows.rate, gyro_bias)
         raw = sequence.attributes.get("imu_compensated") == "no" and not bias.any()
-        own_init, reference_note = init, ""
+        start_init, reference_note = init, ""
         if whole.waypoints is not None:
-            own_init, reference_note = "static", OF_WAYPOINTS
-        rotation, velocity, position, own_std, start_note = _start(
-            whole, measured, windows, std, own_init
+            start_init, reference_note = "static", OF_WAYPOINTS
+        rotation, velocity, position, std, start_note = _find_start(
+            whole, measured, windows, ekf, start_init
         )
-        level = raw_gyro_bias if raw and raw_gyro_bias is not None else std.gyro_bias
-        start = Start(rotation, velocity, position, bias, own_std, level, raw)
+        level = ekf.start.gyro_bias
+        if raw and ekf.raw_gyro_bias is not None:
+            level = ekf.raw_gyro_bias
+        start = Start(rotation, velocity, position, bias, std, level, raw)
         trusted, mask = whole.valid[:, None], whole.imu_valid
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
         placement = str(sequence.attributes.get("placement", "unknown"))
         recordings.append(
-            Recording(
+            PreparedRecording(
                 name=sequence.name,
                 group=str(data.group(sequence)),
                 placement="" if placement == "unknown" else placement,
@@ -172,7 +181,7 @@ def prepare(
                 accel=whole.accel[:-1],
                 imu_valid=None if mask is None or mask.all() else mask[:-1],
                 start=start,
-                attitude=orientation and _attitude(whole, start, windows.rate, orientation),
+                attitude=orientation and _trace_attitude(whole, start, windows.rate, orientation),
                 reference=Trajectory(whole.time[ends], *(part[ends] for part in poses)),
                 displacement=true_displacement(
                     poses[1],
@@ -197,12 +206,12 @@ def _check(
     if sequence.valid.any():
         return
     tapped = sequence.waypoints is not None
-    wanted = {
+    remedies = {
         "--init static": init == "reference" and not tapped,
         "--gyro-bias zero": gyro_bias == "reference",
         "--orientation filter": orientation == "reference",
     }
-    for remedy, needed in wanted.items():
+    for remedy, needed in remedies.items():
         if needed:
             problem = "has waypoints, no poses" if tapped else "has no reference"
             raise InputError(sequence.name, problem, f"give {remedy}")
@@ -214,11 +223,11 @@ def _cut(sequence: Sequence, rows: slice) -> Sequence:
     return sequence._replace(**arrays)
 
 
-def _start(
+def _find_start(
     sequence: Sequence,
     measured: Int[np.ndarray, "m"],
     windows: DataConfig,
-    std: InitialStd,
+    ekf: Filter,
     init: Init,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, InitialStd, str]:
     """Rotation, velocity and position at the start, their uncertainty, and a note about them."""
@@ -226,15 +235,14 @@ def _start(
         velocity = sequence.velocity[0]
         velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
         rotation = matrix_from_quaternion(sequence.orientation[0])
-        return rotation, velocity, sequence.position[0], std, ""
+        return rotation, velocity, sequence.position[0], ekf.start, ""
     second = measured[measured < round(windows.rate)]
     if 2 * len(second) < round(windows.rate):  # most of the first second was not measured
         second = measured[: round(windows.rate)]
-    config = filter_config(windows, FilterSettings())
-    level = level_state(config, sequence.gyro[second], sequence.accel[second], std)
-    found = np.sqrt(np.diag(level.core_covariance))
-    tilt_std, velocity_std = float(found[0]), float(found[3])
-    std, note = std._replace(tilt=tilt_std, velocity=velocity_std), ""
+    level = level_state(ekf, sequence.gyro[second], sequence.accel[second])
+    core_std = np.sqrt(np.diag(level.core_covariance))
+    tilt_std, velocity_std = float(core_std[0]), float(core_std[3])
+    std, note = ekf.start._replace(tilt=tilt_std, velocity=velocity_std), ""
     if velocity_std > ROUGH_START:
         tilt = float(f"{np.degrees(tilt_std):.1g}")  # rounded, so that few different notes are made
         sigma = f"one sigma: velocity {velocity_std:.1f} m/s, tilt {tilt:g}°"
@@ -242,7 +250,7 @@ def _start(
     return np.asarray(level.rotation), np.zeros(3), np.zeros(3), std, note
 
 
-def _gyro_bias(
+def _estimate_gyro_bias(
     sequence: Sequence, measured: Int[np.ndarray, "m"], rate: float, source: BiasSource
 ) -> tuple[Float[np.ndarray, "3"], str]:
     """First estimate of the gyro bias, rad/s, and its origin."""
@@ -252,43 +260,45 @@ def _gyro_bias(
         # Samples interpolated across a gap look like rest, so only measured samples count.
         gyro, accel = np.full((2, len(sequence.time), 3), np.nan)
         gyro[measured], accel[measured] = sequence.gyro[measured], sequence.accel[measured]
-        rest = rest_at_start(gyro, accel, 1.0 / rate)
-        if not rest.seconds:
+        bias, seconds = rest_at_start(gyro, accel, 1.0 / rate)
+        if not seconds:
             note = "gyro bias: no rest at the start (quieter than a hand), so it starts from zero"
             return np.zeros(3), note
-        return rest.gyro_bias, f"gyro bias: mean of {rest.seconds:g} s of rest at the start"
+        return bias, f"gyro bias: mean of {seconds:g} s of rest at the start"
     rows = np.arange(min(round(REFERENCE_BIAS_SECONDS * rate), len(sequence.time) - 1))
     rows = np.intersect1d(rows[sequence.valid[rows] & sequence.valid[rows + 1]], measured)
     if len(rows) < rate:
         return np.zeros(3), "gyro bias: under 1 s of reference at the start, so it starts from zero"
-    before, after = (rotations(sequence.orientation[each]) for each in (rows, rows + 1))
+    before, after = (rotations(sequence.orientation[i]) for i in (rows, rows + 1))
     true_rate = (before.inv() * after).as_rotvec() * rate
     note = f"gyro bias: {len(rows) / rate:g} s against the reference orientation"
     return (sequence.gyro[rows] - true_rate).mean(0), note
 
 
-def _attitude(sequence: Sequence, start: Start, rate: float, source: Orientation) -> Matrices:
+def _trace_attitude(sequence: Sequence, start: Start, rate: float, source: Orientation) -> Matrices:
     """Body→world at every sample.
 
     `filter` is the gyro integrated from the start; `device` is the device's own estimate, turned
     about z to the yaw of the start. Where reference or device are missing, the gyro is integrated
-    from the last known attitude. Raises `InputError` if they are missing at the start.
+    from the last attitude that they give. Raises `InputError` if they are missing at the start.
     """
     turns = Rotation.from_rotvec((sequence.gyro[:-1] - start.gyro_bias) / rate)
     integrated = start.rotation @ cumulative_rotation(turns).as_matrix()
     if source == "filter":
         return integrated
-    given = sequence.orientation if source == "reference" else sequence.device_orientation
-    assert given is not None  # `_check` ensures it
-    known = finite_rows(given) & (sequence.valid if source == "reference" else True)
-    if not known[0]:
+    orientation = sequence.orientation if source == "reference" else sequence.device_orientation
+    assert orientation is not None  # `_check` ensures it
+    present = finite_rows(orientation)
+    if source == "reference":
+        present = present & sequence.valid
+    if not present[0]:
         problem = f"has no {source} orientation at its start"
         raise InputError(sequence.name, problem, "give --orientation filter")
     # Untrusted rows may have any values, even ones that are no rotation.
-    rotation = matrix_from_quaternion(np.where(known[:, None], given, np.nan))
+    rotation = matrix_from_quaternion(np.where(present[:, None], orientation, np.nan))
     if source == "device":
         ours, its = yaw_rotation(np.stack([start.rotation, rotation[0]]))
         rotation = ours @ its.T @ rotation
-    last = last_true(known)
-    turned_since = np.einsum("tji,tjk->tik", integrated[last], integrated)
-    return np.where(known[:, None, None], rotation, rotation[last] @ turned_since)
+    last = last_true(present)
+    turn = np.einsum("tji,tjk->tik", integrated[last], integrated)
+    return np.where(present[:, None, None], rotation, rotation[last] @ turn)

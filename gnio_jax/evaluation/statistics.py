@@ -23,7 +23,7 @@ Scores = Mapping[str, Measures]
 Interval = tuple[float, float]
 
 
-class Summary(NamedTuple):
+class MetricSummary(NamedTuple):
     """One metric over the sequences that have it with every seed."""
 
     mean: float | None
@@ -76,9 +76,11 @@ class Difference(NamedTuple):
     does not count as better."""
 
 
-def values(seeds: Sequence[Scores], metric: str) -> dict[str, Float[np.ndarray, "seeds"]]:
+def collect_values(seeds: Sequence[Scores], metric: str) -> dict[str, Float[np.ndarray, "seeds"]]:
     """A metric of the sequences that have it with every seed."""
-    tables = [{name: own.values.get(metric) for name, own in scores.items()} for scores in seeds]
+    tables = [
+        {name: measures.values.get(metric) for name, measures in scores.items()} for scores in seeds
+    ]
     return {
         name: np.array([table[name] for table in tables], float)
         for name in tables[0]
@@ -86,30 +88,32 @@ def values(seeds: Sequence[Scores], metric: str) -> dict[str, Float[np.ndarray, 
     }
 
 
-def lost(seeds: Sequence[Scores]) -> dict[str, int]:
+def count_divergences(seeds: Sequence[Scores]) -> dict[str, int]:
     """Sequence → number of seeds with which its estimate diverged, if there are any."""
-    return Counter(name for scores in seeds for name, own in scores.items() if own.diverged)
+    return Counter(
+        name for scores in seeds for name, measures in scores.items() if measures.diverged
+    )
 
 
-def summarise(seeds: Sequence[Scores], metric: str, groups: Mapping[str, Any]) -> Summary:
+def summarise(seeds: Sequence[Scores], metric: str, groups: Mapping[str, Any]) -> MetricSummary:
     """Mean, median and interval of a metric. Each sequence counts once."""
-    found, diverged = values(seeds, metric), lost(seeds)
-    every = np.concatenate([*found.values()]) if found else np.zeros(0)
-    kept = [name for name in found if name not in diverged]
-    rows = np.array([found[name] for name in kept]).reshape(len(kept), len(seeds))
-    drawn = [groups[name] for name in kept]
-    reach = interval(rows.mean(1), drawn) if kept else None
-    if reach and metric in SHARES:
-        reach = max(reach[0], 0.0), min(reach[1], 100.0)
-    return Summary(
-        mean=float(rows.mean()) if kept else None,
-        seeds=rows.mean(0).tolist() if kept else [],
-        median=float(np.median(every)) if found else None,
-        interval=reach,
-        sequences=len(kept),
-        groups=len({str(group) for group in drawn}),
-        diverged=sum(diverged.get(name, 0) for name in found),
-        estimates=len(every),
+    table, diverged = collect_values(seeds, metric), count_divergences(seeds)
+    estimates = np.concatenate([*table.values()]) if table else np.zeros(0)
+    names = [name for name in table if name not in diverged]
+    rows = np.array([table[name] for name in names]).reshape(len(names), len(seeds))
+    row_groups = [groups[name] for name in names]
+    limits = interval(rows.mean(1), row_groups) if names else None
+    if limits and metric in SHARES:
+        limits = max(limits[0], 0.0), min(limits[1], 100.0)
+    return MetricSummary(
+        mean=float(rows.mean()) if names else None,
+        seeds=rows.mean(0).tolist() if names else [],
+        median=float(np.median(estimates)) if table else None,
+        interval=limits,
+        sequences=len(names),
+        groups=len({str(group) for group in row_groups}),
+        diverged=sum(diverged.get(name, 0) for name in table),
+        estimates=len(estimates),
     )
 
 
@@ -131,13 +135,13 @@ def interval(values: Float[np.ndarray, "n"], groups: Iterable[Any]) -> Interval 
         mean = float(values.mean())
         sums = np.bincount(group, values - mean)
         error = math.sqrt(count / (count - 1)) * float(np.linalg.norm(sums)) / len(values)
-    reach = float(stdtrit(count - 1, 0.975)) * error
-    found = mean - reach, mean + reach
-    return found if all(map(math.isfinite, found)) else None
+    half_width = float(stdtrit(count - 1, 0.975)) * error
+    limits = mean - half_width, mean + half_width
+    return limits if all(map(math.isfinite, limits)) else None
 
 
 def compare(
-    own: Sequence[Scores],
+    row: Sequence[Scores],
     other: Sequence[Scores],
     metric: str,
     groups: Mapping[str, Any],
@@ -145,43 +149,46 @@ def compare(
 ) -> Difference:
     """The difference of a row from another one in a metric whose best value is `best`. The rows may
     have different numbers of seeds."""
-    of_own, of_other = values(own, metric), values(other, metric)
-    diverged = lost(own) | lost(other)
+    row_values, other_values = collect_values(row, metric), collect_values(other, metric)
+    diverged = count_divergences(row) | count_divergences(other)
     shared = sorted(
         name
-        for name in of_own.keys() & of_other.keys()
-        if name not in diverged and np.isfinite([*of_own[name], *of_other[name]]).all()
+        for name in row_values.keys() & other_values.keys()
+        if name not in diverged and np.isfinite([*row_values[name], *other_values[name]]).all()
     )
     either = {
         name
-        for scores in (*own, *other)
+        for scores in (*row, *other)
         for name, measures in scores.items()
         if measures.values.get(metric) is not None
     }
-    drawn = [groups[name] for name in shared]
-    nothing = Difference(None, None, None, 0, len(shared), len(either), len(set(drawn)))
+    shared_groups = [groups[name] for name in shared]
+    counts = len(shared), len(either), len(set(shared_groups))
+    difference = Difference(None, None, None, 0, *counts)
     if not shared:
-        return nothing
-    rows = [[of[name] for name in shared] for of in (of_own, of_other)]
-    ours, theirs = (np.array([seeds.mean() for seeds in row]) for row in rows)
-    near, far = (np.array([np.abs(seeds - best).mean() for seeds in row]) for row in rows)
-    if near.sum() < far.sum() and _share_lost(own) > _share_lost(other):
-        return nothing._replace(withheld=True)
-    return nothing._replace(
-        mean=float((ours - theirs).mean()),
-        interval=interval(ours - theirs, drawn),
-        gain=100 * (1 - float(ours.mean() / theirs.mean())) if theirs.mean() else None,
-        better=int((near < far).sum()),
+        return difference
+    tables = [[values[name] for name in shared] for values in (row_values, other_values)]
+    means, other_means = (np.array([seeds.mean() for seeds in table]) for table in tables)
+    errors, other_errors = (
+        np.array([np.abs(seeds - best).mean() for seeds in table]) for table in tables
+    )
+    if errors.sum() < other_errors.sum() and _share_diverged(row) > _share_diverged(other):
+        return difference._replace(withheld=True)
+    return difference._replace(
+        mean=float((means - other_means).mean()),
+        interval=interval(means - other_means, shared_groups),
+        gain=100 * (1 - float(means.mean() / other_means.mean())) if other_means.mean() else None,
+        better=int((errors < other_errors).sum()),
     )
 
 
-def _share_lost(seeds: Sequence[Scores]) -> float:
+def _share_diverged(seeds: Sequence[Scores]) -> float:
     """Share of diverged estimates among those whose positions have an error, finite or not."""
     scored = [
-        own.diverged
-        for of in seeds
-        for own in of.values()
-        if any(own.values.get(name) is not None for name in POSITION_ERRORS)
+        measures.diverged
+        for scores in seeds
+        for measures in scores.values()
+        if any(measures.values.get(name) is not None for name in POSITION_ERRORS)
     ]
     return float(np.mean(scored)) if scored else 0.0
 
@@ -189,6 +196,6 @@ def _share_lost(seeds: Sequence[Scores]) -> float:
 class Cell(NamedTuple):
     """A metric of one row of a table."""
 
-    mean: Summary
+    summary: MetricSummary
     difference: Difference | None
     """Difference from the first row; None for the first row itself."""

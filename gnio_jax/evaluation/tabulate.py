@@ -18,7 +18,7 @@ from rich.text import Text
 
 from gnio_jax.evaluation import statistics
 from gnio_jax.evaluation.report import Report
-from gnio_jax.evaluation.statistics import Cell, Difference, Summary
+from gnio_jax.evaluation.statistics import Cell, Difference, MetricSummary
 from gnio_jax.files import with_ending, write_csv, write_text
 
 
@@ -104,44 +104,46 @@ def number(value: float | None, digits: int) -> str:
     return f"{value:.{digits}f}" if abs(value) < 10 ** (7 - digits) else f"{value:.1e}"
 
 
-def mean(found: Summary, digits: int) -> str:
+def mean(summary: MetricSummary, digits: int) -> str:
     """Mean over sequences ± standard deviation over seeds, and † with the number that diverged."""
-    text = number(found.mean, digits)
-    if found.std is not None:
-        text += f" ± {number(found.std, digits)}"
-    return f"{text} † {found.diverged}/{found.estimates}" if found.diverged else text
+    text = number(summary.mean, digits)
+    if summary.std is not None:
+        text += f" ± {number(summary.std, digits)}"
+    return f"{text} † {summary.diverged}/{summary.estimates}" if summary.diverged else text
 
 
-def difference(found: Difference | None, digits: int) -> str:
+def difference(change: Difference | None, digits: int) -> str:
     """Difference, its interval, and the number of sequences if it is not over all. It is empty for
     the first row."""
-    if found is None:
+    if change is None:
         return ""
-    if found.mean is None:
-        return "– ‡" if found.withheld else "–"
-    low, high = found.interval or (0.0, 0.0)
+    if change.mean is None:
+        return "– ‡" if change.withheld else "–"
+    low, high = change.interval or (0.0, 0.0)
     # Enough digits to show two of the interval's half width, but at most three more than the
     # mean's.
-    size = (high - low) / 2 or abs(found.mean)
+    size = (high - low) / 2 or abs(change.mean)
     needed = 1 - math.floor(math.log10(size)) if size else digits
     digits = min(max(digits, needed), digits + 3)
-    reach = f" ({low:+.{digits}f} to {high:+.{digits}f})" if found.interval else ""
-    over = f" over {found.compared}" if found.compared < found.sequences else ""
-    return f"{found.mean:+.{digits}f}{reach}{over}"
+    reach = f" ({low:+.{digits}f} to {high:+.{digits}f})" if change.interval else ""
+    over = f" over {change.compared}" if change.compared < change.sequences else ""
+    return f"{change.mean:+.{digits}f}{reach}{over}"
 
 
 def cells(rows: Sequence[Sequence[Report]], metrics: Iterable[str]) -> dict[str, list[Cell]]:
     """Metric → a cell for each row, whose seeds are reports; compared with the first row."""
-    groups = {name: own for row in rows for each in row for name, own in each.groups.items()}
-    first, *others = ([each.scores for each in row] for row in rows)
-    found = {}
+    groups = {
+        name: group for row in rows for report in row for name, group in report.groups.items()
+    }
+    first, *others = ([report.scores for report in row] for row in rows)
+    table = {}
     for metric in metrics:
         best = column(metric).best
-        found[metric] = [Cell(statistics.summarise(first, metric, groups), None)]
-        for own in others:
-            difference = statistics.compare(own, first, metric, groups, best)
-            found[metric].append(Cell(statistics.summarise(own, metric, groups), difference))
-    return found
+        table[metric] = [Cell(statistics.summarise(first, metric, groups), None)]
+        for seeds in others:
+            difference = statistics.compare(seeds, first, metric, groups, best)
+            table[metric].append(Cell(statistics.summarise(seeds, metric, groups), difference))
+    return table
 
 
 def records(
@@ -149,24 +151,24 @@ def records(
 ) -> list[dict[str, Any]]:
     """The lines of a CSV, one for each metric and row: the head of the row, then its figures."""
     lines = []
-    for metric, own in figures.items():
-        for head, (over, found) in zip(heads, own, strict=True):
-            low, high = (found and found.interval) or (None, None)
+    for metric, cells in figures.items():
+        for head, (summary, difference) in zip(heads, cells, strict=True):
+            low, high = (difference and difference.interval) or (None, None)
             line = {
                 "metric": metric,
-                "mean": over.mean,
-                "std": over.std,
-                "median": over.median,
-                "diverged": over.diverged,
-                "estimates": over.estimates,
-                "difference": found and found.mean,
+                "mean": summary.mean,
+                "std": summary.std,
+                "median": summary.median,
+                "diverged": summary.diverged,
+                "estimates": summary.estimates,
+                "difference": difference and difference.mean,
                 "difference_low": low,
                 "difference_high": high,
-                "gain_percent": found and found.gain,
-                "better": None if found is None or found.withheld else found.better,
-                "compared": found and found.compared,
-                "sequences": found and found.sequences,
-                "groups": found and found.groups,
+                "gain_percent": difference and difference.gain,
+                "better": None if difference is None or difference.withheld else difference.better,
+                "compared": difference and difference.compared,
+                "sequences": difference and difference.sequences,
+                "groups": difference and difference.groups,
             }
             lines.append({**head, **line})
     return lines
@@ -174,28 +176,32 @@ def records(
 
 def marks(cells: Sequence[Cell]) -> list[str]:
     """The meaning of the marks of a table, and the way its intervals were computed."""
-    means, found = [cell.mean for cell in cells], [c.difference for c in cells if c.difference]
-    drawn = " or ".join(map(str, sorted({each.groups for each in found if each.interval})))
-    applies = {
-        f"The interval is Student's t over people or sessions; there are {drawn}.": bool(drawn),
+    summaries = [cell.summary for cell in cells]
+    differences = [cell.difference for cell in cells if cell.difference]
+    counts = sorted({difference.groups for difference in differences if difference.interval})
+    groups = " or ".join(map(str, counts))
+    conditions = {
+        f"The interval is Student's t over people or sessions; there are {groups}.": bool(groups),
         "No interval: the sequences compared are of one person or session.": any(
-            each.groups == 1 and not each.withheld for each in found
+            difference.groups == 1 and not difference.withheld for difference in differences
         ),
         "A difference is over the sequences that both rows have with every seed, and on which no "
         "error is infinite; a mean is over all that a row has with every seed.": any(
-            each.compared < each.sequences for each in found
+            difference.compared < difference.sequences for difference in differences
         ),
         "† This number of all estimates diverged. Their sequences are not in the mean.": any(
-            each.diverged for each in means
+            summary.diverged for summary in summaries
         ),
         "‡ Its remaining walks would be better than those of the first row, but it diverged more "
-        "often, so no difference is shown.": any(each.withheld for each in found),
-        "∞: an error is too large for a number.": any(np.isinf(each.seeds).any() for each in means),
+        "often, so no difference is shown.": any(difference.withheld for difference in differences),
+        "∞: an error is too large for a number.": any(
+            np.isinf(summary.seeds).any() for summary in summaries
+        ),
         "–: this value does not exist for every seed, or there is nothing to compare it with.": any(
-            each.mean is None for each in means
+            summary.mean is None for summary in summaries
         ),
     }
-    return [line for line, there in applies.items() if there]
+    return [line for line, applies in conditions.items() if applies]
 
 
 # --- how the figures were made
@@ -205,14 +211,15 @@ def way(settings: Mapping[str, Any]) -> str:
     """The way trajectories were estimated: the estimator, and every choice other than the
     default."""
     loose = settings.get("coupling") == "loose"
-    own_attitude = settings["estimator"] == "imu_only" or settings.get("coupling") == "tight"
-    turned, started = settings.get("orientation_source"), settings.get("initial_state", "reference")
+    by_filter = settings["estimator"] == "imu_only" or settings.get("coupling") == "tight"
+    orientation = settings.get("orientation_source")
+    start = settings.get("initial_state", "reference")
     bias = settings.get("gyro_bias", "zero")
     parts = {
         settings["estimator"]: True,
         "loose coupling": loose,
-        f"{turned} orientation": turned and not own_attitude,
-        f"{started} start": started != "reference",
+        f"{orientation} orientation": orientation and not by_filter,
+        f"{start} start": start != "reference",
         f"gyro bias: {bias}": bias != "zero",
         f"{settings['alignment']} alignment": settings["alignment"] != "origin",
         f"{settings.get('checkpoint')} checkpoint": settings.get("checkpoint") == "latest",
@@ -220,9 +227,9 @@ def way(settings: Mapping[str, Any]) -> str:
     return ", ".join(text for text, applies in parts.items() if applies)
 
 
-def about(settings: Mapping[str, Any]) -> dict[str, str]:
+def describe(settings: Mapping[str, Any]) -> dict[str, str]:
     """The choices behind the figures, in words."""
-    found = {
+    choices = {
         "window orientation": settings.get("orientation_source"),
         "initial state": settings.get("initial_state"),
         "gyro bias": settings.get("gyro_bias"),
@@ -230,12 +237,12 @@ def about(settings: Mapping[str, Any]) -> dict[str, str]:
         "alignment": settings["alignment"],
     }
     if settings.get("reference") == "waypoints":
-        found["alignment"] = TO_WAYPOINTS
+        choices["alignment"] = TO_WAYPOINTS
     if settings.get("model"):
         network = f"{settings['model']}, checkpoint {settings['checkpoint']}"
-        found["network"] = f"{network}, step {settings['step']}"
-        found["windows"] = windows(settings)
-    return {name: str(value) for name, value in found.items() if value}
+        choices["network"] = f"{network}, step {settings['step']}"
+        choices["windows"] = windows(settings)
+    return {name: str(value) for name, value in choices.items() if value}
 
 
 def windows(settings: Mapping[str, Any]) -> str:
@@ -248,13 +255,13 @@ def windows(settings: Mapping[str, Any]) -> str:
 def remarks(report: Report) -> list[str]:
     """Notes about sequences: each note once with its sequences, the sequences that were left out
     with the reason, and those that diverged."""
-    of: dict[str, list[str]] = {}
+    sequences_of: dict[str, list[str]] = {}
     for name, notes in report.notes.items():
         for note in notes:
-            of.setdefault(note, []).append(name)
+            sequences_of.setdefault(note, []).append(name)
     lines = [
         f"{', '.join(names) if len(names) < 4 else f'{len(names)} sequences'}: {note}"
-        for note, names in of.items()
+        for note, names in sequences_of.items()
     ]
     lines += [f"left out: {name}: {reason}" for name, reason in report.left_out.items()]
     return lines + [f"{name}: the estimate diverged, and is in no mean" for name in report.diverged]
@@ -305,27 +312,29 @@ def render(report: Report) -> Group:
     def numbers(values: Mapping[str, float | None]) -> list[str]:
         return [number(values.get(name), COLUMNS[name].digits) for name in shown]
 
-    for place, (name, own) in enumerate(report.scores.items(), start=1):
-        add(name, numbers(own.values), last=place == len(report.scores))
+    for row_number, (name, measures) in enumerate(report.scores.items(), start=1):
+        add(name, numbers(measures.values), last=row_number == len(report.scores))
     lost = report.diverged
-    intervals = {name: of.interval or (None, None) for name, of in summary.items()}
-    add(_mean_of(lost), numbers({name: of.mean for name, of in summary.items()}), "bold")
-    add("median", numbers({name: of.median for name, of in summary.items()}))
+    limits = {name: metric.interval or (None, None) for name, metric in summary.items()}
+    means = {name: metric.mean for name, metric in summary.items()}
+    add(_mean_label(lost), numbers(means), "bold")
+    add("median", numbers({name: metric.median for name, metric in summary.items()}))
     for end, label in enumerate(("95 % from", "95 % to")):
-        add(label, numbers({name: of[end] for name, of in intervals.items()}))
+        add(label, numbers({name: interval[end] for name, interval in limits.items()}))
     add("n", [str(summary[name].sequences) for name in shown], "dim")
     add("groups", [str(summary[name].groups) for name in shown], "dim", last=True)
     for row, scores in report.reference_rows.items():
-        own = [name for name, measures in scores.items() if measures.diverged]
-        label = f"{row} ({_mean_of(own)})" if own else row
-        add(label, numbers({name: of.mean for name, of in report.summary(row).items()}), "italic")
-        lost = lost + own
-    how = "; ".join(f"{name}: {text}" for name, text in about(report.settings).items())
+        diverged = [name for name, measures in scores.items() if measures.diverged]
+        label = f"{row} ({_mean_label(diverged)})" if diverged else row
+        means = {name: metric.mean for name, metric in report.summary(row).items()}
+        add(label, numbers(means), "italic")
+        lost = lost + diverged
+    choices = "; ".join(f"{name}: {text}" for name, text in describe(report.settings).items())
     signs = "reference rows are means; – is not defined (reasons: metrics.json of an evaluation)"
     warnings = [DIVERGED] if lost else []
     return Group(
         grid,
-        *(Text(line, style="dim") for line in (how, signs)),
+        *(Text(line, style="dim") for line in (choices, signs)),
         *(Text(line, style="yellow") for line in (*warnings, *remarks(report))),
     )
 
@@ -349,5 +358,5 @@ class _Name(NamedTuple):
         yield Text("\n".join(line.rstrip() for line in lines), overflow="fold")
 
 
-def _mean_of(lost: Sequence[str]) -> str:
-    return f"mean without {len(lost)} diverged" if lost else "mean"
+def _mean_label(diverged: Sequence[str]) -> str:
+    return f"mean without {len(diverged)} diverged" if diverged else "mean"

@@ -83,13 +83,13 @@ def align(
     three for `se3` or two waypoints.
     """
     if isinstance(reference, Waypoints):
-        passed = positions_at(estimate, reference.time)
-        known = finite_rows(passed)
-        if known.sum() < 2:
+        positions = positions_at(estimate, reference.time)
+        finite = finite_rows(positions)
+        if finite.sum() < 2:
             raise Undefined("fewer than two waypoints are within the estimate")
-        source, target = passed[known].mean(0), reference.position[known].mean(0)
-        turn = _best_turn(passed[known] - source, reference.position[known] - target)
-        return _moved(estimate, turn, np.append(source, 0.0), np.append(target, 0.0))
+        source, target = positions[finite].mean(0), reference.position[finite].mean(0)
+        turn = _best_turn(positions[finite] - source, reference.position[finite] - target)
+        return _move(estimate, turn, np.append(source, 0.0), np.append(target, 0.0))
     if how == "none":
         return estimate
     trusted = reference.known if how == "origin" else finite_rows(reference.position)
@@ -111,7 +111,7 @@ def align(
     else:
         u, _, vt = np.linalg.svd(b.T @ a)
         turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt  # no reflection
-    return _moved(estimate, turn, source, target)
+    return _move(estimate, turn, source, target)
 
 
 def positions_at(path: Trajectory, stamps: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 2"]:
@@ -132,13 +132,13 @@ def _best_turn(
     return rotation_z(np.arctan2(sine, cosine))
 
 
-def _moved(
+def _move(
     estimate: Trajectory,
     turn: Float[np.ndarray, "3 3"],
     source: Float[np.ndarray, "3"],
     target: Float[np.ndarray, "3"],
 ) -> Trajectory:
-    """The trajectory turned about `source`, which is moved to `target`."""
+    """Turn the trajectory about `source`, which moves to `target`."""
     return Trajectory(
         estimate.time,
         (estimate.position - source) @ turn.T + target,
@@ -146,11 +146,11 @@ def _moved(
     )
 
 
-def paired(
+def pair(
     estimate: Trajectory, reference: Trajectory, most: float = SAME_MOMENT
 ) -> tuple[Trajectory, Trajectory]:
-    """Both trajectories at the stamps that they share, to `most` s: each pose of the reference with
-    the nearest one of the estimate, as evo matches them.
+    """Bring both trajectories to the stamps that they share, to `most` s: each pose of the
+    reference with the nearest one of the estimate, as evo matches them.
 
     The step of the rows is the median step of the shared stamps, halved until no two stamps fall in
     one row. Rows without a shared stamp are ignored: the reference is NaN there, and the estimate
@@ -160,14 +160,14 @@ def paired(
     if len(reference.time) < 2:
         raise Undefined("the reference has a single pose")
     after = np.searchsorted(reference.time[1:-1], estimate.time) + 1
-    late, early = (np.abs(reference.time[x] - estimate.time) for x in (after, after - 1))
-    near, apart = np.where(late < early, after, after - 1), np.minimum(late, early)
-    order = np.argsort(apart, kind="stable")
-    there, first = np.unique(near[order[apart[order] <= most]], return_index=True)
-    here = order[first]
-    if len(here) < 2:
+    delay, lead = (np.abs(reference.time[row] - estimate.time) for row in (after, after - 1))
+    nearest, offset = np.where(delay < lead, after, after - 1), np.minimum(delay, lead)
+    order = np.argsort(offset, kind="stable")
+    matches, first = np.unique(nearest[order[offset[order] <= most]], return_index=True)
+    estimate_rows = order[first]
+    if len(estimate_rows) < 2:
         raise Undefined(f"fewer than two stamps are the same to {most:g} s")
-    time = reference.time[there]
+    time = reference.time[matches]
     step, rows = 2 * float(np.median(np.diff(time))), np.zeros(len(time), int)
     while (np.diff(rows) == 0).any():
         step /= 2
@@ -178,18 +178,17 @@ def paired(
     shared = np.isin(np.arange(rows[-1] + 1), rows)
     clock = time[0] + step * np.arange(rows[-1] + 1)
     poses = [np.full((len(clock), width), np.nan) for width in (3, 4)]
-    for part, given in zip(poses, reference[1:], strict=True):
-        part[rows] = given[there]
-    latest = here[np.cumsum(shared) - 1]
-    ours = Trajectory(clock, estimate.position[latest], estimate.orientation[latest])
-    return ours, Trajectory(clock, *poses)
+    for part, values in zip(poses, reference[1:], strict=True):
+        part[rows] = values[matches]
+    latest = estimate_rows[np.cumsum(shared) - 1]
+    path = Trajectory(clock, estimate.position[latest], estimate.orientation[latest])
+    return path, Trajectory(clock, *poses)
 
 
-def in_frame_of(
+def align_if_possible(
     path: Trajectory, other: Trajectory | Waypoints, how: Alignment = "origin"
 ) -> Trajectory:
-    """`align`, for drawing a trajectory with a reference: `path` is unchanged if alignment is
-    impossible."""
+    """`align`, or `path` unchanged if an alignment is impossible; for pictures."""
     try:
         return align(path, other, how)
     except Undefined:
@@ -222,10 +221,10 @@ def read_tum(path: Path) -> Trajectory:
 
 def _read_columns(path: Path, names: str) -> Table:
     """A file whose columns are these, the first with stamps that increase."""
-    table, known = read_text(path, separator=" ", header=False), names.split()
-    if table.width() != len(known):
-        problem = f"has {table.width()} columns, not {len(known)}"
+    table, columns = read_text(path, separator=" ", header=False), names.split()
+    if table.width() != len(columns):
+        problem = f"has {table.width()} columns, not {len(columns)}"
         raise InputError(path, problem, f"they are {names}")
-    table = table.renamed(known)
+    table = table.renamed(columns)
     check_increasing(table.take("t"), path, table.row)
     return table

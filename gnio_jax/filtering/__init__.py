@@ -8,24 +8,27 @@ from gnio_jax.config import ConsideredStd, CorrelatedError, FilterSettings, Init
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.consider import considered_covariance, sensitivity
 from gnio_jax.filtering.displacement import displacements
+from gnio_jax.filtering.filter import Filter, make_filter
 from gnio_jax.filtering.fix import Fix, fixes_on_intervals
-from gnio_jax.filtering.history import FilterHistory
+from gnio_jax.filtering.history import FilterHistory, explain_failure
+from gnio_jax.filtering.measurements import register
 from gnio_jax.filtering.scan import run_filter, run_odometry
-from gnio_jax.filtering.settings import FilterConfig, FilterSetup, filter_setup
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import FilterState, GateState
 from gnio_jax.filtering.tracker import Pose, Tracker
 from gnio_jax.filtering.update import Linearised, Outcome, Step, linearise, measure
 from gnio_jax.filtering.waypoints import WaypointPoses, waypoint_poses
+from gnio_jax.filtering.zero_velocity import ZeroVelocity
 
 __all__ = [
     "ConsideredStd",
     "CorrelatedError",
+    "Filter",
     "FilterConfig",
     "FilterHistory",
     "FilterSettings",
-    "FilterSetup",
     "FilterState",
     "Fix",
     "GateState",
@@ -38,16 +41,19 @@ __all__ = [
     "Step",
     "Tracker",
     "WaypointPoses",
+    "ZeroVelocity",
     "considered_covariance",
     "cores_as_devices",
     "displacements",
-    "filter_setup",
+    "explain_failure",
     "fixes_on_intervals",
     "initial_state",
     "level_state",
     "linearise",
+    "make_filter",
     "measure",
     "over_sequences",
+    "register",
     "run_filter",
     "run_odometry",
     "sensitivity",

@@ -51,8 +51,8 @@ def padded_signals(
     recording and change nothing before it.
     """
     gyro, accel = zip(*recordings, strict=True)
-    turns = [filled_up(each[:samples], samples, 0.0) for each in gyro]
-    return np.stack(turns), np.stack([filled_up(each[:samples], samples) for each in accel])
+    turns = [filled_up(signal[:samples], samples, 0.0) for signal in gyro]
+    return np.stack(turns), np.stack([filled_up(signal[:samples], samples) for signal in accel])
 
 
 def padded_masks(
@@ -86,38 +86,39 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
     operations are too small for XLA to split each among cores: call `cores_as_devices` first.
     """
 
-    def batched(*arguments: object) -> T:
-        own = arguments[shared:]
-        if jax.tree.leaves(own)[0].shape[0] > 1:
-            return jax.vmap(function, in_axes=(None,) * shared + (0,) * len(own))(*arguments)
+    def run_batch(*arguments: object) -> T:
+        sequences = arguments[shared:]
+        if jax.tree.leaves(sequences)[0].shape[0] > 1:
+            in_axes = (None,) * shared + (0,) * len(sequences)
+            return jax.vmap(function, in_axes=in_axes)(*arguments)
         # A single walk without vmap is traced in half the time, and the network runs only where
         # there is a window: vmap would take both branches.
-        only = jax.tree.map(lambda leaf: leaf[0], own)
-        found = function(*arguments[:shared], *only)
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], found)
+        only = jax.tree.map(lambda leaf: leaf[0], sequences)
+        result = function(*arguments[:shared], *only)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], result)
 
-    def mapped(*arguments: object) -> T:
-        own = arguments[shared:]
-        count = jax.tree.leaves(own)[0].shape[0]
+    def run_shared(*arguments: object) -> T:
+        sequences = arguments[shared:]
+        count = jax.tree.leaves(sequences)[0].shape[0]
         # Every process takes part, even if there are fewer sequences than devices.
         devices = jax.devices() if jax.process_count() > 1 else jax.devices()[:count]
         if len(devices) == 1:
-            return batched(*arguments)
+            return run_batch(*arguments)
         times = -count % len(devices)
         filled = jax.tree.map(
-            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[-1:], times, axis=0)]), own
+            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[-1:], times, axis=0)]), sequences
         )
         everywhere, shared_out = PartitionSpec(), PartitionSpec("sequence")
         spread = jax.shard_map(
-            batched,
+            run_batch,
             mesh=Mesh(np.array(devices), ("sequence",)),
-            in_specs=(everywhere,) * shared + (shared_out,) * len(own),
+            in_specs=(everywhere,) * shared + (shared_out,) * len(sequences),
             out_specs=shared_out,
             check_vma=False,
         )
         return jax.tree.map(lambda leaf: leaf[:count], spread(*arguments[:shared], *filled))
 
-    return mapped
+    return run_shared
 
 
 def cores_as_devices() -> None:

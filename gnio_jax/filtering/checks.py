@@ -7,6 +7,7 @@ Values are only known outside `jax.jit`. Inside it only shapes and precisions ar
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, get_args
@@ -18,9 +19,10 @@ from jax.core import Tracer
 from jax.tree_util import keystr, tree_map_with_path
 from jaxtyping import Int
 
-from gnio_jax.config import NoiseModel
-from gnio_jax.config.files import bounds, named
+from gnio_jax.config.files import bounds, iterate_settings
 from gnio_jax.config.schema import Bound
+from gnio_jax.filtering.displacement import Displacement
+from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.fix import THRESHOLDS, Fix, improper_covariances
 from gnio_jax.filtering.settings import FilterConfig, YawFrame
 from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_error
@@ -28,9 +30,10 @@ from gnio_jax.numerics import finite_rows
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
 
 
-class Inputs(NamedTuple):
+class FilterInputs(NamedTuple):
     """The arguments of every run, checked and in one precision."""
 
+    ekf: Filter
     state: FilterState
     gyro: Array
     """(K·n, 3), rad/s, raw, in the body frame."""
@@ -40,7 +43,6 @@ class Inputs(NamedTuple):
     """(K·n,) booleans: which samples are present; None: the stream is complete."""
     measurements: tuple[Any, ...]
     """Trees of arrays whose leading axis is K."""
-    noise: NoiseModel
 
 
 # One argument
@@ -140,7 +142,7 @@ def check_bounds(name: str, number: Any, limits: Iterable[Bound]) -> None:
 def check_numbers(name: str, settings: Any) -> None:
     """Refuse a tuple of settings (`NoiseModel`, `InitialStd`, `ConsideredStd`) with a number
     outside the bounds of its field."""
-    for field, hint, value in named(settings, f"{name}."):
+    for field, hint, value in iterate_settings(settings, f"{name}."):
         for number in value if isinstance(value, tuple | list) else (value,):
             check_bounds(field, number, bounds(hint))
 
@@ -150,17 +152,17 @@ def check_numbers(name: str, settings: Any) -> None:
 
 
 def checked_inputs(
+    ekf: Filter,
     state: FilterState,
     gyro: Any,
     accel: Any,
     imu_valid: Any,
     measurements: tuple[Any, ...],
-    config: FilterConfig,
-    noise: NoiseModel,
-) -> Inputs:
+) -> FilterInputs:
     """The arguments that every run takes, checked and in the state's precision. Of the values of
     measurements only those of a `Fix` are checked: NaN is no measurement."""
-    state = checked_state(state, config, noise)
+    check_filter(ekf)
+    config, state = ekf.config, checked_state(state, ekf)
     dtype, n = state.offset.dtype, config.samples_per_clone
     samples = jnp.shape(gyro)[0] if jnp.ndim(gyro) else 0
     if samples < n or samples % n:
@@ -190,26 +192,35 @@ def checked_inputs(
         value = checked_shape(f"measurements{keystr(path)}", value, shape)
         return value.astype(dtype) if jnp.issubdtype(value.dtype, jnp.floating) else value
 
-    check_measurements(measurements)
+    check_measurements("measurements", measurements, ekf.measurements)
     measurements = tree_map_with_path(checked_rows, tuple(measurements))
     for number, measurement in enumerate(measurements):
         if isinstance(measurement, Fix):
             check_fix(f"measurements[{number}]", measurement)
-    return Inputs(state, gyro, accel, imu_valid, measurements, checked_noise(noise, dtype))
+    ekf = converted_filter(ekf, dtype)
+    return FilterInputs(ekf, state, gyro, accel, imu_valid, measurements)
 
 
-def check_measurements(measurements: Any) -> None:
-    """Refuse what is no tuple of objects with a method `update`; a `Fix` alone is a tuple of
-    arrays."""
+def check_measurements(argument: str, measurements: Any, others: tuple[Any, ...] = ()) -> None:
+    """Refuse what is no tuple of objects with a method `update` and a name of its own, which none
+    of the `others` has; a `Fix` alone is a tuple of arrays."""
     alone = callable(getattr(measurements, "update", None))
     if alone or not isinstance(measurements, tuple | list):
         kind = type(measurements).__name__
         remedy = "write (fix,) for one" if alone else "write () for none"
-        raise ValueError(f"measurements: must be a tuple of measurements, found {kind}; {remedy}")
+        raise ValueError(f"{argument}: must be a tuple of measurements, found {kind}; {remedy}")
+    names = {Displacement.name, *(measurement.name for measurement in others)}
     for number, measurement in enumerate(measurements):
+        kind, name = type(measurement).__name__, getattr(measurement, "name", None)
         if not callable(getattr(measurement, "update", None)):
-            problem = f"{type(measurement).__name__} has no method update(state, step)"
-            raise ValueError(f"measurements[{number}]: {problem}")
+            raise ValueError(f"{argument}[{number}]: {kind} has no method update(state, step)")
+        if not isinstance(name, str):
+            problem = f"{kind} has no name; give the class one, e.g. name = '{kind.lower()}'"
+            raise ValueError(f"{argument}[{number}]: {problem}")
+        if name in names:
+            remedy = f"give it another, e.g. class Second({kind}): name = 'second'"
+            raise ValueError(f"{argument}[{number}]: the name '{name}' is taken; {remedy}")
+        names.add(name)
 
 
 def check_fix(name: str, fix: Fix) -> None:
@@ -246,32 +257,47 @@ def check_fix(name: str, fix: Fix) -> None:
         check_rows(f"{name}.{field}", value, lambda rows, bad=bad: bad(rows) & used, problem)
 
 
-def checked_noise(noise: NoiseModel, dtype: Any) -> NoiseModel:
-    """`noise` in one precision."""
-    check_numbers("noise", noise)
-    if len(noise.std_factor) != 3:
-        raise ValueError("noise.std_factor: must be three numbers, for x, y and z")
-    return jax.tree.map(lambda value: jnp.asarray(value, dtype), noise)
+def check_filter(ekf: Any) -> None:
+    """Refuse what is no `Filter`, or one with impossible parts."""
+    if not isinstance(ekf, Filter):
+        kind = type(ekf).__name__
+        raise ValueError(f"ekf: must be a Filter, e.g. Filter(FilterConfig(...)), found {kind}")
+    check_numbers("ekf.noise", ekf.noise)
+    if len(ekf.noise.std_factor) != 3:
+        raise ValueError("ekf.noise.std_factor: must be three numbers, for x, y and z")
+    check_measurements("ekf.measurements", ekf.measurements)
 
 
-def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -> FilterState:
-    """`state` in one precision, with the shapes that `config` and `noise` need.
+def converted_filter(ekf: Filter, dtype: Any) -> Filter:
+    """The filter with all numbers that a run reads in one precision."""
+    noise, measurements = jax.tree.map(
+        lambda value: jnp.asarray(value, dtype), (ekf.noise, ekf.measurements)
+    )
+    return dataclasses.replace(ekf, noise=noise, measurements=measurements)
 
-    A state without a temporally correlated error gets one where `noise` has one.
+
+def checked_state(state: FilterState, ekf: Filter) -> FilterState:
+    """`state` in one precision, with the shapes that the filter needs.
+
+    A state without a temporally correlated error gets one where the noise has one.
     """
+    config, noise = ekf.config, ekf.noise
     if noise.correlation is not None:
         state = with_correlated_error(state)
     elif len(state.correlated):
-        problem = "the state has a correlated error, but noise.correlation is None"
+        problem = "the state has a correlated error, but ekf.noise.correlation is None"
         raise ValueError(f"state.correlated: {problem}")
-    shapes = state_shapes(config, noise, jnp.float32 if config.allow_float32 else jnp.float64)
+    dtype = jnp.float32 if config.allow_float32 else jnp.float64
+    shapes = state_shapes(config, noise, dtype)
+    if state.window is not None:
+        shapes = shapes._replace(window=jax.ShapeDtypeStruct((config.reach, 7), dtype))
 
     def checked_leaf(path: Any, value: Any, like: jax.ShapeDtypeStruct) -> jax.Array:
         name = f"state{keystr(path)}"
         if not jnp.issubdtype(like.dtype, jnp.floating):
             return checked_shape(name, value, like.shape).astype(like.dtype)
         # The memory of the IMU may hold anything.
-        finite = not name.startswith("state.imu")
+        finite = not name.startswith(("state.imu", "state.window"))
         return checked_array(name, value, like.shape, config, finite).astype(state.offset.dtype)
 
     state = tree_map_with_path(checked_leaf, state, shapes)
@@ -284,10 +310,11 @@ def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -
 
 
 def checked_displacements(
-    displacement: Any, covariance: Any, inputs: Inputs, config: FilterConfig
+    displacement: Any, covariance: Any, inputs: FilterInputs
 ) -> tuple[jax.Array, jax.Array]:
     """A displacement and its covariance for every clone interval of a run, in its precision. Those
     with a NaN are not checked."""
+    config = inputs.ekf.config
     dtype, count = inputs.gyro.dtype, len(inputs.gyro) // config.samples_per_clone
 
     def improper(matrices: np.ndarray) -> np.ndarray:

@@ -64,15 +64,15 @@ def considered_covariance(
     `ValueError` for a standard deviation that is negative or not finite.
     """
     check_numbers("considered", std)
-    each = (std.gyro_bias, std.gyro_bias, std.gyro_bias, std.scale, std.heading, std.slope)
-    root = sensitivity * jnp.stack([jnp.asarray(value) for value in each])[None, None]
+    stds = (std.gyro_bias, std.gyro_bias, std.gyro_bias, std.scale, std.heading, std.slope)
+    root = sensitivity * jnp.stack([jnp.asarray(value) for value in stds])[None, None]
     if raw_axis is not None:
         along = jnp.einsum("kdi,ki->kd", sensitivity[:, :, OF_BIAS], raw_axis)
         root = jnp.concatenate([root, std.raw_gyro_bias * along[:, :, None]], axis=2)
     return jnp.einsum("kic,kjc->kij", root, root)
 
 
-def disturbed(displacement: Float[Array, "k 3"], c: Float[Array, "6"]) -> Float[jax.Array, "k 3"]:
+def disturb(displacement: Float[Array, "k 3"], c: Float[Array, "6"]) -> Float[jax.Array, "k 3"]:
     """d of the displacements u = `displacement`, m; NaN stays NaN."""
     displacement, c = jnp.asarray(displacement), jnp.asarray(c)
     turn = geometry.rotation_z(c[OF_HEADING])
@@ -94,17 +94,19 @@ def sensitivity(
     cut its gradient (`FilterConfig.truncate_every`), because S is the derivative of the whole run.
     """
 
-    def means(c: Float[Array, "6"]) -> tuple[Mean, Array]:
+    def run_disturbed(c: Float[Array, "6"]) -> tuple[Mean, Array]:
         start = state._replace(gyro_bias=state.gyro_bias + c[OF_BIAS])
-        found = run(start, disturbed(displacement, c))
-        return Mean(*(getattr(found, name) for name in Mean._fields)), found.rotation
+        history = run(start, disturb(displacement, c))
+        return Mean(*(getattr(history, name) for name in Mean._fields)), history.rotation
 
     nothing = jnp.zeros(ENTRIES, state.offset.dtype)
-    derivatives, rotation = jax.jacfwd(means, has_aux=True)(nothing)
-    return _of_error(rotation, derivatives)
+    derivatives, rotation = jax.jacfwd(run_disturbed, has_aux=True)(nothing)
+    return _assemble_sensitivity(rotation, derivatives)
 
 
-def _of_error(rotation: Float[Array, "k 3 3"], derivatives: Mean) -> Float[jax.Array, "k 15 6"]:
+def _assemble_sensitivity(
+    rotation: Float[Array, "k 3 3"], derivatives: Mean
+) -> Float[jax.Array, "k 15 6"]:
     """S of θ, v, p, b_g, b_a from the derivatives of the estimates by c, whose 6 entries are the
     last axis. `rotation` has the estimated rotations."""
     of_rotation, *others = derivatives
@@ -125,7 +127,7 @@ None for all other arrays (counters, decisions, memories)."""
 def start_tangents(state: FilterState) -> Tangents:
     """The tangents at the start, where only the gyro's bias depends on c."""
     zeros = jax.tree.map(
-        lambda leaf: jnp.zeros((ENTRIES, *leaf.shape), leaf.dtype), _floating(state)
+        lambda leaf: jnp.zeros((ENTRIES, *leaf.shape), leaf.dtype), _select_floating(state)
     )
     return zeros._replace(gyro_bias=jnp.eye(ENTRIES, dtype=state.gyro_bias.dtype)[:, OF_BIAS])
 
@@ -143,10 +145,12 @@ def step_with_tangents(
     the run, to rounding.
     """
 
-    def moved(floating: Tangents, c: Float[Array, "6"]) -> tuple[Tangents, tuple[FilterState, T]]:
+    def run_step(
+        floating: Tangents, c: Float[Array, "6"]
+    ) -> tuple[Tangents, tuple[FilterState, T]]:
         def measure_disturbed(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
             measured, diagnostics = measure(jax.lax.stop_gradient(state), oldest)
-            displacement = disturbed(measured.displacement[None], c)[0]
+            displacement = disturb(measured.displacement[None], c)[0]
             return dataclasses.replace(measured, displacement=displacement), diagnostics
 
         whole = jax.tree.map(
@@ -155,28 +159,29 @@ def step_with_tangents(
             state,
             is_leaf=lambda part: part is None,
         )
-        after, found = step(whole, measure_disturbed)
-        return _floating(after), (after, found)
+        after, result = step(whole, measure_disturbed)
+        return _select_floating(after), (after, result)
 
     every_entry = jnp.eye(ENTRIES, dtype=state.offset.dtype)
-    point = _floating(state), jnp.zeros_like(every_entry[0])
+    point = _select_floating(state), jnp.zeros_like(every_entry[0])
 
-    def along(tangent: Tangents, direction: Float[Array, "6"]) -> tuple:
-        _, after, found = jax.jvp(moved, point, (tangent, direction), has_aux=True)
-        return after, found
+    def push_forward(tangent: Tangents, direction: Float[Array, "6"]) -> tuple:
+        _, after, result = jax.jvp(run_step, point, (tangent, direction), has_aux=True)
+        return after, result
 
     # vmap runs over the tangents only: the step itself is computed once.
-    after, (state, found) = jax.vmap(along, out_axes=(0, None))(tangents, every_entry)
-    return state, found, after
+    over_tangents = jax.vmap(push_forward, out_axes=(0, None))
+    after, (state, result) = over_tangents(tangents, every_entry)
+    return state, result, after
 
 
 def core_sensitivity(mean: Mean, tangents: Tangents) -> Float[jax.Array, "15 6"]:
     """S of θ, v, p, b_g, b_a."""
     last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[None], tangents.mean)
-    return _of_error(mean.rotation[None], last)[0]
+    return _assemble_sensitivity(mean.rotation[None], last)[0]
 
 
-def _floating(state: FilterState) -> Any:
+def _select_floating(state: FilterState) -> Any:
     """The state without its arrays that are not floating-point."""
     return jax.tree.map(
         lambda leaf: leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else None, state

@@ -18,7 +18,7 @@ entries instead of 3 W.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import no_type_check
+from typing import ClassVar, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +65,7 @@ class Displacement:
     frame: YawFrame = field(metadata={"static": True})
     """The yaw frame: by the filter's own attitude of the oldest clone, or by another one
     (`YawFrame`)."""
+    name: ClassVar[str] = "displacement"
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """Nothing changes without a measurement, before the ring is full, at gimbal lock, or where
@@ -72,8 +73,7 @@ class Displacement:
         a larger covariance instead."""
         config = step.config
         linear, defined = linearise_displacement(self, state, step)
-        present = self.present & (state.step >= config.clones)
-        linear = linear._replace(residual=jnp.where(present, linear.residual, jnp.nan))
+        linear = linear._replace(residual=jnp.where(self.present, linear.residual, jnp.nan))
         outcome, correction = project(state, linear, step)
         tested = outcome.present & defined
         gate, weight = innovation_gate(state.gate, config, state.step, outcome.nis, tested)
@@ -103,16 +103,15 @@ def scaled_displacement(
     or K of them. A NaN in either means that there is no measurement. NaN is kept out of the
     arithmetic, because otherwise the derivatives would be NaN too."""
     dtype, shape = covariance.dtype, covariance.shape
-    finite = jnp.isfinite(covariance).all((-2, -1))
-    present = jnp.isfinite(displacement).all(-1) & finite
+    present = jnp.isfinite(displacement).all(-1) & jnp.isfinite(covariance).all((-2, -1))
     eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), shape)
     factor = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor)).astype(dtype)
     scale = jnp.asarray(noise.measurement_scale, dtype) * (factor[:, None] * factor[None])
-    there = present[..., None, None]
-    known = jnp.where(there, covariance, eye)
+    mask = present[..., None, None]
+    finite_covariance = jnp.where(mask, covariance, eye)
     return Displacement(
         displacement=jnp.where(present[..., None], displacement, 0.0),
-        covariance=jnp.where(there, jnp.broadcast_to(scale, shape) * known, eye),
+        covariance=jnp.where(mask, jnp.broadcast_to(scale, shape) * finite_covariance, eye),
         present=present,
         frame=frame,
     )
@@ -175,12 +174,13 @@ def displacements(
     expressed in the yaw frame of clone k − W; NaN for k < W, before there are W + 1 clones.
     """
     window = config.clones_per_window
-    found = np.full((len(position) - 1, 3), np.nan)
-    measured = max(len(found) - window, 0)
+    displacement = np.full((len(position) - 1, 3), np.nan)
+    measured = max(len(displacement) - window, 0)
     oldest = slice(1, 1 + measured)
     moved = position[1 + window :] - position[oldest]
-    found[window:] = np.einsum("kji,kj->ki", numerics.yaw_rotation(rotation[oldest]), moved)
-    return found
+    yaw = numerics.yaw_rotation(rotation[oldest])
+    displacement[window:] = np.einsum("kji,kj->ki", yaw, moved)
+    return displacement
 
 
 # TLIO's χ² gate: which displacements the filter accepts. It has nothing to do with the gate of the
@@ -206,8 +206,8 @@ def innovation_gate(
     nis: Float[Array, ""],
     tested: Array,
 ) -> tuple[GateState, Float[Array, ""]]:
-    """The gate's memory after clone interval `step`, counted from 1, and the weight of its
-    measurement: 1 if it passes as it is and 0 if not.
+    """The gate's memory after clone interval `step` (counted from 1), and the weight of its
+    measurement: 1 accepted, 0 rejected.
 
     While no measurement is `tested`, the time of the last success moves along (ours). Otherwise the
     first second after any hole would pass unchecked, because the last success would be too old.

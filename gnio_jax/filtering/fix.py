@@ -56,6 +56,7 @@ class Fix(NamedTuple):
     threshold: Float[Array, "*k"]
     """Largest rᵀ S⁻¹ r of all m components that passes; inf: every fix does. A fix that lacks
     components must pass the test of the same probability (`threshold_of`)."""
+    name = "fix"
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """A fix is refused if it fails the χ² test against the filter's prediction. So a fix that
@@ -68,7 +69,7 @@ class Fix(NamedTuple):
         axes, dtype = self.position.shape[0], state.offset.dtype
         fix = jax.tree.map(lambda part: jnp.asarray(part, dtype), self)
         present = jnp.isfinite(fix.position) & ~improper(fix)
-        both, eye = present[:, None] & present[None], jnp.eye(axes, dtype=dtype)
+        pairs, eye = present[:, None] & present[None], jnp.eye(axes, dtype=dtype)
         # No NaN may enter the arithmetic, because otherwise the derivatives would be NaN too.
         position = jnp.where(present, fix.position, 0.0)
         before_end = jnp.where(present.any(), fix.before_end, 0.0)
@@ -77,12 +78,12 @@ class Fix(NamedTuple):
 
         velocity = state.velocity[:axes]
         expected = state.position[:axes] - before_end * velocity
-        late = jnp.where(present, time_std * velocity, 0.0)
+        time_error = jnp.where(present, time_std * velocity, 0.0)
         residual = jnp.where(present, position - expected, 0.0)
         linear = linearise(
             state,
             jnp.where(present.any(), residual, jnp.nan),
-            jnp.where(both, fix.covariance, eye) + late[:, None] * late[None],
+            jnp.where(pairs, fix.covariance, eye) + time_error[:, None] * time_error[None],
             position=by_position,
             velocity=-before_end * by_position,
         )
@@ -94,8 +95,8 @@ def improper(fix: Fix) -> Bool[Array, ""]:
     """Whether one fix cannot be: its covariance is not symmetric and positive definite, or another
     number is NaN or out of bounds."""
     present = jnp.isfinite(fix.position)
-    both = present[:, None] & present[None]
-    covariance = jax.lax.stop_gradient(jnp.where(both, fix.covariance, jnp.eye(len(present))))
+    pairs = present[:, None] & present[None]
+    covariance = jax.lax.stop_gradient(jnp.where(pairs, fix.covariance, jnp.eye(len(present))))
     skew = jnp.abs(covariance - covariance.T).max()
     _, volume = whiten(covariance, ())  # NaN where it is not positive definite
     return ~(
@@ -178,13 +179,13 @@ def fixes_on_intervals(
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     weight = present.sum(axis=1) / np.where(present, variance, 0.0).sum(axis=1)
 
-    def shares(weights: np.ndarray) -> np.ndarray:
+    def normalise(weights: np.ndarray) -> np.ndarray:
         """The weights, each divided by the sum of those of its row."""
         sums = np.bincount(row, weights, intervals)[row]
         return np.divide(weights, sums, out=np.zeros_like(weights), where=weights > 0)
 
-    share = shares(weight)
-    component_share = np.stack([shares(weight * column) for column in present.T], axis=1)
+    share = normalise(weight)
+    component_share = np.stack([normalise(weight * column) for column in present.T], axis=1)
     fix = Fix(
         position=np.zeros((intervals, axes)),
         covariance=np.zeros((intervals, axes, axes)),
@@ -192,14 +193,14 @@ def fixes_on_intervals(
         time_std=np.sqrt(np.bincount(row, (share * time_std) ** 2, intervals)),
         threshold=np.full(intervals, THRESHOLDS[axes] if threshold is None else threshold),
     )
-    both = present[:, :, None] & present[:, None]
+    pairs = present[:, :, None] & present[:, None]
     products = component_share[:, :, None] * component_share[:, None]
     np.add.at(fix.position, row, component_share * np.where(present, position, 0.0))
-    np.add.at(fix.covariance, row, products * np.where(both, covariance, 0.0))
-    held = np.zeros((intervals, axes), bool)
-    np.logical_or.at(held, row, present)
-    fix.position[~held] = np.nan
-    fix.covariance[:] += np.eye(axes) * ~held[:, :, None]
+    np.add.at(fix.covariance, row, products * np.where(pairs, covariance, 0.0))
+    filled = np.zeros((intervals, axes), bool)
+    np.logical_or.at(filled, row, present)
+    fix.position[~filled] = np.nan
+    fix.covariance[:] += np.eye(axes) * ~filled[:, :, None]
     return fix
 
 
@@ -208,8 +209,8 @@ def improper_covariances(
 ) -> Bool[np.ndarray, "f"]:
     """Which covariances are not finite, symmetric and positive definite, in the components that are
     present."""
-    both = present[:, :, None] & present[:, None]
-    covariance = np.where(both, covariance, np.eye(present.shape[1]))
+    pairs = present[:, :, None] & present[:, None]
+    covariance = np.where(pairs, covariance, np.eye(present.shape[1]))
     finite = np.isfinite(covariance).all(axis=(1, 2))
     usable = np.reshape(finite, (-1, 1, 1))
     covariance = np.where(usable, covariance, np.eye(present.shape[1]))

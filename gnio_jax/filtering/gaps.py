@@ -48,6 +48,23 @@ def no_gap(n: int, dtype: np.dtype) -> Gap:
     return Gap(np.zeros(n, dtype), np.zeros(n, dtype), np.ones(n, dtype))
 
 
+def after_window(
+    stream: Imu, window: Float[Array, "r 7"] | None, config: FilterConfig
+) -> tuple[Imu, Float[Array, "r 7"]]:
+    """The stream behind the samples of `FilterState.window` (zeros if there are none yet), and the
+    last samples of both, as the window for a later run."""
+    used = np.ones(len(stream.gyro)) if stream.gap is None else stream.gap.used
+    dtype, reach = stream.gyro.dtype, config.reach
+    used = jnp.asarray(used, dtype)[:, None]
+    before = jnp.zeros((reach, 7), dtype) if window is None else window
+    rows = jnp.concatenate([before, jnp.concatenate([stream.gyro, stream.accel, used], axis=1)])
+    gap = None
+    if window is not None or stream.gap is not None:
+        zeros = jnp.zeros(len(rows), dtype)
+        gap = Gap(zeros, zeros, rows[:, 6])
+    return Imu(rows[:, :3], rows[:, 3:6], gap), rows[-reach:]
+
+
 def bridge(
     gyro: Float[Array, "n 3"],
     accel: Float[Array, "n 3"],
@@ -72,27 +89,27 @@ def bridge(
     number = jnp.arange(1, n + 1)
     last = jax.lax.cummax(jnp.where(valid, number, 0))
     age = jnp.where(last == 0, memory.missing + number, number - last)
-    known = jnp.all(jnp.isfinite(memory.gyro)) | (last > 0)
+    begun = jnp.all(jnp.isfinite(memory.gyro)) | (last > 0)  # there is a sample to hold
 
-    gyro = _held(gyro, memory.gyro, valid, last)
-    accel = _held(accel, memory.accel, valid, last)
+    gyro = _hold(gyro, memory.gyro, valid, last)
+    accel = _hold(accel, memory.accel, valid, last)
     limit = max(round(config.bridge_seconds / config.dt), 1)
-    coasting = (age > limit) | ~known
-    variance = _variance(jnp.where(known, age, limit + 1), limit).astype(gyro.dtype)
+    coasting = (age > limit) | ~begun
+    variance = _variance(jnp.where(begun, age, limit + 1), limit).astype(gyro.dtype)
     gap = Gap(
         gyro_variance=variance * config.gap_gyro_std**2,
         accel_variance=variance * config.gap_accel_std**2,
         used=jnp.where(coasting, 0.0, 1.0).astype(gyro.dtype),
     )
     after = memory._replace(
-        gyro=jnp.where(known[-1], gyro[-1], jnp.nan),
-        accel=jnp.where(known[-1], accel[-1], jnp.nan),
+        gyro=jnp.where(begun[-1], gyro[-1], jnp.nan),
+        accel=jnp.where(begun[-1], accel[-1], jnp.nan),
         missing=age[-1].astype(memory.missing.dtype),
     )
     return Imu(gyro, accel, gap), (age * config.dt).astype(gyro.dtype), after
 
 
-def _held(
+def _hold(
     samples: Float[Array, "n 3"],
     remembered: Float[Array, "3"],
     valid: Bool[Array, "n"],

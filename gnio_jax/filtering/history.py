@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax.config import NoiseModel
@@ -59,19 +60,17 @@ class FilterHistory(NamedTuple):
     log_likelihood: Float[Array, "k"]
     """ln N(r; 0, S) of the innovation, r in m; NaN where no measurement. Their sum is the evidence
     for the noise model."""
-    at_rest: Float[Array, "k"]
-    """1 where the velocity was measured as zero (`zero_velocity_std`), else 0, including where the
-    χ² test refused this."""
     imu_gap: Float[Array, "k"]
     """Age of the oldest held IMU sample of the interval, s; 0 where none was missing. Above
     `bridge_seconds` the filter coasted."""
     healthy: Float[Array, "k"]
     """0 from the first row on whose state is not finite, has a negative variance or a speed above
     `FilterConfig.speed_limit`. The input was bad, and all rows from there on are invalid. The final
-    state remembers this, and a later run from it begins with 0."""
-    others: tuple[Outcome, ...]
-    """The outcomes of the other measurements, stacked over K: the velocity at rest where
-    `zero_velocity_std` is above 0, then the caller's `measurements`."""
+    state remembers this, and a later run from it begins with 0. `explain_failure` names the
+    cause."""
+    outcomes: dict[str, Outcome]
+    """The outcomes of all other measurements by their names, stacked over K: of those of the
+    filter, as "zero_velocity", and of those of the run, as "fix"."""
     diagnostics: dict[str, Array]
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a
     network."""
@@ -90,6 +89,39 @@ class FilterHistory(NamedTuple):
         return jnp.asarray(self.displacement), self.measurement_covariance / scale[None]
 
 
+def explain_failure(history: FilterHistory, config: FilterConfig) -> str:
+    """The reason why the first row that is not healthy is not, in words; empty if all rows of this
+    one run are healthy."""
+    healthy = np.asarray(history.healthy) > 0
+    if healthy.all():
+        return ""
+    row = int(np.argmin(healthy))
+    mean, variances = (
+        jax.tree.map(lambda rows: np.asarray(rows[row]), part)
+        for part in (
+            Mean(*(getattr(history, name) for name in Mean._fields)),
+            history.covariance_diagonal,
+        )
+    )
+    gaps = np.asarray(history.imu_gap)[: row + 1]
+    cause = describe_failure(mean, variances, config)
+    coasted = gaps > config.bridge_seconds
+    if coasted.any():
+        cause += f", behind a hole of {gaps.max():.1f} s in the IMU's samples"
+    return cause
+
+
+def describe_failure(mean: Mean, variances: Float[np.ndarray, "15"], config: FilterConfig) -> str:
+    """What makes an estimate impossible, in words."""
+    if not all(np.isfinite(part).all() for part in (*mean, variances)):
+        return "a value is not finite"
+    if (variances < 0).any():
+        return "a variance is below 0"
+    if (speed := float(np.linalg.norm(mean.velocity))) > config.speed_limit:
+        return f"a speed of {speed:.0f} m/s, above the limit of {config.speed_limit:g} m/s"
+    return "an earlier estimate was impossible"
+
+
 class StepRecord(NamedTuple):
     """The addition of one clone step to the history, or of K steps, stacked."""
 
@@ -97,8 +129,8 @@ class StepRecord(NamedTuple):
     covariance: Array
     """Covariance of θ, v, p, b_g, b_a, or its diagonal: see `FilterConfig.history`."""
     displacement: Displacement
-    outcomes: tuple[Outcome, ...]
-    """Outcomes of the displacement and of the other measurements in their order."""
+    outcomes: dict[str, Outcome]
+    """Outcomes of the displacement and of the other measurements by their names."""
     diagnostics: dict[str, Array]
 
 
@@ -106,7 +138,8 @@ def finished_history(
     records: StepRecord, imu_gap: Float[Array, "k"], healthy: Bool[Array, ""], config: FilterConfig
 ) -> FilterHistory:
     """The history of K stacked records from a state that was `healthy` or not."""
-    (update, *others), covariance = records.outcomes, records.covariance
+    outcomes, covariance = dict(records.outcomes), records.covariance
+    update = outcomes.pop("displacement")
     dtype, whole = covariance.dtype, config.history == "core"
 
     def where_present(value: Array) -> Array:
@@ -116,7 +149,6 @@ def finished_history(
     # S is the identity where there is no measurement, so that the logarithm has a derivative there.
     log_likelihood = -0.5 * (update.nis + 3 * math.log(2 * math.pi)) - jnp.log(update.volume)
     diagonal = jnp.diagonal(covariance, axis1=1, axis2=2) if whole else covariance
-    at_rest = others[0].accepted if config.zero_velocity_std > 0 else jnp.zeros_like(update.present)
 
     parts = (*records.mean, covariance)
     finite = [jnp.all(jnp.isfinite(part), axis=tuple(range(1, part.ndim))) for part in parts]
@@ -134,9 +166,8 @@ def finished_history(
         gate_passed=where_present(update.weight),
         nis=where_present(update.nis),
         log_likelihood=where_present(log_likelihood),
-        at_rest=at_rest.astype(dtype),
         imu_gap=imu_gap.astype(dtype),
         healthy=healthy.astype(dtype),
-        others=tuple(others),
+        outcomes=outcomes,
         diagnostics=records.diagnostics,
     )

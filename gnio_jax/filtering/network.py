@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
+from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
@@ -23,7 +23,7 @@ Predict = Callable[[Any], Prediction]
 
 
 def network_measurement(
-    predict: Predict, config: FilterConfig, noise: NoiseModel
+    predict: Predict, ekf: Filter
 ) -> Callable[..., tuple[Displacement, dict[str, Array]]]:
     """The displacement that the network measures, with its diagnostics, as a function
 
@@ -35,14 +35,16 @@ def network_measurement(
     the filter needs.
     """
 
-    def of_one(window: Float[Array, "1 n 6"]) -> Prediction:
-        found = predict(window)
-        _check(found)
-        return jax.tree.map(lambda leaf: _as_floating(leaf[0]), found)
+    config = ekf.config
 
-    shapes = jax.eval_shape(of_one, jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32))
+    def predict_one(window: Float[Array, "1 n 6"]) -> Prediction:
+        prediction = predict(window)
+        _check(prediction)
+        return jax.tree.map(lambda leaf: _make_floating(leaf[0]), prediction)
 
-    def nothing() -> Prediction:
+    shapes = jax.eval_shape(predict_one, jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32))
+
+    def predict_nothing() -> Prediction:
         return jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
 
     def measure(
@@ -53,28 +55,30 @@ def network_measurement(
     ) -> tuple[Displacement, dict[str, Array]]:
         def infer() -> Prediction:
             gyro, accel, gap = latest()
-            found = of_one(network_window(state, oldest, gyro, accel, config))
+            prediction = predict_one(network_window(state, oldest, gyro, accel, config))
             whole = gap is None or jnp.all(gap.used > 0)
-            return found._replace(displacement=jnp.where(whole, found.displacement, jnp.nan))
+            displacement = jnp.where(whole, prediction.displacement, jnp.nan)
+            return prediction._replace(displacement=displacement)
 
-        found = jax.lax.cond(has_window, infer, nothing)
+        prediction = jax.lax.cond(has_window, infer, predict_nothing)
         dtype, frame = state.offset.dtype, config.displacement_frame
-        covariance = found.covariance(config.log_std_min, dtype)
-        displacement = found.displacement.astype(dtype)
-        return scaled_displacement(displacement, covariance, noise, frame), found.diagnostics
+        covariance = prediction.covariance(config.log_std_min, dtype)
+        displacement = prediction.displacement.astype(dtype)
+        measurement = scaled_displacement(displacement, covariance, ekf.noise, frame)
+        return measurement, prediction.diagnostics
 
     return measure
 
 
-def _check(found: Any) -> None:
+def _check(prediction: Any) -> None:
     """Refuse a result that is no prediction of one window."""
-    if not isinstance(found, Prediction):
-        kind = type(found).__name__
+    if not isinstance(prediction, Prediction):
+        kind = type(prediction).__name__
         raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")
-    for name, value in {**found._asdict(), **found.diagnostics}.items():
+    for name, value in {**prediction._asdict(), **prediction.diagnostics}.items():
         if name in ("displacement", "log_std") and value.shape != (1, 3):
             raise ValueError(f"predict: {name} must be (1, 3) for one window, found {value.shape}")
-        if name in found.diagnostics and value.shape[:1] != (1,):
+        if name in prediction.diagnostics and value.shape[:1] != (1,):
             problem = f"must have a leading axis of one window, found {value.shape}"
             raise ValueError(f"predict: diagnostics['{name}'] {problem}")
 
@@ -98,5 +102,5 @@ def network_window(
     return window[None].astype(jnp.float32)
 
 
-def _as_floating(value: Any) -> Any:
+def _make_floating(value: Any) -> Any:
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.float32)

@@ -89,7 +89,8 @@ def integrate(start: Mean, imu: Imu, noise: NoiseModel, dt: float) -> Interval:
     # to the velocity and the position.
     later = jnp.pad(by_tilt[:, :, :, 1:], ((0, 0), (0, 0), (0, 0), (0, 1)))
     right_jacobians = jax.vmap(geometry.right_jacobian, out_axes=2)(turns)
-    theta = dt * matmul(after, right_jacobians)
+    # A sum as a reduction is computed once, not in everything that reads it.
+    theta = dt * geometry.contract_right(after, right_jacobians)
     of_gyro = [theta, matmul(later[:, :, 0], theta), matmul(later[:, :, 1], theta)]
     velocity = dt * before
     of_accel = [jnp.zeros_like(velocity), velocity, lever[None, None] * velocity]

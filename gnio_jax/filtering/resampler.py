@@ -119,7 +119,7 @@ def grid_rows(
         inside = (begin <= centres) & (centres <= end)
         if not inside.any():
             continue
-        fine = _curve(time, samples[run], np.arange(low, high + 1) * step, grid, slack)
+        fine = _evaluate_curve(time, samples[run], np.arange(low, high + 1) * step, grid, slack)
         if begin == 0:  # the stream's start, as far as samples can be reflected
             reflected = min(low - lowest, high - low)
             fine = np.concatenate([2 * fine[0] - fine[reflected:0:-1], fine])
@@ -135,7 +135,7 @@ def grid_rows(
     return rows
 
 
-def _curve(
+def _evaluate_curve(
     time: np.ndarray, samples: np.ndarray, points: np.ndarray, grid: Grid, slack: float
 ) -> np.ndarray:
     """A run evaluated at some points: by lines, and before a low-pass by a spline where samples are
@@ -199,18 +199,18 @@ class Stream:
                 self._unproven = stamp, sample
                 return
             come.insert(0, waiting)
-        self._check_rate([each for each, _ in come])
+        self._check_rate([arrival for arrival, _ in come])
         self._unproven = None
-        for each in come:
-            self._append(*each)
+        for arrival, values in come:
+            self._append(arrival, values)
 
     @property
-    def known(self) -> int:
-        """Number of the next grid samples that no later sample can change."""
+    def ready(self) -> int:
+        """Number of the next grid samples that later samples cannot change any more."""
         return self._ended - self.taken
 
     def rows(self, count: int) -> Float[np.ndarray, "count 7"]:
-        """The next grid samples, at most `known`. They are read, not taken."""
+        """The next grid samples, at most `ready`. They are read, not taken."""
         stamps, samples = np.array(self._stamps), np.array(self._samples).reshape(-1, 6)
         slack = self._slack(self._newest)
         return grid_rows(stamps, samples, self.taken, count, self.grid, slack)
@@ -249,8 +249,8 @@ class Stream:
         for before, stamp in itertools.pairwise([self._newest, *stamps]):
             if stamp - before <= max(grid.hole, _STOP * grid.dt):
                 intervals, covered = intervals + 1, covered + stamp - before
-        known = round(covered / grid.dt, 3) >= _RATE_KNOWN
-        rate = intervals / covered if known else 0.0
+        enough = round(covered / grid.dt, 3) >= _RATE_KNOWN
+        rate = intervals / covered if enough else 0.0
         if rate > _TOO_FAST * fastest:
             raise ValueError(
                 f"imu_rate: the samples come at {rate:.4g} Hz, the tracker was made for "

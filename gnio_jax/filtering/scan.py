@@ -11,10 +11,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.checks import Inputs, check_frame, checked_displacements, checked_inputs
+from gnio_jax.filtering.checks import (
+    FilterInputs,
+    check_frame,
+    checked_displacements,
+    checked_inputs,
+)
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
-from gnio_jax.filtering.gaps import Imu, bridge
+from gnio_jax.filtering.filter import Filter
+from gnio_jax.filtering.gaps import Imu, after_window, bridge
 from gnio_jax.filtering.history import FilterHistory, StepRecord, finished_history
 from gnio_jax.filtering.network import Predict, network_measurement
 from gnio_jax.filtering.propagation import (
@@ -24,7 +29,7 @@ from gnio_jax.filtering.propagation import (
     integrate,
     propagate,
 )
-from gnio_jax.filtering.settings import FilterConfig, YawFrame
+from gnio_jax.filtering.settings import YawFrame
 from gnio_jax.filtering.state import (
     FilterState,
     core_covariance,
@@ -33,40 +38,39 @@ from gnio_jax.filtering.state import (
     unroll_clones,
 )
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
-from gnio_jax.filtering.zero_velocity import ZeroVelocity
 from gnio_jax.types import Array
 
 T = TypeVar("T")
 
 
 def run_filter(
+    ekf: Filter,
     state: FilterState,
     gyro: Any,
     accel: Any,
     displacement: Any,
     covariance: Any,
-    config: FilterConfig,
-    noise: NoiseModel,
     imu_valid: Any = None,
     frame: YawFrame = "given",
     measurements: tuple[Measurement, ...] = (),
 ) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals of n IMU samples with given displacements (paper §III-G).
 
+    - ekf: the filter (`Filter`, `make_filter`).
     - state: the start (`initial_state`, `level_state`), or what an earlier run returned.
     - gyro, accel: (K·n, 3) rad/s and m/s², raw, in the body frame; the filter subtracts its biases.
-    - displacement, covariance: (K, 3) m and (K, 3, 3) m², before the scaling of `noise`. Row k is
-      from clone k − W to clone k, expressed in the yaw frame of clone k − W (`displacements` makes
-      such rows from a known trajectory). A row with a NaN, or before there are W + 1 clones, is no
-      measurement.
+    - displacement, covariance: (K, 3) m and (K, 3, 3) m², before the scaling of `ekf.noise`. Row k
+      is from clone k − W to clone k, expressed in the yaw frame of clone k − W (`displacements`
+      makes such rows from a known trajectory). A row with a NaN, or before there are W + 1 clones,
+      is no measurement.
     - imu_valid: (K·n,) booleans, False where an IMU sample is missing. Missing samples are bridged
       (see `gaps`), and if there is a mask also those that are not finite. None: the stream is
       complete.
     - frame: the attitude that defines this yaw frame: "given" is another one than the filter's,
       "own" is the filter's, as for the displacements of `FilterHistory.given`, which repeat a run
       of `run_odometry` without its network.
-    - measurements: other measurements, which are taken after the displacement of each interval; the
-      leading axis of their arrays is K (see `update`).
+    - measurements: measurements with a row for each interval, the leading axis K of their arrays.
+      They are taken after the displacement and after those of `ekf`, in their order (see `update`).
 
     Returns the final state, from which a later call continues (and continues the clone numbers k),
     and the history. Works under `jax.jit`, `jax.vmap` and `jax.grad`. Raises `ValueError` naming an
@@ -75,26 +79,24 @@ def run_filter(
     ones.
     """
     check_frame(frame)
-    inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
-    measured = checked_displacements(displacement, covariance, inputs, config)
-    return _run_filter(inputs, *measured, config, frame)
+    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
+    return _run_filter(inputs, *checked_displacements(displacement, covariance, inputs), frame)
 
 
-@functools.partial(jax.jit, static_argnames=("config", "frame"))
+@functools.partial(jax.jit, static_argnames="frame")
 def _run_filter(
-    inputs: Inputs, displacement: Array, covariance: Array, config: FilterConfig, frame: YawFrame
+    inputs: FilterInputs, displacement: Array, covariance: Array, frame: YawFrame
 ) -> tuple[FilterState, FilterHistory]:
-    given = scaled_displacement(displacement, covariance, inputs.noise, frame)
-    return _run(as_given, inputs, given, config)
+    rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)
+    return _run(take_row, inputs, rows)
 
 
 def run_odometry(
     predict: Predict,
+    ekf: Filter,
     state: FilterState,
     gyro: Any,
     accel: Any,
-    config: FilterConfig,
-    noise: NoiseModel,
     imu_valid: Any = None,
     measurements: tuple[Measurement, ...] = (),
 ) -> tuple[FilterState, FilterHistory]:
@@ -110,83 +112,88 @@ def run_odometry(
     expressed in the filter's own yaw frame and linearised accordingly
     (`displacement.linearise_displacement`), except with "tlio". Its covariance is diag(exp 2u), u
     raised to `log_std_min`. The network is not called in the first `FilterConfig.first_measured`
-    intervals, which have no whole window, and a window in which the filter coasted through a gap is
-    no measurement. Everything else is as in `run_filter`. Jit it from outside. It is also
-    differentiable in the values that `predict` closes over. Raises `ValueError` as `run_filter`
-    does, or for a `predict` that returns something else.
+    intervals after the start, which have no whole window, and a window in which the filter coasted
+    through a gap is no measurement. Everything else is as in `run_filter`. Jit it from outside. It
+    is also differentiable in the values that `predict` closes over. Raises `ValueError` as
+    `run_filter` does, or for a `predict` that returns something else.
     """
-    inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
-    of_window = network_measurement(predict, config, inputs.noise)
+    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
+    config, begun = ekf.config, inputs.state.window is not None
+    of_window = network_measurement(predict, inputs.ekf)
 
     def measure(
         number: Array, stream: Imu, _: None, state: FilterState, oldest: Array
     ) -> tuple[Displacement, dict]:
         def latest() -> Imu:
-            first = (number + 1) * config.samples_per_clone - config.reach
+            first = (number + 1) * config.samples_per_clone
             return jax.tree.map(
                 lambda signal: jax.lax.dynamic_slice_in_dim(signal, first, config.reach), stream
             )
 
-        # The number is the scan's own counter and the same for every sequence of a batch, so this
+        # From a start the scan's own counter is the same for every sequence of a batch, so this
         # remains a branch under vmap.
-        return of_window(number >= config.first_measured, latest, state, oldest)
+        number_since_start = number + inputs.state.step if begun else number
+        return of_window(number_since_start >= config.first_measured, latest, state, oldest)
 
-    return _run(measure, inputs, None, config)
+    return _run(measure, inputs, None)
 
 
 def _run(
     measure: Callable[..., tuple[Displacement, dict]],
-    inputs: Inputs,
-    given: Displacement | None,
-    config: FilterConfig,
+    inputs: FilterInputs,
+    displacement: Displacement | None,
 ) -> tuple[FilterState, FilterHistory]:
     """The state and the history of `clone_steps`."""
     state, records, age = clone_steps(
-        measure, inputs, given, config, lambda slot, _, record, __: record
+        measure, inputs, displacement, lambda slot, _, record, __: record
     )
+    config = inputs.ekf.config
     history = finished_history(records, age, inputs.state.healthy, config)
     state = state._replace(healthy=history.healthy[-1] > 0)
     return unroll_clones(state, len(age) % config.clones), history
 
 
-def as_given(_: Array, __: Imu, given: Displacement, *___: Any) -> tuple[Displacement, dict]:
-    """`measure` of `clone_steps` where the displacements are given."""
-    return given, {}
+def take_row(_: Array, __: Imu, row: Displacement, *___: Any) -> tuple[Displacement, dict]:
+    """`measure` of `clone_steps` where the displacements are known before the run."""
+    return row, {}
 
 
 def clone_steps(
     measure: Callable[..., tuple[Displacement, dict]],
-    inputs: Inputs,
-    given: Displacement | None,
-    config: FilterConfig,
+    inputs: FilterInputs,
+    displacement: Displacement | None,
     keep: Callable[[Array, FilterState, StepRecord, StepTrace], T],
 ) -> tuple[FilterState, T, Float[Array, "k"]]:
     """Bridge holes of the stream and take a clone step for every interval. Returns the state at the
     end, whose clones are a ring, the stacked results of `keep`, and the age of the oldest held
     sample of each interval, s.
 
-    measure(number, stream, given, state, oldest) returns the displacement of an interval and the
-    network's diagnostics: `number` counts the intervals from 0, `stream` is the whole stream,
-    `given` the interval's row, `oldest` the slot of the oldest clone. keep(slot, state, record,
-    trace) takes the slot of the newest clone and what `clone_step` returns.
+    measure(number, stream, row, state, oldest) returns the displacement of an interval and the
+    network's diagnostics: `number` counts the intervals from 0; `stream` is the whole stream behind
+    the last `FilterConfig.reach` samples before it; `row` is the interval's row of `displacement`,
+    and `oldest` the slot of the oldest clone. keep(slot, state, record, trace) takes the slot of
+    the newest clone and what `clone_step` returns.
     """
+    ekf, start, config = inputs.ekf, inputs.state, inputs.ekf.config
     signals = inputs.gyro, inputs.accel, inputs.imu_valid
-    stream, age, memory = bridge(*signals, inputs.state.imu, config)
+    stream, age, memory = bridge(*signals, start.imu, config)
     n = config.samples_per_clone
     by_interval = jax.tree.map(lambda x: x.reshape(-1, n, *x.shape[1:]), stream)
     age = age.reshape(-1, n).max(1)
+    with_past, window = after_window(stream, start.window, config)
 
     def step(state: FilterState, row: tuple) -> tuple[FilterState, T]:
-        number, imu, given, others = row
-        at_step = functools.partial(measure, number, stream, given)
+        number, imu, displacement, measurements = row
+        measure_now = functools.partial(measure, number, with_past, displacement)
         slot = number % config.clones
-        taken = clone_step(state, imu, slot, at_step, config, inputs.noise, others)
-        return taken[0], keep(slot, *taken)
+        state, record, trace = clone_step(ekf, state, imu, slot, measure_now, measurements)
+        return state, keep(slot, state, record, trace)
 
-    rows = jnp.arange(len(age)), by_interval, given, inputs.measurements
-    start = invariant_errors(inputs.state, config)
+    rows = jnp.arange(len(age)), by_interval, displacement, inputs.measurements
+    start = invariant_errors(start._replace(window=None), config)
     state, kept = blocked_scan(step, start, rows, config.checkpoint_every, config.truncate_every)
-    return state._replace(imu=memory._replace(quiet=state.imu.quiet)), kept, age
+    memory = memory._replace(quiet=state.imu.quiet)
+    return state._replace(imu=memory, window=window), kept, age
 
 
 # One clone interval
@@ -206,16 +213,16 @@ class StepTrace(NamedTuple):
 
 
 def clone_step(
+    ekf: Filter,
     state: FilterState,
     imu: Imu,
     slot: Array | int,
     measure: Measure,
-    config: FilterConfig,
-    noise: NoiseModel,
     measurements: tuple[Measurement, ...] = (),
 ) -> tuple[FilterState, StepRecord, StepTrace]:
     """One clone interval with the samples `imu`: propagate, clone into `slot` of the ring, take the
-    displacement and the other measurements."""
+    displacement, the measurements of the filter, and then those of this interval."""
+    config, noise = ekf.config, ekf.noise
     # A ring of clones: the newest clone replaces the oldest one, and the next slot then holds the
     # oldest clone. The anchor moves once in a round of the ring.
     dtype, oldest = state.offset.dtype, (slot + 1) % config.clones
@@ -227,10 +234,9 @@ def clone_step(
     state = _propagate(state, interval, transition, slot)
 
     displacement, diagnostics = measure(state, oldest)
-    at_rest = (ZeroVelocity(),) if config.zero_velocity_std > 0 else ()
-    outcomes: tuple[Outcome, ...] = ()
+    outcomes: dict[str, Outcome] = {}
     corrections: tuple[Correction, ...] = ()
-    for measurement in (displacement, *at_rest, *measurements):
+    for measurement in (displacement, *ekf.measurements, *measurements):
         step = Step(imu, slot, oldest, config, noise, outcomes)
         update = jax.checkpoint(
             lambda measurement, state, step=step: measurement.update(state, step),
@@ -238,7 +244,8 @@ def clone_step(
             prevent_cse=False,
         )
         state, outcome, correction = update(measurement, state)
-        outcomes, corrections = (*outcomes, outcome), (*corrections, correction)
+        outcomes = {**outcomes, measurement.name: outcome}
+        corrections = (*corrections, correction)
 
     covariance = core_covariance(state, config)
     if config.history == "diagonal":

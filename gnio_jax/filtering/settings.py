@@ -9,29 +9,32 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, no_type_check
+from typing import Any, Literal, no_type_check
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import keystr, tree_leaves_with_path
+from jax.tree_util import GetAttrKey, keystr, tree_leaves_with_path
 
-from gnio_jax.config import (
-    ConsideredStd,
-    DataConfig,
-    FilterOptions,
-    FilterSettings,
-    InitialStd,
-    NoiseModel,
-)
-from gnio_jax.config.files import checked_value
-from gnio_jax.config.schema import Count, NonNegative, NonNegativeCount, Place, Positive
+from gnio_jax.config import DataConfig, FilterOptions, FilterSettings
+from gnio_jax.config.files import check_value
+from gnio_jax.config.schema import Count, Entries, Location, NonNegative, NonNegativeCount, Positive
 from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
-_NUMBERS = ("noise", "start", "considered")
+_NUMBERS = ("noise", "start", "considered", "measurements")
 _OPTIONS = tuple(field.name for field in dataclasses.fields(FilterOptions))
 _OTHERS = [field.name for field in dataclasses.fields(FilterSettings) if field.name not in _NUMBERS]
 jax.tree_util.register_dataclass(FilterSettings, list(_NUMBERS), _OTHERS)
+
+
+jax.tree_util.register_pytree_with_keys(
+    Entries,
+    lambda entries: (
+        [(GetAttrKey(name), value) for name, value in entries.items()],
+        tuple(entries),
+    ),
+    lambda names, values: Entries(dict(zip(names, values, strict=True))),
+)
 
 YawFrame = Literal["own", "given"]
 """The yaw frame in which a displacement is expressed: that of the filter's own attitude of the
@@ -83,10 +86,10 @@ class FilterConfig(FilterOptions):
             value = getattr(self, name)
             if isinstance(value, np.ndarray | np.generic) and value.ndim == 0:
                 value = value.item()
-            object.__setattr__(self, name, checked_value(hint, value, Place("FilterConfig", name)))
+            object.__setattr__(self, name, check_value(hint, value, Location("FilterConfig", name)))
         if self.gate_softness and self.mahalanobis_fail_scale:
             problem = "makes no sense beside mahalanobis_fail_scale"
-            Place("FilterConfig", "gate_softness").refuse(problem, "set one of them to 0")
+            Location("FilterConfig", "gate_softness").refuse(problem, "set one of them to 0")
 
     @property
     def window(self) -> int:
@@ -147,25 +150,6 @@ class FilterConfig(FilterOptions):
 # ------------------------------------------------------------------------------------------------
 
 
-class FilterSetup(NamedTuple):
-    """The filter that the settings describe."""
-
-    config: FilterConfig
-    noise: NoiseModel
-    initial_std: InitialStd
-    considered: ConsideredStd | None = None
-    """Standard deviations of errors that the filter does not estimate; None: there are none."""
-    raw_gyro_bias: float | None = None
-    """Standard deviation of the first bias of a gyro whose phone subtracts no bias, rad/s."""
-
-
-def filter_setup(windows: DataConfig, settings: FilterSettings) -> FilterSetup:
-    """The filter for the windows and strides that a network was trained with."""
-    considered = settings.considered if any(settings.considered) else None
-    config = filter_config(windows, settings)
-    return FilterSetup(config, settings.noise, settings.start, considered, settings.raw_gyro_bias)
-
-
 def filter_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig:
     """The settings that are fixed when the filter is compiled. The numbers of the settings may be
     traced."""
@@ -208,11 +192,11 @@ def free_parameters(settings: FilterSettings, paths: Iterable[str]) -> dict[str,
     Each of the `paths` names a number ("noise.gyro_density") or a section of them ("noise"). A
     number that is 0 is switched off and has no free parameter.
     """
-    wanted = tuple(paths)
+    paths = tuple(paths)
     return {
         name: math.log(value) - (math.log1p(-value) if name == SHARE else 0.0)
         for name, value in _numbers(settings).items()
-        if value > 0 and any(is_below(name, path) for path in wanted)
+        if value > 0 and any(is_below(name, path) for path in paths)
     }
 
 

@@ -37,12 +37,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gnio_jax import geometry
-from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.checks import Inputs, check_frame, checked_displacements, checked_inputs
+from gnio_jax.filtering.checks import (
+    FilterInputs,
+    check_frame,
+    checked_displacements,
+    checked_inputs,
+)
 from gnio_jax.filtering.displacement import scaled_displacement
+from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.history import StepRecord
 from gnio_jax.filtering.propagation import Transition, put
-from gnio_jax.filtering.scan import StepTrace, as_given, clone_steps
+from gnio_jax.filtering.scan import StepTrace, clone_steps, take_row
 from gnio_jax.filtering.settings import FilterConfig, YawFrame
 from gnio_jax.filtering.state import (
     CLONE,
@@ -73,13 +78,12 @@ class SmoothedHistory(NamedTuple):
 
 
 def smooth(
+    ekf: Filter,
     state: FilterState,
     gyro: Any,
     accel: Any,
     displacement: Any,
     covariance: Any,
-    config: FilterConfig,
-    noise: NoiseModel,
     imu_valid: Any = None,
     frame: YawFrame = "given",
     measurements: tuple[Measurement, ...] = (),
@@ -89,23 +93,22 @@ def smooth(
 
     Arguments and `ValueError`s are those of `run_filter`, whose updates are smoothed exactly as
     they were made. A run of `run_odometry` that returned `history` is smoothed without its network
-    by `smooth(state, gyro, accel, *history.given(noise), config, noise,
-    frame=config.displacement_frame)`. `state` is the prior, and earlier measurements are not
+    by `smooth(ekf, state, gyro, accel, *history.given(ekf.noise),
+    frame=ekf.config.displacement_frame)`. `state` is the prior, and earlier measurements are not
     smoothed. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
 
-    Smoothing trusts the IMU as far as `noise` says. Where the IMU is sampled too slowly for the
+    Smoothing trusts the IMU as far as `ekf.noise` says. Where the IMU is sampled too slowly for the
     motion, as on a swinging leg at 100 Hz, its integration errs by more than that, and the smoothed
     positions can be worse than those of the filter. With 200 Hz, or with a larger
-    `noise.accel_density` (0.03 there), they are better.
+    `accel_density` (0.03 there), they are better.
 
     Memory: about K · (18 m + 500) numbers, m = 21 + 6 (W + 1): 25 kB for each interval at W = 20,
     in float64. Smoothed variances are differences. In float32 a variance that becomes smaller by
     many orders of magnitude, as at the start, keeps few digits and can become negative.
     """
     check_frame(frame)
-    inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
-    measured = checked_displacements(displacement, covariance, inputs, config)
-    return _smooth(inputs, *measured, config, frame)
+    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
+    return _smooth(inputs, *checked_displacements(displacement, covariance, inputs), frame)
 
 
 class _ForwardStep(NamedTuple):
@@ -122,27 +125,28 @@ class _ForwardStep(NamedTuple):
     trace: StepTrace
 
 
-@functools.partial(jax.jit, static_argnames=("config", "frame"))
+@functools.partial(jax.jit, static_argnames="frame")
 def _smooth(
-    inputs: Inputs, displacement: Array, covariance: Array, config: FilterConfig, frame: YawFrame
+    inputs: FilterInputs, displacement: Array, covariance: Array, frame: YawFrame
 ) -> SmoothedHistory:
-    given = scaled_displacement(displacement, covariance, inputs.noise, frame)
+    config = inputs.ekf.config
+    rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)
 
     def keep(slot: Array, state: FilterState, record: StepRecord, trace: StepTrace) -> _ForwardStep:
         whole = jnp.concatenate([state.core_covariance, state.cross_covariance], axis=1)
         cross = with_position(whole) if state.shift is None else state.shift(with_position(whole))
         return _ForwardStep(slot, record.mean, first_order_covariance(state), cross, trace)
 
-    state, steps, _ = clone_steps(as_given, inputs, given, config, keep)
+    state, steps, _ = clone_steps(take_row, inputs, rows, keep)
     size, dtype = sum(state.cross_covariance.shape), state.offset.dtype
     nothing = Adjoint(jnp.zeros(size, dtype), jnp.zeros((size, size), dtype))
-    backward = functools.partial(_backward, config=config)
+    backward = functools.partial(_step_back, config=config)
     _, (mean, covariance) = jax.lax.scan(backward, nothing, steps, reverse=True)
     diagonal = jnp.diagonal(covariance, axis1=1, axis2=2)
     return SmoothedHistory(*mean, diagonal, covariance if config.history == "core" else None)
 
 
-def _backward(
+def _step_back(
     adjoint: Adjoint, step: _ForwardStep, config: FilterConfig
 ) -> tuple[Adjoint, tuple[Mean, Array]]:
     """The smoothed estimate after a step, and the adjoint before it."""
@@ -156,8 +160,8 @@ def _backward(
     mean = Mean(rotation, *map(jnp.add, step.mean[1:], others))
     oldest = (step.slot + 1) % config.clones
     for correction in reversed(step.trace.corrections):
-        adjoint = _before_update(adjoint, correction, oldest)
-    adjoint = _before_propagation(adjoint, step.trace.transition, step.slot)
+        adjoint = _pull_back_update(adjoint, correction, oldest)
+    adjoint = _pull_back_propagation(adjoint, step.trace.transition, step.slot)
     return adjoint, (mean, covariance)
 
 
@@ -168,7 +172,7 @@ class Adjoint(NamedTuple):
     matrix: Float[Array, "m m"]
 
 
-def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
+def _pull_back_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
     """The adjoint before an update; `oldest` is the slot of the oldest clone."""
 
     measured = functools.partial(measurable_errors, correction.jacobian, oldest=oldest)
@@ -186,7 +190,9 @@ def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, 
     )
 
 
-def _before_propagation(adjoint: Adjoint, transition: Transition, slot: Int[Array, ""]) -> Adjoint:
+def _pull_back_propagation(
+    adjoint: Adjoint, transition: Transition, slot: Int[Array, ""]
+) -> Adjoint:
     """The adjoint before the propagation and the cloning into `slot`."""
     size, core = len(adjoint.vector), CORE + len(transition.decay)
 
@@ -196,8 +202,8 @@ def _before_propagation(adjoint: Adjoint, transition: Transition, slot: Int[Arra
         pose = jnp.concatenate([moved[THETA], moved[OFFSET]])
         return jnp.concatenate([moved, put(clones, pose, CLONE * slot, 0)])
 
-    def back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
+    def pull_back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
         like = jax.ShapeDtypeStruct((size, rows.shape[1]), rows.dtype)
         return jax.linear_transpose(step, like)(rows)[0]
 
-    return Adjoint(back(adjoint.vector[:, None])[:, 0], back(back(adjoint.matrix).T))
+    return Adjoint(pull_back(adjoint.vector[:, None])[:, 0], pull_back(pull_back(adjoint.matrix).T))

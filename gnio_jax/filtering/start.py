@@ -14,6 +14,7 @@ The definition of rest depends on its use:
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -24,9 +25,15 @@ from jax.core import Tracer
 from jaxtyping import Float
 
 from gnio_jax import geometry
-from gnio_jax.config import InitialStd
-from gnio_jax.config.schema import NOT_NEGATIVE, TLIO_STD
-from gnio_jax.filtering.checks import check_bounds, check_numbers, check_rotation, checked_array
+from gnio_jax.config.schema import NOT_NEGATIVE
+from gnio_jax.filtering.checks import (
+    check_bounds,
+    check_filter,
+    check_numbers,
+    check_rotation,
+    checked_array,
+)
+from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState, Mean, without_clones
 from gnio_jax.numerics import finite_rows
@@ -52,46 +59,45 @@ LEAST_GRAVITY = 0.5 * GRAVITY
 # The arguments of the public functions have no shapes for the run-time checker: a wrong shape is
 # the user's mistake and a ValueError.
 def initial_state(
-    config: FilterConfig,
+    ekf: Filter,
     rotation: Any,
     velocity: Any,
     position: Any,
     gyro_bias: Any = 0,
     accel_bias: Any = 0,
-    std: InitialStd = TLIO_STD,
     level_gyro_bias: Any = None,
 ) -> FilterState:
     """Start of the filter from a known pose, without clones.
 
     rotation (3, 3) body → world; velocity (3,) m/s and position (3,) m in the world frame;
-    gyro_bias rad/s and accel_bias m/s², each (3,) or one number for all axes; std has the standard
-    deviations of their errors, which are independent. Raises `ValueError` naming an argument of
-    wrong shape or precision.
+    gyro_bias rad/s and accel_bias m/s², each (3,) or one number for all axes. `ekf.start` has the
+    standard deviations of their errors, which are independent. Raises `ValueError` naming an
+    argument of wrong shape or precision.
 
     level_gyro_bias, rad/s, is the standard deviation of the two components of the gyro bias that
-    are level at the start, if it is not std.gyro_bias (ours, for a raw gyro). Gravity shows these
-    components to the filter. Without a rest and without fixes, only the displacements show the
-    vertical one, and their errors are temporally correlated: a filter that learns it from them
+    are level at the start, if it is not ekf.start.gyro_bias (ours, for a raw gyro). Gravity shows
+    these components to the filter. Without a rest and without fixes, only the displacements show
+    the vertical one, and their errors are temporally correlated: a filter that learns it from them
     loses the yaw.
     """
+    check_filter(ekf)
+    config = ekf.config
     rotation = checked_array("rotation", rotation, (3, 3), config)
     check_rotation("rotation", rotation)
-    given = {"velocity": velocity, "position": position}
+    parts = {"velocity": velocity, "position": position}
     biases = {"gyro_bias": gyro_bias, "accel_bias": accel_bias}
     for name, value in biases.items():
-        given[name] = value if jnp.ndim(value) else jnp.full(3, value, rotation.dtype)
+        parts[name] = value if jnp.ndim(value) else jnp.full(3, value, rotation.dtype)
     vectors = [
         checked_array(name, value, (3,), config).astype(rotation.dtype)
-        for name, value in given.items()
+        for name, value in parts.items()
     ]
-    check_numbers("std", std)
+    check_numbers("ekf.start", ekf.start)
     check_bounds("level_gyro_bias", level_gyro_bias, [NOT_NEGATIVE])
-    return without_clones(Mean(rotation, *vectors), std, config.clones, level_gyro_bias)
+    return without_clones(Mean(rotation, *vectors), ekf.start, config.clones, level_gyro_bias)
 
 
-def level_state(
-    config: FilterConfig, gyro: Any, accel: Any, std: InitialStd = TLIO_STD
-) -> FilterState:
+def level_state(ekf: Filter, gyro: Any, accel: Any) -> FilterState:
     """Start without a reference: tilt from gravity, yaw, velocity and position zero (ours).
 
     gyro rad/s and accel m/s² (m, 3), raw, are the first samples, of a second or so, in which the
@@ -100,30 +106,34 @@ def level_state(
     averaged, because a hand may turn the phone. If a second or more is as quiet as on a table, the
     bias of the gyro is its mean, as in `rest_at_start`; otherwise it is zero.
 
-    The `std` of tilt and velocity are replaced. That of the tilt follows from the accelerometer's
-    bias and from the spread of the averaged accelerations, with one independent sample per half
-    second. That of the velocity is proportional to this spread, from 0.05 m/s on a table to 1 m/s
-    for a walker. The yaw is zero by definition, so its `std` is kept. Raises `ValueError` naming an
-    argument of wrong shape or precision, that is not finite, or that shows no gravity.
+    The standard deviations of tilt and velocity are not those of `ekf.start`. That of the tilt
+    follows from the accelerometer's bias and from the spread of the averaged accelerations, with
+    one independent sample per half second. That of the velocity is proportional to this spread,
+    from 0.05 m/s on a table to 1 m/s for a walker. The yaw is zero by definition, so it keeps that
+    of `ekf.start`. Raises `ValueError` naming an argument of wrong shape or precision, that is not
+    finite, or that shows no gravity.
     """
+    check_filter(ekf)
+    config, std = ekf.config, ekf.start
     samples = jnp.shape(accel)[0] if jnp.ndim(accel) else 0
     gyro = checked_array("gyro", gyro, (samples, 3), config)
     accel = checked_array("accel", accel, (samples, 3), config)
     if samples < 2:
         raise ValueError(f"accel: at least two samples are needed, found {samples}")
-    rotation, gyro_bias, tilt_std, velocity_std, up = _levelled(
+    rotation, gyro_bias, tilt_std, velocity_std, up = _level(
         gyro, accel, jnp.asarray(std.accel_bias), config
     )
     if not isinstance(up, Tracer) and (size := np.linalg.norm(up)) < LEAST_GRAVITY:
         problem = f"shows no gravity, its mean is {size:.2g} m/s²"
         raise ValueError(f"accel: {problem}; it must be in m/s² and include gravity")
-    std, nothing = std._replace(tilt=tilt_std, velocity=velocity_std), np.zeros(3, accel.dtype)
-    return initial_state(config, rotation, nothing, nothing, gyro_bias, std=std)
+    ekf = dataclasses.replace(ekf, start=std._replace(tilt=tilt_std, velocity=velocity_std))
+    zeros = np.zeros(3, accel.dtype)
+    return initial_state(ekf, rotation, zeros, zeros, gyro_bias)
 
 
 # One program, as in `without_clones`.
 @functools.partial(jax.jit, static_argnames="config")
-def _levelled(
+def _level(
     gyro: Array, accel: Array, bias_std: Array, config: FilterConfig
 ) -> tuple[Array, Array, Array, Array, Array]:
     """The attitude from gravity, the gyro's bias, the standard deviations of tilt and velocity, and
@@ -160,14 +170,14 @@ def rest_at_start(
     """The whole seconds at the start in which raw gyro (rad/s) and accel (m/s²) are as quiet as on
     a table (ours). NaN means that a sample is missing; a second without more than half of its
     samples is not quiet."""
-    second, rest = round(REST_SECONDS / dt), 0
-    there = finite_rows(gyro) & finite_rows(accel)
-    while rest + second <= len(gyro):
-        rows = rest + np.flatnonzero(there[rest : rest + second])
+    second, end = round(REST_SECONDS / dt), 0
+    present = finite_rows(gyro) & finite_rows(accel)
+    while end + second <= len(gyro):
+        rows = end + np.flatnonzero(present[end : end + second])
         if 2 * len(rows) < second or gyro[rows].std(0).max() > REST_GYRO_STD:
             break
         if accel[rows].std(0).max() > REST_ACCEL_STD:
             break
-        rest += second
-    bias = gyro[:rest][there[:rest]].mean(0) if rest else np.zeros(3)
-    return Rest(np.asarray(bias, np.float64), rest * dt)
+        end += second
+    bias = gyro[:end][present[:end]].mean(0) if end else np.zeros(3)
+    return Rest(np.asarray(bias, np.float64), end * dt)

@@ -80,8 +80,8 @@ class ImuMemory(NamedTuple):
     missing: Int[Array, ""]
     """Number of samples missing since."""
     quiet: Int[Array, ""]
-    """Number of successive clone intervals in which the IMU was quiet; counted if
-    `zero_velocity_std` is above 0."""
+    """Number of successive clone intervals in which the IMU was quiet; `ZeroVelocity` counts
+    them."""
 
 
 class Mean(NamedTuple):
@@ -154,6 +154,10 @@ class FilterState(NamedTuple):
     with additive errors."""
     healthy: Bool[Array, ""]
     """Once False, it remains False: see `FilterHistory.healthy`."""
+    window: Float[Array, "r 7"] | None = None
+    """The last `FilterConfig.reach` samples before the state, with holes bridged: gyro rad/s, accel
+    m/s², raw, and whether the filter used the sample. A later run needs them for the network's
+    first windows. None at a start, and inside a run."""
 
     @property
     def position(self) -> Float[Array, "*k 3"]:

@@ -20,9 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from gnio_jax.config import ConsideredStd, InitialStd, NoiseModel
-from gnio_jax.config.schema import TLIO_STD
-from gnio_jax.filtering.checks import check_number, checked_noise, checked_state
+from gnio_jax.filtering.checks import (
+    check_filter,
+    check_number,
+    checked_state,
+    converted_filter,
+)
 from gnio_jax.filtering.consider import (
     Tangents,
     considered_covariance,
@@ -31,13 +34,13 @@ from gnio_jax.filtering.consider import (
     step_with_tangents,
 )
 from gnio_jax.filtering.displacement import Displacement
+from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.gaps import Imu, bridge
-from gnio_jax.filtering.history import FilterHistory, finished_history
+from gnio_jax.filtering.history import FilterHistory, describe_failure, finished_history
 from gnio_jax.filtering.network import Predict, network_measurement
 from gnio_jax.filtering.propagation import integrate
 from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid
 from gnio_jax.filtering.scan import Measure, clone_step
-from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import (
     BIASES,
@@ -71,9 +74,11 @@ class Pose(NamedTuple):
     healthy: bool
     """False from the first clone step on whose state is not finite, has a negative variance or a
     speed above `FilterConfig.speed_limit`. All poses from there on are invalid."""
+    failure: str = ""
+    """What made the first pose that is not healthy impossible; empty before it."""
 
 
-class Estimate(NamedTuple):
+class DevicePose(NamedTuple):
     """A `Pose` on the device, without its time."""
 
     mean: Mean
@@ -100,20 +105,19 @@ class Core(NamedTuple):
 class Tracker:
     """The filter with the network in the loop, fed sample by sample.
 
-    - predict, config, noise: as `run_odometry` takes them.
+    - predict, ekf: as `run_odometry` takes them, with the measurements of the filter. The consider
+      covariance of `ekf.considered` is added to that of the poses; a tracker takes no gyro as raw,
+      so `raw_gyro_bias` has no effect.
     - state: the start, at the time of the first sample (`initial_state`, `level_state`, or the
       final state of a run). None: it is made of the first `rest_seconds`, in which the device must
       be still (`level_state`). Until then there is no pose; afterwards these samples are filtered
       too. A sample that is missing, or without any acceleration, begins the rest anew.
-    - rest_seconds, std: length of that rest, s, and the standard deviations of that start.
+    - rest_seconds: length of that rest, s.
     - hole: samples further apart than this leave the grid samples between them missing, s; None:
       1.5 dt. A slower IMU needs a larger value.
     - imu_rate: Hz, nominal, of the samples that will come; None: 1/dt. A faster IMU is band-limited
       as in `data.resample`, and poses come later by `delay`. The rate could be estimated from the
       stamps, but then there would be no pose before, and the delay would depend on jitter.
-    - considered: errors that the filter does not estimate, constant since the start, whose consider
-      covariance is added to that of the poses (see `consider`). None: there are none. A tracker
-      takes no gyro as raw, so `raw_gyro_bias` has no effect.
 
     The constructor compiles everything, so that no sample waits for a compiler. Poses are new
     arrays, which later samples do not change. A tracker must not be used by several threads at
@@ -123,36 +127,32 @@ class Tracker:
     def __init__(
         self,
         predict: Predict,
-        config: FilterConfig,
-        noise: NoiseModel,
+        ekf: Filter,
         state: FilterState | None = None,
         *,
         rest_seconds: float = 1.0,
-        std: InitialStd = TLIO_STD,
         hole: float | None = None,
         imu_rate: float | None = None,
-        considered: ConsideredStd | None = None,
     ):
-        check_number("rest_seconds", rest_seconds, 1.5 * config.dt, "s")
-        self._config, self._std, self._considered = config, std, considered
-        self._rest = round(rest_seconds / config.dt)
-        self._stream = Stream(create_grid(config.dt, hole, imu_rate))
+        check_filter(ekf)
+        dt = ekf.config.dt
+        check_number("rest_seconds", rest_seconds, 1.5 * dt, "s")
+        self._rest, self._failure = round(rest_seconds / dt), ""
+        self._stream = Stream(create_grid(dt, hole, imu_rate))
         dtype = jax.dtypes.canonicalize_dtype(np.float64) if state is None else state.offset.dtype
-        self._noise = checked_noise(noise, dtype)
+        self._ekf = converted_filter(ekf, dtype)
         start = state
         if start is None:  # The programs are compiled for the shapes of any start.
-            nothing = jnp.zeros(3, dtype)
-            start = initial_state(config, jnp.eye(3, dtype=dtype), nothing, nothing, std=std)
+            zeros = jnp.zeros(3, dtype)
+            start = initial_state(ekf, jnp.eye(3, dtype=dtype), zeros, zeros)
         core = self._start(start)
-        self._advance, self._look_ahead = compile_programs(
-            predict, core, config, self._noise, considered
-        )
+        self._advance, self._look_ahead = compile_programs(predict, core, self._ekf)
         if state is None:
             self._core = None
 
     def expect(self, imu_rate: float, hole: float | None = None) -> None:
         """Change `imu_rate` and `hole` before the first sample. Nothing is compiled again."""
-        self._stream = Stream(create_grid(self._config.dt, hole, imu_rate))
+        self._stream = Stream(create_grid(self._ekf.config.dt, hole, imu_rate))
 
     def push(self, time: Any, gyro: Any, accel: Any) -> Pose | None:
         """Take one sample: time s, gyro (3,) rad/s, accel (3,) m/s², raw, in the body frame. A
@@ -169,16 +169,16 @@ class Tracker:
         so much faster than `imu_rate` that it would alias, and for a rest without gravity, whose
         samples are left out.
         """
-        self._stream.push(*_checked_sample(time, gyro, accel))
+        self._stream.push(*_check_sample(time, gyro, accel))
         if self._core is None:
             self._start_from_rest()
-        n, made = self._config.samples_per_clone, False
-        while self._core is not None and self._stream.known >= n:
+        n, stepped = self._ekf.config.samples_per_clone, False
+        while self._core is not None and self._stream.ready >= n:
             rows = self._stream.rows(n).astype(self._core.window.dtype)
             self._stream.take(n)
             self._core, estimate = self._advance(self._core, rows)
-            self._ahead, made = (0, estimate, self._core.filter.imu), True
-        return self._as_pose() if made else None
+            self._ahead, stepped = (0, estimate, self._core.filter.imu), True
+        return self._read_pose() if stepped else None
 
     def pose(self) -> Pose | None:
         """The pose after the newest grid sample; between clone steps the samples since the last
@@ -190,19 +190,20 @@ class Tracker:
         if self._core is None:
             return None
         done, estimate, memory = self._ahead
-        known = self._stream.known
-        for row in self._stream.rows(known)[done:].astype(self._core.window.dtype):
+        ready = self._stream.ready
+        for row in self._stream.rows(ready)[done:].astype(self._core.window.dtype):
             estimate, memory = self._look_ahead(estimate, memory, row)
-        self._ahead = known, estimate, memory
-        return self._as_pose()
+        self._ahead = ready, estimate, memory
+        return self._read_pose()
 
     def filter_state(self) -> FilterState | None:
         """The filter after the last clone step, as `run_odometry` would return it; None while there
         is no start."""
         if self._core is None:
             return None
-        oldest = int(self._core.intervals) % self._config.clones
-        return unroll_clones(_copied(self._core.filter), oldest)
+        config, core = self._ekf.config, _copy(self._core)
+        state = unroll_clones(core.filter, int(core.intervals) % config.clones)
+        return state._replace(window=core.window)
 
     @property
     def delay(self) -> float:
@@ -214,14 +215,14 @@ class Tracker:
 
     def _start_from_rest(self) -> None:
         """Start as soon as the next samples make a whole rest; they are filtered afterwards."""
-        while self._core is None and self._stream.known >= self._rest:
+        while self._core is None and self._stream.ready >= self._rest:
             rows = self._stream.rows(self._rest)
             unusable = np.flatnonzero((rows[:, VALID] == 0) | ~rows[:, ACCEL].any(axis=1))
             if len(unusable):
                 self._stream.take(int(unusable[-1]) + 1)
                 continue
             try:
-                state = level_state(self._config, rows[:, GYRO], rows[:, ACCEL], self._std)
+                state = level_state(self._ekf, rows[:, GYRO], rows[:, ACCEL])
             except ValueError:  # It shows no gravity, but the next samples may.
                 self._stream.take(self._rest)
                 raise
@@ -229,43 +230,42 @@ class Tracker:
 
     def _start(self, state: FilterState) -> Core:
         """The filter begins with `state`, at the time of the next sample."""
-        state = checked_state(state, self._config, self._noise)
-        window = jnp.zeros((self._config.reach, 7), state.offset.dtype)
-        state = invariant_errors(state, self._config)
-        tangents = None if self._considered is None else start_tangents(state)
+        config, state = self._ekf.config, checked_state(state, self._ekf)
+        window = state.window
+        if window is None:
+            window = jnp.zeros((config.reach, 7), state.offset.dtype)
+        state = invariant_errors(state._replace(window=None), config)
+        tangents = None if self._ekf.considered is None else start_tangents(state)
         # Copies, because the compiled step takes the memory of its argument, which no other array,
         # nor two of its fields, may share.
-        core = _copied(Core(state, window, jnp.int32(0), tangents))
+        core = _copy(Core(state, window, jnp.int32(0), tangents))
         flags = jnp.stack([jnp.nan, jnp.nan, state.healthy]).astype(window.dtype)
         self._core: Core | None = core
-        estimate = estimated(state, flags, tangents, self._considered, self._config)
-        self._ahead: tuple[int, Estimate, ImuMemory] = 0, estimate, core.filter.imu
-        """Number of known samples that `pose` has integrated, and the result."""
+        estimate = device_pose(self._ekf, state, flags, tangents)
+        self._ahead: tuple[int, DevicePose, ImuMemory] = 0, estimate, core.filter.imu
+        """Number of ready samples that `pose` has integrated, and the result."""
         return core
 
-    def _as_pose(self) -> Pose:
+    def _read_pose(self) -> Pose:
         """The newest estimate on the host, at the end of the interval of its last sample."""
         ahead, estimate, _ = self._ahead
         mean, covariance, numbers = jax.tree.map(np.array, estimate)
         accepted, nis, healthy = numbers.tolist()
-        time = self._stream.origin + (self._stream.taken + ahead) * self._config.dt
+        if not healthy and not self._failure:
+            self._failure = describe_failure(mean, np.diag(covariance), self._ekf.config)
+        time = self._stream.origin + (self._stream.taken + ahead) * self._ekf.config.dt
         flags = {"accepted": accepted, "nis": nis, "healthy": healthy > 0}
-        return Pose(time, *mean, covariance=covariance, **flags)
+        return Pose(time, *mean, covariance=covariance, **flags, failure=self._failure)
 
 
 def compile_programs(
-    predict: Predict,
-    core: Core,
-    config: FilterConfig,
-    noise: NoiseModel,
-    considered: ConsideredStd | None,
-) -> tuple[Callable[..., tuple[Core, Estimate]], Callable[..., tuple[Estimate, ImuMemory]]]:
+    predict: Predict, core: Core, ekf: Filter
+) -> tuple[Callable[..., tuple[Core, DevicePose]], Callable[..., tuple[DevicePose, ImuMemory]]]:
     """`advance` and `look_ahead`, compiled for cores like this one."""
-    rows = jax.ShapeDtypeStruct((config.samples_per_clone, 7), core.window.dtype)
-    fixed = {"config": config, "noise": noise}
-    step = functools.partial(advance, predict=predict, considered=considered, **fixed)
+    rows = jax.ShapeDtypeStruct((ekf.config.samples_per_clone, 7), core.window.dtype)
+    step = functools.partial(advance, predict=predict, ekf=ekf)
     advancing = jax.jit(step, donate_argnums=0).lower(core, rows)
-    ahead, row = functools.partial(look_ahead, **fixed), rows.update(shape=(7,))
+    ahead, row = functools.partial(look_ahead, ekf=ekf), rows.update(shape=(7,))
     looking = jax.jit(ahead).lower(advancing.out_info[1], core.filter.imu, row)
     return advancing.compile(), looking.compile()
 
@@ -274,27 +274,26 @@ def advance(
     core: Core,
     rows: Float[Array, "n 7"],
     predict: Predict,
-    config: FilterConfig,
-    noise: NoiseModel,
-    considered: ConsideredStd | None,
-) -> tuple[Core, Estimate]:
+    ekf: Filter,
+) -> tuple[Core, DevicePose]:
     """One clone step, as `run_odometry` makes it, from the n grid samples (gyro, accel, valid) of
     its interval. The network is not called if the window is no measurement."""
-    valid = rows[:, VALID] > 0
+    config, valid = ekf.config, rows[:, VALID] > 0
     imu, age, memory = bridge(rows[:, GYRO], rows[:, ACCEL], valid, core.filter.imu, config)
     assert imu.gap is not None
     newest = jnp.concatenate([imu.gyro, imu.accel, imu.gap.used[:, None]], axis=1)
     window = jnp.concatenate([core.window[config.samples_per_clone :], newest])
-    complete = (core.intervals >= config.clones_per_window) & jnp.all(window[:, VALID] > 0)
-    of_window = network_measurement(predict, config, noise)
+    complete = core.filter.step >= config.clones_per_window
+    complete = complete & jnp.all(window[:, VALID] > 0)
+    measure_window = network_measurement(predict, ekf)
     latest = Imu(window[:, GYRO], window[:, ACCEL], None)
 
     def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
-        return of_window(complete, lambda: latest, state, oldest)[0], {}
+        return measure_window(complete, lambda: latest, state, oldest)[0], {}
 
     def step(state: FilterState, measure: Measure) -> tuple[FilterState, FilterHistory]:
         slot = core.intervals % config.clones
-        return advance_filter(state, imu, age, measure, slot, config, noise)
+        return advance_filter(ekf, state, imu, age, measure, slot)
 
     if core.tangents is None:
         (state, history), tangents = step(core.filter, measure), None
@@ -302,72 +301,69 @@ def advance(
         state, history, tangents = step_with_tangents(step, core.filter, core.tangents, measure)
     state = state._replace(imu=memory._replace(quiet=state.imu.quiet))
     flags = jnp.stack([history.accepted[0], history.nis[0], history.healthy[0]])
-    estimate = estimated(state, flags, tangents, considered, config)
+    estimate = device_pose(ekf, state, flags, tangents)
     return Core(state, window, core.intervals + 1, tangents), estimate
 
 
 def advance_filter(
+    ekf: Filter,
     state: FilterState,
     imu: Imu,
     age: Float[Array, "n"],
     measure: Measure,
     slot: Array,
-    config: FilterConfig,
-    noise: NoiseModel,
 ) -> tuple[FilterState, FilterHistory]:
     """One clone step, and a history of one row. `age` of each held sample, s: see `gaps.bridge`."""
-    state, record, _ = clone_step(state, imu, slot, measure, config, noise)
+    state, record, _ = clone_step(ekf, state, imu, slot, measure)
     records = jax.tree.map(lambda leaf: leaf[None], record)
-    history = finished_history(records, jnp.max(age)[None], state.healthy, config)
+    history = finished_history(records, jnp.max(age)[None], state.healthy, ekf.config)
     return state._replace(healthy=history.healthy[-1] > 0), history
 
 
 def look_ahead(
-    estimate: Estimate,
+    estimate: DevicePose,
     memory: ImuMemory,
     row: Float[Array, "7"],
-    config: FilterConfig,
-    noise: NoiseModel,
-) -> tuple[Estimate, ImuMemory]:
+    ekf: Filter,
+) -> tuple[DevicePose, ImuMemory]:
     """The estimate and the memory of the IMU after one more grid sample, by integration alone.
 
     A consider covariance is propagated by the same transition as the filter's own.
     """
     mean, covariance, flags = estimate
+    config = ekf.config
     imu, _, memory = bridge(row[None, GYRO], row[None, ACCEL], row[None, VALID] > 0, memory, config)
-    ahead = integrate(mean, imu, noise, config.dt)
+    ahead = integrate(mean, imu, ekf.noise, config.dt)
     transition = jnp.concatenate([ahead.transition, jnp.eye(15, dtype=row.dtype)[BIASES]])
     covariance = transition @ covariance @ transition.T + ahead.noise
     mean = Mean(ahead.rotation, ahead.velocity, ahead.position, *mean[3:])
-    return Estimate(mean, 0.5 * (covariance + covariance.T), flags), memory
+    return DevicePose(mean, 0.5 * (covariance + covariance.T), flags), memory
 
 
-def estimated(
-    state: FilterState,
-    flags: Float[Array, "3"],
-    tangents: Tangents | None,
-    considered: ConsideredStd | None,
-    config: FilterConfig,
-) -> Estimate:
+def device_pose(
+    ekf: Filter, state: FilterState, flags: Float[Array, "3"], tangents: Tangents | None
+) -> DevicePose:
     """The state's estimate; the consider covariance is added to its own."""
-    covariance = core_covariance(state, config)
-    if tangents is not None and considered is not None:
+    covariance = core_covariance(state, ekf.config)
+    if tangents is not None and ekf.considered is not None:
         sensitivity = core_sensitivity(state.mean, tangents)
-        covariance = covariance + considered_covariance(sensitivity[None], considered)[0]
-    return Estimate(state.mean, covariance, flags)
+        covariance = covariance + considered_covariance(sensitivity[None], ekf.considered)[0]
+    return DevicePose(state.mean, covariance, flags)
 
 
-def _checked_sample(time: Any, gyro: Any, accel: Any) -> tuple[float, tuple[float, ...]]:
+def _check_sample(time: Any, gyro: Any, accel: Any) -> tuple[float, tuple[float, ...]]:
     """The time, and gyro and accel in one tuple."""
-    (seconds,) = _numbers("time", time, (), "a finite number of seconds", math.inf)
+    (seconds,) = _check_numbers("time", time, (), "a finite number of seconds", math.inf)
     if not math.isfinite(seconds):
         raise ValueError(f"time: must be a finite number of seconds, found {time!r}")
-    rate = _numbers("gyro", gyro, (3,), "three numbers", FASTEST_TURN, "rad/s")
-    return seconds, rate + _numbers("accel", accel, (3,), "three numbers", STRONGEST_FORCE, "m/s²")
+    rate = _check_numbers("gyro", gyro, (3,), "three numbers", FASTEST_TURN, "rad/s")
+    return seconds, rate + _check_numbers(
+        "accel", accel, (3,), "three numbers", STRONGEST_FORCE, "m/s²"
+    )
 
 
-def _numbers(
-    name: str, value: Any, shape: tuple[int, ...], wanted: str, largest: float, unit: str = ""
+def _check_numbers(
+    name: str, value: Any, shape: tuple[int, ...], kind: str, largest: float, unit: str = ""
 ) -> tuple[float, ...]:
     """The numbers of an array of this shape, which must be within the range of an IMU."""
     try:
@@ -375,13 +371,13 @@ def _numbers(
     except (TypeError, ValueError):
         array = np.empty(0)
     if array.shape != shape:
-        raise ValueError(f"{name}: must be {wanted}, found {value!r}")
+        raise ValueError(f"{name}: must be {kind}, found {value!r}")
     numbers = tuple(array.reshape(-1).tolist())
-    size = max((abs(each) for each in numbers if math.isfinite(each)), default=0.0)
+    size = max((abs(number) for number in numbers if math.isfinite(number)), default=0.0)
     if size > largest:
         raise ValueError(f"{name}: no IMU measures more than {largest:g} {unit}, found {size:g}")
     return numbers
 
 
-def _copied(tree: Any) -> Any:
+def _copy(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.array(leaf, copy=True), tree)

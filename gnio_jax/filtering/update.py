@@ -16,7 +16,7 @@ taken (`with_turns`), and the mean moves on the group (`retract`). This is the r
 on SE_2(3) (Barrau and Bonnabel 2017); `FilterConfig.error` switches it off. docs/filter.md has the
 derivation.
 
-A measurement is an object with a method
+A measurement is an object with a `name` and a method
 
     update(state, step) -> (state, Outcome, Correction),
 
@@ -28,7 +28,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import chex
@@ -131,15 +132,21 @@ class Step(NamedTuple):
     """Slot of the oldest clone."""
     config: FilterConfig
     noise: NoiseModel
-    before: tuple[Outcome, ...] = ()
-    """Outcomes of the measurements of this interval before this one; the first is the
-    displacement."""
+    before: Mapping[str, Outcome] = MappingProxyType({})
+    """Outcomes of the measurements of this interval before this one, by their names; the first is
+    the displacement."""
 
 
 @runtime_checkable
 class Measurement(Protocol):
     """A measurement that is taken at the end of every clone interval: a tree of arrays, e.g. a
-    NamedTuple, with this method."""
+    NamedTuple, with this name and method."""
+
+    @property
+    def name(self) -> str:
+        """The key of its outcomes in `FilterHistory.outcomes`. In a NamedTuple it is an attribute
+        of the class, `name = "height"`."""
+        ...
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]: ...
 
@@ -211,13 +218,15 @@ def measure(
     threshold: Array | float = math.inf,
     frame: MeasuredFrame = "carrier",
 ) -> tuple[FilterState, Outcome, Correction]:
-    """One EKF update. A residual or covariance with a NaN means that there is no measurement. A
-    measurement whose rᵀ S⁻¹ r is above a finite `threshold` is refused (e.g. a quantile of χ² with
-    m degrees of freedom). `frame` is that of the measured quantity: a position in the world that is
-    measured with "carrier" would show a yaw that nobody measured."""
+    """One EKF update. A residual or covariance with a NaN means that there is no measurement, and
+    so does a measurement from the oldest clone before there are W + 1 of them. A measurement whose
+    rᵀ S⁻¹ r is above a finite `threshold` is refused (e.g. a quantile of χ² with m degrees of
+    freedom). If S is not positive definite, the state becomes NaN, which
+    `FilterHistory.healthy` reports. `frame` is that of the measured quantity: a position in the
+    world that is measured with "carrier" would show a yaw that nobody measured."""
     outcome, correction = project(state, linear, step)
     tested = outcome.present & jnp.isfinite(threshold)
-    accepted = outcome.present & (outcome.nis <= threshold)
+    accepted = outcome.present & ~(outcome.nis > threshold)
     weight = accepted.astype(outcome.nis.dtype)
     outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
     return correct(state, outcome, correction, step, linear if frame == "world" else None)
@@ -228,6 +237,8 @@ def project(state: FilterState, linear: Linearised, step: Step) -> tuple[Outcome
     the identity, so that no NaN enters the arithmetic or the derivatives."""
     present = jnp.isfinite(linear.residual).all() & jnp.isfinite(linear.covariance).all()
     by_part = dict(linear.jacobian)
+    if {"oldest_rotation", "since_oldest"} & by_part.keys():
+        present = present & (state.step >= step.config.clones)
     if step.config.invariant:
         by_part = with_turns(by_part, state, step.oldest)
     jacobian = jnp.concatenate(list(by_part.values()), axis=1)

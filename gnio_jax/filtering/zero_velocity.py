@@ -5,13 +5,14 @@ The paper's gated head makes displacements small at rest instead.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
+from gnio_jax.config.schema import ABOVE_ZERO, Number
 from gnio_jax.filtering.displacement import gate_activity
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.settings import FilterConfig
@@ -21,7 +22,11 @@ from gnio_jax.types import GRAVITY, Array
 
 
 class ZeroVelocity(NamedTuple):
-    """Measures a velocity of zero, with `zero_velocity_std`, while the IMU is quiet."""
+    """Measures a velocity of zero while the IMU is quiet."""
+
+    std: Annotated[Number, ABOVE_ZERO] = 0.02
+    """Standard deviation of the velocity at rest along each axis of the body, m/s."""
+    name = "zero_velocity"
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """Apply the measurement, after a χ² test where a displacement was tested and the gate is
@@ -30,7 +35,8 @@ class ZeroVelocity(NamedTuple):
         it: after the start, after a series of rejections, and where there are no displacements.
         Without displacements no gate would open again, and a rest that was refused once would
         always be refused. The gate's memory depends on the displacements alone, because a false
-        rest must neither open nor close their gate.
+        rest must neither open nor close their gate. `mahalanobis_fail_scale` and `gate_softness`
+        are not for rest.
         """
         config = step.config
         state, quiet = detect_rest(state, step.imu, config)
@@ -39,9 +45,9 @@ class ZeroVelocity(NamedTuple):
         to_body = state.rotation.T
         residual = jnp.where(quiet, -(to_body @ state.velocity), jnp.nan)
         jacobian = {"velocity": to_body, "rotation": to_body @ geometry.hat(state.velocity)}
-        linear = linearise(state, residual, config.zero_velocity_std**2 * eye, **jacobian)
+        linear = linearise(state, residual, self.std**2 * eye, **jacobian)
         active, _ = gate_activity(state.gate, config, state.step * config.samples_per_clone)
-        tested = active & step.before[0].tested
+        tested = active & step.before["displacement"].tested
         return measure(state, linear, step, jnp.where(tested, config.gate_threshold, jnp.inf))
 
 

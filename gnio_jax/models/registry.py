@@ -16,9 +16,10 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import PRNGKeyArray
 
+from gnio_jax import plugins
 from gnio_jax.config import ModelConfig
-from gnio_jax.config.files import checked_value
-from gnio_jax.config.schema import Place
+from gnio_jax.config.files import check_value
+from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.models.convolution import winograd_pays
 from gnio_jax.models.ctin import CTIN
@@ -47,7 +48,8 @@ _EQUIVARIANT: dict[str, type[nn.Module]] = {
 
 
 def names() -> list[str]:
-    """Names of the networks that `create` knows."""
+    """Names of the networks that `create` knows, with those of plugins."""
+    plugins.load()
     return sorted(_MODELS)
 
 
@@ -66,8 +68,9 @@ def register(name: str, network: type[nn.Module]) -> None:
 def options(name: str) -> dict[str, Any]:
     """The options of the network `name` and their types. Raises `InputError` for an unknown
     name."""
-    more = "; the program that registers one of your own knows that one, too"
-    network = _MODELS[_check_word(name, names(), f"model '{name}'", "unknown", "models", more)]
+    if name not in _MODELS:
+        _check_word(name, names(), f"model '{name}'", "unknown", "models", "; plugins add others")
+    network = _MODELS[name]
     types = get_type_hints(network, include_extras=True)
     kinds = {field.name: types[field.name] for field in dataclasses.fields(network)}
     kinds |= {"equivariance": Literal["none", *_EQUIVARIANT]}
@@ -77,7 +80,9 @@ def options(name: str) -> dict[str, Any]:
 def from_config(config: ModelConfig) -> nn.Module:
     """The network that these settings describe; options that are not set take the network's own
     defaults."""
-    return create(**{option: value for option, value in vars(config).items() if value is not None})
+    values = {**vars(config), **config.options}
+    del values["options"]
+    return create(**{option: value for option, value in values.items() if value is not None})
 
 
 def create(name: str, **values: Any) -> nn.Module:
@@ -94,7 +99,7 @@ def create(name: str, **values: Any) -> nn.Module:
     for option, value in values.items():
         kind = kinds[_check_word(option, kinds, subject, f"unknown option '{option}'", "options")]
         if get_origin(kind) in (Literal, Annotated):
-            values[option] = checked_value(kind, value, Place(subject, option))
+            values[option] = check_value(kind, value, Location(subject, option))
     if "winograd" in kinds:
         values.setdefault("winograd", winograd_pays())
     equivariance = values.pop("equivariance", "none")

@@ -48,7 +48,7 @@ def predict_split(workdir: Path, split: str) -> PredictedWindows:
     network = Network.of(run.model, run.variables)
     predicted = evaluation.infer(network, recordings, config, diagnostics=DIAGNOSTICS)
     # There is a row for each stride; rows before the end of the first window have neither.
-    references = [evaluation.given_displacements(recording, 0.0) for recording in recordings]
+    references = [evaluation.reference_displacements(recording, 0.0) for recording in recordings]
     truth, displacement = (
         np.concatenate([rows.value for rows in parts]) for parts in (references, predicted)
     )

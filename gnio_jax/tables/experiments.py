@@ -68,7 +68,7 @@ class Experiment(NamedTuple):
 
     title: str
     source: str
-    """Place of the published figures, and their data."""
+    """Location of the published figures, and their data."""
     rows: list[TableRow]
 
 

@@ -21,7 +21,8 @@ from gnio_jax.config import TablesConfig, TrainConfig
 from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
-from gnio_jax.evaluation.statistics import Cell, Summary
+from gnio_jax.evaluation.folder import read_views
+from gnio_jax.evaluation.statistics import Cell, MetricSummary
 from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments
@@ -174,7 +175,7 @@ def _over_seeds(name: str, rows: list[Float[np.ndarray, "_"]]) -> dict[str, list
     """A figure of this table alone, for each row with its seeds."""
     means = [float(np.mean(values)) if len(values) else None for values in rows]
     summaries = [
-        Summary(mean, values.tolist(), None, None, 0, 0, 0, len(values))
+        MetricSummary(mean, values.tolist(), None, None, 0, 0, 0, len(values))
         for mean, values in zip(means, rows, strict=True)
     ]
     return {name: [Cell(summary, None) for summary in summaries]}
@@ -186,7 +187,7 @@ def figures_of(results: list[RowResult]) -> dict[str, list[Cell]]:
     return {
         metric: row_cells
         for metric, row_cells in cells.items()
-        if metric == "ate" or any(figure.mean.seeds for figure in row_cells)
+        if metric == "ate" or any(figure.summary.seeds for figure in row_cells)
     }
 
 
@@ -197,13 +198,13 @@ def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
     header += ["difference of ATE, m (95 %)", "published (m)", "its gain"]
     table, first = [], experiment.rows[0].published
     for index, row in enumerate(experiment.rows):
-        mean, difference = figures["ate"][index]
+        summary, difference = figures["ate"][index]
         means = [
-            tabulate.mean(figures[x][index].mean, column.digits) for x, column in columns.items()
+            tabulate.mean(figures[x][index].summary, column.digits) for x, column in columns.items()
         ]
         gain = arrow(difference and difference.gain) if index else ""
         published_gain = 100 * (1 - row.published / first) if row.published and first else None
-        measured = [tabulate.number(mean.median, 2), gain, tabulate.difference(difference, 2)]
+        measured = [tabulate.number(summary.median, 2), gain, tabulate.difference(difference, 2)]
         printed = [tabulate.number(row.published, 2), arrow(published_gain) if index else ""]
         table.append([row.label, *means, *measured, *printed])
     marks = "".join(f"\n{line}\n" for line in tabulate.marks(figures["ate"]))
@@ -229,10 +230,12 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[RowResult
     from gnio_jax.evaluation import page
     from gnio_jax.tables import plots
 
-    runs = [
-        page.of_folder(result.folders[0], result.reports[0], result.row.label) for result in results
-    ]
-    available = [view.name for view in runs[0].views if view.known]
+    runs = []
+    for result in results:
+        report = result.reports[0]
+        views = read_views(result.folders[0], report)
+        runs.append(page.describe_report(report, views, name=result.row.label))
+    available = [view.name for view in runs[0].views if view.has_reference]
     names = _words(options.sequences) if options.sequences else available[:8]
     for name in names:
         if name not in available:

@@ -8,9 +8,11 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from gnio_jax.evaluation import colours, plots, statistics
-from gnio_jax.evaluation.plots import View, finish, save
+from gnio_jax import drawing
+from gnio_jax.drawing import save
+from gnio_jax.evaluation import statistics
 from gnio_jax.evaluation.statistics import Cell
+from gnio_jax.evaluation.views import View
 from gnio_jax.tables.activities import ACTIVITIES, HORIZONTAL, PredictedWindows
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.runs import RowResult
@@ -18,13 +20,13 @@ from gnio_jax.tables.runs import RowResult
 __all__ = ["attention", "gate", "gradients", "save", "standing", "table", "trajectories"]
 
 METHODS = {
-    "tlio": colours.BLUE,
-    "gnio": colours.GREEN,
-    "ronin_resnet": colours.ORANGE,
-    "deepils": colours.PURPLE,
-    "ctin": colours.VERMILION,
-    "imot": colours.SKY,
-    "imot_text": colours.YELLOW,
+    "tlio": drawing.BLUE,
+    "gnio": drawing.GREEN,
+    "ronin_resnet": drawing.ORANGE,
+    "deepils": drawing.PURPLE,
+    "ctin": drawing.VERMILION,
+    "imot": drawing.SKY,
+    "imot_text": drawing.YELLOW,
 }
 """TLIO blue and GNIO green, as in the paper's figure."""
 
@@ -40,17 +42,19 @@ def table(experiment: Experiment, results: list[RowResult], ates: list[Cell]) ->
     ratios = (2, 1) if has_published else (1,)
     panels = np.atleast_1d(figure.subplots(1, len(ratios), sharey=True, width_ratios=ratios))
     measured_axes, names = panels[0], []
-    for index, (result, (mean, _)) in enumerate(zip(results, ates, strict=True)):
-        lost = statistics.lost(result.seeds)
-        values_of = statistics.values(result.seeds, "ate")
+    for index, (result, (summary, _)) in enumerate(zip(results, ates, strict=True)):
+        lost = statistics.count_divergences(result.seeds)
+        values_of = statistics.collect_values(result.seeds, "ate")
         sequences = [values.mean() for name, values in values_of.items() if name not in lost]
         labels = ("sequence", "seed, mean over sequences") if index == 0 else (None, None)
-        measured_axes.barh(index, mean.mean or 0.0, color=colours.GREEN, alpha=0.35, height=0.6)
+        measured_axes.barh(index, summary.mean or 0.0, color=drawing.GREEN, alpha=0.35, height=0.6)
         above = np.full(len(sequences), index) + 0.2
-        measured_axes.plot(sequences, above, "|", color=colours.GREY, ms=7, label=labels[0])
-        seeds = np.full(len(mean.seeds), index)
-        measured_axes.plot(mean.seeds, seeds, "o", color="black", ms=4, label=labels[1])
-        diverged = f"\n({mean.diverged} of {mean.estimates} diverged)" if mean.diverged else ""
+        measured_axes.plot(sequences, above, "|", color=drawing.GREY, ms=7, label=labels[0])
+        seeds = np.full(len(summary.seeds), index)
+        measured_axes.plot(summary.seeds, seeds, "o", color="black", ms=4, label=labels[1])
+        diverged = (
+            f"\n({summary.diverged} of {summary.estimates} diverged)" if summary.diverged else ""
+        )
         names.append(result.row.label + diverged)
     measured_axes.set_yticks(range(len(results)), names)
     measured_axes.invert_yaxis()
@@ -58,7 +62,7 @@ def table(experiment: Experiment, results: list[RowResult], ates: list[Cell]) ->
     measured_axes.set_xlim(left=0)
     for index, value in enumerate(published):
         if value is not None:
-            panels[1].barh(index, value, color=colours.BLUE, alpha=0.35, height=0.6)
+            panels[1].barh(index, value, color=drawing.BLUE, alpha=0.35, height=0.6)
             panels[1].text(value, index, f" {value:.2f}", va="center", fontsize=8)
     if has_published:
         panels[1].set(xlabel="published (m), on other data", title="paper")
@@ -66,7 +70,7 @@ def table(experiment: Experiment, results: list[RowResult], ates: list[Cell]) ->
     form = {"fontsize": 8, "frameon": False, "loc": "outside lower center", "ncols": 2}
     figure.legend(*measured_axes.get_legend_handles_labels(), **form)
     for axes in panels:
-        finish(axes)
+        drawing.finish(axes)
     return figure
 
 
@@ -77,7 +81,7 @@ def gradients(
     seeds, with their range shaded."""
     figure = Figure(figsize=(6.8, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    for result, norm, colour in zip(results, norms, colours.COLOURS, strict=False):
+    for result, norm, colour in zip(results, norms, drawing.COLOURS, strict=False):
         epochs = np.arange(1, norm.shape[1] + 1)
         axes.semilogy(epochs, norm.mean(0), color=colour, label=result.row.label)
         axes.fill_between(epochs, norm.min(0), norm.max(0), color=colour, alpha=0.15, lw=0)
@@ -86,7 +90,7 @@ def gradients(
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")
     axes.legend(fontsize=8, frameon=False)
-    finish(axes)
+    drawing.finish(axes)
     return figure
 
 
@@ -107,15 +111,15 @@ def trajectories(
             if view.name == name
         }
         reference = next(iter(views.values())).reference[:, :2]
-        (handles["reference"],) = axes.plot(*reference.T, color=colours.REFERENCE, lw=1.8)
+        (handles["reference"],) = axes.plot(*reference.T, color=drawing.REFERENCE, lw=1.8)
         for number, (method, view) in enumerate(views.items()):
-            colour = METHODS.get(method, colours.COLOURS[number % len(colours.COLOURS)])
+            colour = METHODS.get(method, drawing.COLOURS[number % len(drawing.COLOURS)])
             (handles[method],) = axes.plot(*view.position[:, :2].T, color=colour, lw=1.1)
         first = reference[np.isfinite(reference).all(1)][0]
-        axes.plot(*first, color=colours.REFERENCE, zorder=4, **plots.START)
+        axes.plot(*first, color=drawing.REFERENCE, zorder=4, **drawing.START)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_title(name, fontsize=9)
-        finish(axes)
+        drawing.finish(axes)
     for axes in panels[len(names) :]:
         axes.set_visible(False)
     columns = min(8, len(handles))
@@ -137,9 +141,9 @@ def gate(windows: PredictedWindows) -> Figure:
     }
     standing_still, slow = (ACTIVITIES.index(name) for name in ("standing", "slow"))
     rows = {
-        "standing": (windows.activity == standing_still, colours.VERMILION),
-        "slow": (windows.activity == slow, colours.GREY),
-        "moving": (windows.activity > slow, colours.BLUE),
+        "standing": (windows.activity == standing_still, drawing.VERMILION),
+        "slow": (windows.activity == slow, drawing.GREY),
+        "moving": (windows.activity > slow, drawing.BLUE),
     }
     for axes, (name, values) in zip(figure.subplots(1, 3), quantities.items(), strict=True):
         horizontal = values[:, HORIZONTAL]
@@ -151,7 +155,7 @@ def gate(windows: PredictedWindows) -> Figure:
                 count = f"{label} ({mask.sum():,})"
                 axes.stairs(share, edges, color=colour, lw=1.6, label=count)
         axes.set(xlabel=name, ylabel="share of windows and axes")
-        finish(axes)
+        drawing.finish(axes)
     figure.axes[0].legend(fontsize=8, frameon=False)
     return figure
 
@@ -180,9 +184,9 @@ def standing(by_method: dict[str, dict[str, dict[str, float]]]) -> Figure:
     for number, (method, figures) in enumerate(by_method.items()):
         places = np.arange(len(names)) + 0.1 * (number - (len(by_method) - 1) / 2)
         values = [figures.get(name, {}).get("error", np.nan) for name in names]
-        axes.semilogy(places, values, "o", color=METHODS.get(method, colours.GREY), label=method)
+        axes.semilogy(places, values, "o", color=METHODS.get(method, drawing.GREY), label=method)
     axes.set_xticks(range(len(names)), names)
     axes.set(ylabel="rms error of a window's displacement (m)", title="By activity")
     axes.legend(fontsize=8, frameon=False)
-    finish(axes)
+    drawing.finish(axes)
     return figure

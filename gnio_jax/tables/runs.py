@@ -13,7 +13,7 @@ from gnio_jax import calibration, data
 from gnio_jax import config as configuration
 from gnio_jax.config import CalibrateConfig, EvaluateConfig, TablesConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept
+from gnio_jax.evaluation import reuse
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Scores
 from gnio_jax.reporting import Reporter
@@ -62,8 +62,8 @@ def run_row(
         runs = [calibrate_run(run, reporter, workers) for run in runs]
     settings = {"split": options.split, "estimator": options.estimator, "plots": False}
     requests = [EvaluateConfig(str(run), data_root=config.data_root, **settings) for run in runs]
-    evaluations = [kept.look(request) for request in requests]
-    reports = [kept.made(evaluation, reporter, workers) for evaluation in evaluations]
+    evaluations = [reuse.find_existing(request) for request in requests]
+    reports = [reuse.load_or_evaluate(evaluation, reporter, workers) for evaluation in evaluations]
     return RowResult(row, reports, runs, [evaluation.folder for evaluation in evaluations])
 
 

@@ -30,9 +30,6 @@ from gnio_jax.training.optimizer import Plateau, filter_numbers, trained_setting
 from gnio_jax.training.task import TrainState
 
 Which = Literal["best", "latest"]
-VERSION = 2
-"""Version of what a checkpoint holds besides the network's variables, which are the same in every
-version."""
 METADATA = 2**17
 """Largest number of bytes that a checkpoint takes besides its arrays."""
 
@@ -42,8 +39,8 @@ logging.getLogger("absl").setLevel(logging.CRITICAL)
 logging.getLogger("asyncio").addFilter(lambda record: "orbax" not in record.getMessage())
 
 
-class Position(NamedTuple):
-    """The progress of a run besides its `TrainState`, kept as JSON with the checkpoint."""
+class RunPosition(NamedTuple):
+    """The position of a run besides its `TrainState`, kept as JSON with the checkpoint."""
 
     epoch: int = 0
     """Epoch in progress, or finished if `step` is a multiple of the steps per epoch."""
@@ -52,7 +49,7 @@ class Position(NamedTuple):
     """Smallest value of `optim.best_by` on the validation split since the last change of what is
     trained."""
     sums: dict[str, float] = {}
-    """Figures summed over the steps of the epoch in progress (`task.Progress`)."""
+    """Figures summed over the steps of the epoch in progress (`task.DispatchSums`)."""
     seconds: float = 0.0
     """Time spent training so far."""
     plateau: Plateau = Plateau()
@@ -75,7 +72,7 @@ def exists(workdir: Path, which: Which = "latest") -> bool:
     return folder.is_dir() and any(child.name.isdigit() for child in folder.iterdir())
 
 
-def save(workdir: Path, which: Which, state: TrainState, position: Position) -> None:
+def save(workdir: Path, which: Which, state: TrainState, position: RunPosition) -> None:
     """Write a checkpoint at `position.step`, `latest` with the optimizer's state. An existing
     checkpoint of this step is the same and is kept.
 
@@ -86,7 +83,7 @@ def save(workdir: Path, which: Which, state: TrainState, position: Position) -> 
     """
     folder, state = _folder(workdir, which), jax.device_get(state)
     shapes = _shapes(state.variables)
-    meta = {"version": VERSION, "position": position._asdict(), "shapes": shapes}
+    meta = {"position": position._asdict(), "shapes": shapes}
     items: dict[str, Any] = {
         "variables": ocp.args.StandardSave(state.variables),
         "meta": ocp.args.JsonSave(meta),
@@ -114,19 +111,18 @@ def write_best(workdir: Path, run: Run) -> None:
     if numbers := filter_numbers(run.config):
         variables["filter"] = numbers
     state = TrainState(jnp.int32(run.step), variables, opt_state=())
-    save(workdir, "best", state, Position(run.epoch, run.step))
+    save(workdir, "best", state, RunPosition(run.epoch, run.step))
 
 
-def restore(workdir: Path, template: TrainState) -> tuple[TrainState, Position]:
+def restore(workdir: Path, template: TrainState) -> tuple[TrainState, RunPosition]:
     """The latest state, in the structure of `template`, placed by `parallel.everywhere`.
 
-    Raises `InputError` if it does not fit, or is of an earlier version.
+    Raises `InputError` if it does not fit.
     """
     template = jax.device_get(template)
-    wanted = {"variables": template.variables, "optimizer": template.opt_state}
-    remedy = f"begin another run from its weights: --init-from {workdir} --workdir ..."
-    position, found = _read(workdir, "latest", wanted, remedy)
-    state = TrainState(jnp.int32(position.step), found["variables"], found["optimizer"])
+    templates = {"variables": template.variables, "optimizer": template.opt_state}
+    position, items = _read_items(workdir, "latest", templates)
+    state = TrainState(jnp.int32(position.step), items["variables"], items["optimizer"])
     chex.assert_trees_all_equal_shapes_and_dtypes(state, template)
     return parallel.everywhere(state), position
 
@@ -146,9 +142,8 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
     template = {"batch_stats": {}, **models.variable_shapes(model, config.data.seen)}
     if numbers := filter_numbers(config):
         template["filter"] = numbers
-    remedy = f"train it again from the run that it began with, {config.init_from}"
-    position, found = _read(workdir, which, {"variables": template}, remedy)
-    variables = found["variables"]
+    position, items = _read_items(workdir, which, {"variables": template})
+    variables = items["variables"]
     chex.assert_trees_all_equal_shapes_and_dtypes(variables, template)
     try:
         chex.assert_tree_all_finite(variables)
@@ -162,7 +157,7 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
     return Run(config, model, variables, position.epoch, position.step)
 
 
-def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
+def load_initial_network(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
     """The run that `config.init_from` names, if any, as `load` reads it.
 
     Raises `InputError` for a folder without a run, and for one whose network is not that of
@@ -177,7 +172,7 @@ def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
     if config.init_from is None:
         return None
     run = load(config.init_from)
-    theirs, ours = (_description(each) for each in (run.config, config))
+    theirs, ours = map(_describe_network, (run.config, config))
     head_to_calibrated = ("head", "calibrated")
     if (theirs.get("model.uncertainty"), ours.get("model.uncertainty")) == head_to_calibrated:
         ours["model.uncertainty"] = "head"
@@ -188,7 +183,7 @@ def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
     return run
 
 
-def _description(config: TrainConfig) -> dict[str, Any]:
+def _describe_network(config: TrainConfig) -> dict[str, Any]:
     """What two runs must share to have the same network: its name and options, and its windows."""
     model: Any = models.from_config(config.model)
     model = getattr(model, "network", model)  # the network inside an equivariant construction
@@ -202,7 +197,7 @@ def _description(config: TrainConfig) -> dict[str, Any]:
     return {f"model.{name}": value for name, value in options.items()} | windows
 
 
-def averaged_over_headings(run: Run, source: str) -> Run:
+def average_over_headings(run: Run, source: str) -> Run:
     """The run with its network averaged over four headings (`models.equivariance.FourHeadings`),
     which has the same weights. Raises `InputError` naming `source` for a network that was not
     trained on every heading, or is equivariant in another way."""
@@ -230,14 +225,13 @@ def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
     return ocp.CheckpointManager(folder.absolute(), options=options)
 
 
-def _read(
-    workdir: Path, which: Which, templates: dict[str, Any], remedy: str
-) -> tuple[Position, dict[str, Any]]:
+def _read_items(
+    workdir: Path, which: Which, templates: dict[str, Any]
+) -> tuple[RunPosition, dict[str, Any]]:
     """The position of a checkpoint, and the items that these templates name.
 
     Raises `InputError` if there is no checkpoint, if it is damaged, or if its variables have other
-    shapes. It raises it with this remedy for a checkpoint of an earlier version, if the state of an
-    optimizer or numbers of the filter are asked for.
+    shapes.
     """
     where = _folder(workdir, which)
     if not exists(workdir, which):
@@ -246,7 +240,7 @@ def _read(
     with _manager(where, create=False) as manager:
         step = manager.latest_step()
 
-        def restored(items: dict[str, Any]) -> Any:
+        def restore_items(items: dict[str, Any]) -> Any:
             try:
                 return manager.restore(step, args=ocp.args.Composite(**items))
             except (OSError, ValueError, KeyError, TypeError) as error:
@@ -254,26 +248,20 @@ def _read(
                 damaged = InputError(where / str(step), problem, "the checkpoint is damaged")
                 raise damaged from None
 
-        meta = restored({"meta": ocp.args.JsonRestore()})["meta"]
-        older = meta.get("version") != VERSION
-        if older and ("optimizer" in templates or "filter" in templates["variables"]):
-            problem = "is of an earlier version of gnio-jax, with other states beside the weights"
-            raise InputError(where / str(step), problem, remedy)
-        wanted, kept = _shapes(templates["variables"]), meta["shapes"]
-        for name in sorted(wanted.keys() | kept.keys()):
-            if wanted.get(name) != kept.get(name):
+        meta = restore_items({"meta": ocp.args.JsonRestore()})["meta"]
+        shapes, saved_shapes = _shapes(templates["variables"]), meta["shapes"]
+        for name in sorted(shapes.keys() | saved_shapes.keys()):
+            if shapes.get(name) != saved_shapes.get(name):
                 problem = (
-                    f"'{name}' has shape {kept.get(name)} in the checkpoint "
-                    f"and {wanted.get(name)} in the configured model"
+                    f"'{name}' has shape {saved_shapes.get(name)} in the checkpoint "
+                    f"and {shapes.get(name)} in the configured model"
                 )
                 same = "model.width and the other model fields must be those of the run"
                 raise InputError(where, problem, same)
-        found = restored({n: ocp.args.StandardRestore(tree) for n, tree in templates.items()})
-        found = {name: found[name] for name in templates}
+        trees = restore_items({n: ocp.args.StandardRestore(tree) for n, tree in templates.items()})
+        trees = {name: trees[name] for name in templates}
     position = meta["position"]
-    if older:  # its weights have today's form
-        return Position(position["epoch"], position["step"]), found
-    return Position(**position | {"plateau": Plateau(*position["plateau"])}), found
+    return RunPosition(**position | {"plateau": Plateau(*position["plateau"])}), trees
 
 
 def _shapes(variables: Any) -> dict[str, list[int]]:
@@ -286,7 +274,7 @@ def _shapes(variables: Any) -> dict[str, list[int]]:
 # ------------------------------------------------------------------------------------------------
 
 
-def learnt_from(workdir: Path, config: TrainConfig, dataset: str) -> set[str]:
+def training_recordings(workdir: Path, config: TrainConfig, dataset: str) -> set[str]:
     """Names of the recordings of a dataset that the network of a run was trained on; none if the
     folder does not list them."""
     path = workdir / "splits.yaml"
@@ -299,8 +287,8 @@ def learnt_from(workdir: Path, config: TrainConfig, dataset: str) -> set[str]:
     )
     if config.datasets == (dataset,):
         return set(names)
-    own = f"{dataset}/"
-    return {name.removeprefix(own) for name in names if name.startswith(own)}
+    prefix = f"{dataset}/"
+    return {name.removeprefix(prefix) for name in names if name.startswith(prefix)}
 
 
 def recordings_by_name(recordings: Any) -> dict[str, int | None]:

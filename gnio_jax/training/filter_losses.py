@@ -19,7 +19,7 @@ from gnio_jax import geometry
 from gnio_jax.config import ThroughFilter
 from gnio_jax.filtering import FilterConfig, FilterHistory
 from gnio_jax.filtering.history import POSITION, VELOCITY
-from gnio_jax.training.segments import Path, Segment
+from gnio_jax.training.segments import MotionPath, Segment
 from gnio_jax.types import Array
 
 HORIZON_SECONDS = (1.0, 5.0, 10.0, 30.0, 60.0)
@@ -58,7 +58,7 @@ class FilterLosses(NamedTuple):
 
 
 def filter_losses(
-    estimate: Path,
+    estimate: MotionPath,
     segment: Segment,
     history: FilterHistory,
     config: FilterConfig,
@@ -117,7 +117,9 @@ def yaw_errors(
     return jax.vmap(geometry.yaw_direction)(turn)
 
 
-def relative_displacement(estimate: Path, truth: Path, count: int) -> Float[jax.Array, ""]:
+def relative_displacement(
+    estimate: MotionPath, truth: MotionPath, count: int
+) -> Float[jax.Array, ""]:
     """‖Rz(ψ_i)ᵀ (p̂_j − p̂_i) − (p_j − p_i)‖² / (distance² + floor²), j = i + `count`, mean over i.
 
     ψ_i is the yaw error at i, so errors before i do not count; distance is the distance walked from
@@ -132,7 +134,7 @@ def relative_displacement(estimate: Path, truth: Path, count: int) -> Float[jax.
     return jnp.mean(jnp.sum(error**2, axis=1) / _squared_distance(truth.position, count))
 
 
-def relative_yaw(estimate: Path, truth: Path, count: int) -> Float[jax.Array, ""]:
+def relative_yaw(estimate: MotionPath, truth: MotionPath, count: int) -> Float[jax.Array, ""]:
     """4 sin²((ψ_j − ψ_i)/2) / (distance² + floor²), j = i + `count`, mean over i; 1/m².
 
     ψ is the yaw error; for small changes the numerator is (ψ_j − ψ_i)², rad².
@@ -169,13 +171,13 @@ def waypoint_error(
     before, after = position[:-1, None, :2], position[1:, None, :2]
     path = (before + share * (after - before)).reshape(-1, 2)
     present = jnp.all(jnp.isfinite(waypoint), axis=1)
-    place = jnp.where(present[:, None], waypoint, 0.0)
+    target = jnp.where(present[:, None], waypoint, 0.0)
     weight = jnp.where(present.any(), present, True).astype(path.dtype)
-    rotation, shift = geometry.planar_alignment(path, place, weight)
-    squared = jnp.sum((geometry.matmul(path, rotation.T) + shift[None] - place) ** 2, axis=1)
+    rotation, shift = geometry.planar_alignment(path, target, weight)
+    squared = jnp.sum((geometry.matmul(path, rotation.T) + shift[None] - target) ** 2, axis=1)
     counted = FAR_OFF**2 * jnp.log1p(squared / FAR_OFF**2)
-    middle = jnp.average(place, axis=0, weights=weight)
-    spread = jnp.sum((place - middle[None]) ** 2, axis=1)
+    middle = jnp.average(target, axis=0, weights=weight)
+    spread = jnp.sum((target - middle[None]) ** 2, axis=1)
     error = jnp.sum(weight * counted) / (jnp.sum(weight * (spread + DISTANCE_FLOOR**2)))
     return jnp.where(present.any(), error, 0.0)
 
@@ -192,7 +194,7 @@ def gaussian_nll(
     error: Float[Array, "k d"], covariance: Float[Array, "k d d"]
 ) -> Float[jax.Array, ""]:
     """Mean over k of −ln N(e_k; 0, P_k), without its constant."""
-    variances, remainders = _eliminated(error, covariance)
+    variances, remainders = _eliminate(error, covariance)
     return 0.5 * jnp.mean(jnp.sum(remainders**2 / variances + jnp.log(variances), axis=1))
 
 
@@ -200,11 +202,11 @@ def normalised_squares(
     error: Float[Array, "k d"], covariance: Float[Array, "k d d"]
 ) -> Float[jax.Array, "k"]:
     """eᵀ P⁻¹ e."""
-    variances, remainders = _eliminated(error, covariance)
+    variances, remainders = _eliminate(error, covariance)
     return jnp.sum(remainders**2 / variances, axis=1)
 
 
-def _eliminated(
+def _eliminate(
     error: Float[Array, "k d"], covariance: Float[Array, "k d d"]
 ) -> tuple[Float[jax.Array, "k d"], Float[jax.Array, "k d"]]:
     """Variance of each entry given the entries before it (D of P = L D Lᵀ), NaN where P is not
@@ -225,7 +227,10 @@ def _eliminated(
 
 
 def window_error(
-    displacement: Float[Array, "k 3"], estimate: Path, truth: Path, clones_per_window: int
+    displacement: Float[Array, "k 3"],
+    estimate: MotionPath,
+    truth: MotionPath,
+    clones_per_window: int,
 ) -> Float[jax.Array, ""]:
     """Squared error of the measured displacements, summed over the axes, mean over the windows, m².
 
@@ -236,11 +241,14 @@ def window_error(
     """
     first, last = slice(1, -clones_per_window), slice(1 + clones_per_window, None)
     moved = truth.position[last] - truth.position[first]
-    own = jax.lax.stop_gradient(estimate.rotation[first])
-    own_cosine, own_sine = jax.vmap(geometry.yaw_direction)(own)
-    cosine, sine = yaw_errors(own, truth.rotation[first])
+    attitude = jax.lax.stop_gradient(estimate.rotation[first])
+    attitude_cosine, attitude_sine = jax.vmap(geometry.yaw_direction)(attitude)
+    cosine, sine = yaw_errors(attitude, truth.rotation[first])
     # The rotation by the yaw error, then into the filter's own yaw frame, is one rotation about z.
-    c, s = own_cosine * cosine + own_sine * sine, own_cosine * sine - own_sine * cosine
+    c, s = (
+        attitude_cosine * cosine + attitude_sine * sine,
+        attitude_cosine * sine - attitude_sine * cosine,
+    )
     x, y = c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1]
     measured = displacement[clones_per_window:]
     error = measured - jnp.stack([x, y, moved[:, 2]], axis=1)

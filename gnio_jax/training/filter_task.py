@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterable, Iterator
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 import chex
@@ -22,23 +22,29 @@ from jaxtyping import Int, PRNGKeyArray
 
 from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
-from gnio_jax.filtering import FilterConfig, initial_state, over_sequences, run_odometry
+from gnio_jax.filtering import (
+    FilterConfig,
+    initial_state,
+    make_filter,
+    over_sequences,
+    run_odometry,
+)
 from gnio_jax.filtering.settings import filter_config, with_free_parameters
 from gnio_jax.training.filter_losses import HORIZON_SECONDS, FilterLosses, filter_losses
 from gnio_jax.training.segments import (
-    Path,
+    MotionPath,
     Segment,
     SegmentSource,
-    Start,
+    StartEstimate,
     cut_segment,
     draw_start,
-    joined,
-    low_passed,
+    join_segments,
+    low_pass_segments,
     random_starts,
     segment_source,
-    turned_segment,
+    turn_segment,
 )
-from gnio_jax.training.task import BatchLosses, Progress, Row, Task, TrainState
+from gnio_jax.training.task import BatchLosses, DispatchSums, Row, Task, TrainState
 from gnio_jax.types import Sequence
 
 CHECKPOINT_EVERY = 20
@@ -59,7 +65,7 @@ class FilterTask(Task):
     unit = "segments"
     figures = ("loss", "mse", "displacement", "yaw", "innovation", "state", "waypoints")
     skip_above = 1000.0
-    joined = staticmethod(joined)
+    join = staticmethod(join_segments)
 
     @staticmethod
     def source_of(
@@ -71,7 +77,7 @@ class FilterTask(Task):
     def count(source: SegmentSource) -> int:
         return source.earliest.shape[0]
 
-    def description(self, state: TrainState, workdir: FilePath) -> Iterator[str]:
+    def description(self, state: TrainState, workdir: Path) -> Iterator[str]:
         optim, learn = self.config.optim, self.config.through_filter.learn
         yield (
             f"{self.config.model.name} in the filter's loop: {' and '.join(learn)} learn, "
@@ -83,30 +89,31 @@ class FilterTask(Task):
     def order(self, key: PRNGKeyArray, epoch: int, source: SegmentSource) -> Int[jax.Array, "p"]:
         """First rows of the segments."""
         key = jax.random.fold_in(key, epoch)
-        which = self.weighted(key, jnp.arange(self.count(source)))
-        earliest, latest = (jnp.asarray(each)[which] for each in (source.earliest, source.latest))
+        which = self.select_visits(key, jnp.arange(self.count(source)))
+        earliest, latest = jnp.asarray(source.earliest)[which], jnp.asarray(source.latest)[which]
         return random_starts(key, source._replace(earliest=earliest, latest=latest))
 
     def draw(
         self, key: PRNGKeyArray, source: SegmentSource, which: Int[jax.Array, "b"]
-    ) -> tuple[Segment, Start]:
+    ) -> tuple[Segment, StartEstimate]:
         augment, rate = self.config.augment, self.config.data.rate
         segment_key, pass_key = jax.random.split(key)
         segments, starts = self.segments(segment_key, source, which, augment.yaw)
-        return low_passed(pass_key, segments, augment, rate), starts
+        return low_pass_segments(pass_key, segments, augment, rate), starts
 
     def losses(
-        self, variables: Any, batch: tuple[Segment, Start], step: Int[jax.Array, ""]
+        self, variables: Any, batch: tuple[Segment, StartEstimate], step: Int[jax.Array, ""]
     ) -> BatchLosses:
         """Means over the segments, and over the horizons of losses that have several."""
         chex.assert_type([batch[0].gyro, batch[0].accel], jnp.float64)
-        found = self.filtered(variables, *batch, self.softened())
-        means = {name: jnp.mean(getattr(found, name)) for name in self.figures[2:]}
-        figures = {"loss": jnp.mean(found.total), "mse": jnp.mean(found.window), **means}
-        return BatchLosses(figures, variables["batch_stats"], jnp.all(found.healthy))
+        losses = self.filter_segments(variables, *batch, self.training_filter())
+        means = {name: jnp.mean(getattr(losses, name)) for name in self.figures[2:]}
+        figures = {"loss": jnp.mean(losses.total), "mse": jnp.mean(losses.window), **means}
+        return BatchLosses(figures, variables["batch_stats"], jnp.all(losses.healthy))
 
-    def softened(self) -> FilterConfig:
-        """The filter in training: its gate has a slope, and its gradient is cut."""
+    def training_filter(self) -> FilterConfig:
+        """The settings of the filter in training: its gate has a slope, and its gradient is
+        cut."""
         return dataclasses.replace(
             filter_config(self.config.data, self.config.filter),
             gate_softness=GATE_SOFTNESS,
@@ -116,7 +123,7 @@ class FilterTask(Task):
 
     def segments(
         self, key: PRNGKeyArray, source: SegmentSource, rows: Int[jax.Array, "b"], turned: bool
-    ) -> tuple[Segment, Start]:
+    ) -> tuple[Segment, StartEstimate]:
         """The segments that begin at these rows, and the start of the filter in each. `turned`:
         each segment is turned by a random yaw. The filter finds the same path, turned, and the
         network sees windows of another heading."""
@@ -125,63 +132,63 @@ class FilterTask(Task):
         turn_key, start_key = jax.random.split(key)
         if turned:
             angles = jax.random.uniform(turn_key, rows.shape, jnp.float64, -jnp.pi, jnp.pi)
-            segments = jax.vmap(turned_segment)(segments, angles)
+            segments = jax.vmap(turn_segment)(segments, angles)
         std = self.config.filter.start
         start = jax.vmap(lambda key, truth: draw_start(key, truth, std, START_SPREAD))
         return segments, start(jax.random.split(start_key, rows.shape[0]), segments.truth)
 
-    def filtered(
-        self, variables: Any, segments: Segment, starts: Start, ekf: FilterConfig
+    def filter_segments(
+        self, variables: Any, segments: Segment, starts: StartEstimate, config: FilterConfig
     ) -> FilterLosses:
         """The losses of each segment of a batch, with the network in the filter's loop; the
         segments are divided among the devices."""
         network = {name: tree for name, tree in variables.items() if name != "filter"}
         frozen = models.inference_variables(self.model, network)
 
-        def one(program: Any, segment: Segment, start: Start) -> FilterLosses:
+        def one(program: Any, segment: Segment, start: StartEstimate) -> FilterLosses:
             frozen, numbers = program
             settings = with_free_parameters(self.config.filter, numbers)
-            first = initial_state(ekf, *start, settings.start)
+            ekf = dataclasses.replace(make_filter(self.config.data, settings), config=config)
+            first = initial_state(ekf, *start)
             predict = functools.partial(models.Inference(self.model), frozen)
-            signals = segment.gyro, segment.accel
-            _, history = run_odometry(predict, first, *signals, ekf, settings.noise)
-            path = Path(
+            _, history = run_odometry(predict, ekf, first, segment.gyro, segment.accel)
+            path = MotionPath(
                 *(
                     jnp.concatenate([getattr(first, name)[None], getattr(history, name)])
-                    for name in Path._fields
+                    for name in MotionPath._fields
                 )
             )
-            return filter_losses(path, segment, history, ekf, self.config.through_filter)
+            return filter_losses(path, segment, history, config, self.config.through_filter)
 
         return over_sequences(one, shared=1)((frozen, variables["filter"]), segments, starts)
 
-    def take_steps(self, *given: Any) -> tuple[TrainState, Progress]:
-        state, progress = super().take_steps(*given)
+    def take_steps(self, *arguments: Any) -> tuple[TrainState, DispatchSums]:
+        state, sums = super().take_steps(*arguments)
         if len(jax.devices()) > 1:
             # If the segments were divided, the state is now on all devices, and the next step would
             # be compiled again for this placement.
             state = jax.tree.map(parallel.fresh_copy, state)
-        return state, progress
+        return state, sums
 
     def figures_of(self, state: TrainState, held_out: SegmentSource, key: PRNGKeyArray) -> Row:
         """The loss is infinite where the filter diverges."""
-        found = jax.device_get(validate(state, held_out, key, task=self))
-        sound = bool(found.healthy) and math.isfinite(found.total)
+        losses = jax.device_get(validate(state, held_out, key, task=self))
+        sound = bool(losses.healthy) and math.isfinite(losses.total)
         row: Row = {
-            "val_loss": float(found.total) if sound else math.inf,
-            "val_mse": float(found.window),
-            "val_rmse": math.sqrt(found.window),
-            "val_innovation": float(found.innovation),
-            "val_state": float(found.state),
+            "val_loss": float(losses.total) if sound else math.inf,
+            "val_mse": float(losses.window),
+            "val_rmse": math.sqrt(losses.window),
+            "val_innovation": float(losses.innovation),
+            "val_state": float(losses.state),
         }
         if held_out.tapped.any():
-            row["val_waypoint_error"] = math.sqrt(found.waypoints)
+            row["val_waypoint_error"] = math.sqrt(losses.waypoints)
         # Roots of the squared errors of each horizon: relative to the distance, and in rad per
         # metre.
         for name in ("displacement", "yaw"):
-            for seconds, square in zip(HORIZON_SECONDS, getattr(found, name), strict=False):
+            for seconds, square in zip(HORIZON_SECONDS, getattr(losses, name), strict=False):
                 row[f"val_{name}_error/{seconds:g}s"] = math.sqrt(square)
-        return row | {"val_nis": float(found.nis), "val_nees": float(found.nees)}
+        return row | {"val_nis": float(losses.nis), "val_nees": float(losses.nees)}
 
     def remark(self, row: Row) -> str:
         skipped = f"{row['skipped']} skipped  " if row["skipped"] else ""
@@ -206,16 +213,16 @@ def validate(
     # The last batch is filled up with segments of weight zero.
     which = jnp.minimum(jnp.arange(batches * size), count - 1)
     weight = (jnp.arange(batches * size) < count).astype(jnp.float64) / count
-    ekf = filter_config(task.config.data, task.config.filter)
+    config = filter_config(task.config.data, task.config.filter)
     drawn = task.segments(key, source, jnp.asarray(source.earliest)[which], turned=False)
 
-    def one_batch(batch: tuple[Segment, Start, jax.Array]) -> FilterLosses:
-        found = task.filtered(state.variables, batch[0], batch[1], ekf)
-        found = found._replace(healthy=found.healthy.astype(jnp.float64))
-        return jax.tree.map(lambda each: jnp.tensordot(batch[2], each, 1), found)
+    def one_batch(batch: tuple[Segment, StartEstimate, jax.Array]) -> FilterLosses:
+        losses = task.filter_segments(state.variables, batch[0], batch[1], config)
+        losses = losses._replace(healthy=losses.healthy.astype(jnp.float64))
+        return jax.tree.map(lambda values: jnp.tensordot(batch[2], values, 1), losses)
 
     in_batches = jax.tree.map(
-        lambda each: each.reshape(batches, size, *each.shape[1:]), (*drawn, weight)
+        lambda leaf: leaf.reshape(batches, size, *leaf.shape[1:]), (*drawn, weight)
     )
-    means = jax.tree.map(lambda each: jnp.sum(each, axis=0), jax.lax.map(one_batch, in_batches))
+    means = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), jax.lax.map(one_batch, in_batches))
     return means._replace(healthy=means.healthy > 1 - 0.5 / count)

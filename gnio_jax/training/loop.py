@@ -22,11 +22,11 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter, Silence
 from gnio_jax.training import checkpoint, optimizer, run_folder
-from gnio_jax.training.checkpoint import Position, Run, load_run
+from gnio_jax.training.checkpoint import Run, RunPosition, load_run
 from gnio_jax.training.filter_task import FilterTask
-from gnio_jax.training.recordings import Recordings, set_up
+from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.task import Progress, Row, Task
+from gnio_jax.training.task import DispatchSums, Row, Task
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
@@ -39,7 +39,7 @@ NO_GRADIENT = 1e-9
 step."""
 
 
-class Outcome(NamedTuple):
+class TrainingResult(NamedTuple):
     """How a training run ended."""
 
     workdir: Path
@@ -49,7 +49,7 @@ class Outcome(NamedTuple):
     """Signal that ended this run early, or prevented the seeds after it; the state is saved."""
 
 
-def train(config: TrainConfig, resume: bool = False, **options: Any) -> Outcome:
+def train(config: TrainConfig, resume: bool = False, **options: Any) -> TrainingResult:
     """Train the network of `config` and write checkpoints and logs to its work folder. Training is
     on windows, or through the filter if `config.through_filter` names what is trained.
 
@@ -61,8 +61,8 @@ def train(config: TrainConfig, resume: bool = False, **options: Any) -> Outcome:
     raises `FloatingPointError` naming the step (through the filter such a step is skipped). The
     other options and errors are those of `train_all`.
     """
-    (outcome,) = train_all([config], resume, **options)
-    return outcome
+    (result,) = train_all([config], resume, **options)
+    return result
 
 
 def train_all(
@@ -72,7 +72,7 @@ def train_all(
     workers: int = 1,
     devices: int | None = None,
     load: Callable[[str], Run] = load_run,
-) -> list[Outcome]:
+) -> list[TrainingResult]:
     """`train` for experiments that differ only in their seeds and folders (`config.with_seeds`),
     one after the other. Recordings are read once and steps are compiled once.
 
@@ -87,8 +87,9 @@ def train_all(
     another run, and where the devices cannot share a batch evenly.
     """
     reporter = (reporter or Lines()) if parallel.is_first() else Silence()
-    begun = [(configuration.default_workdir(each) / "config.yaml").exists() for each in configs]
-    resumes = [resume and (there or not any(begun)) for there in begun]
+    folders = map(configuration.default_workdir, configs)
+    existing = [(folder / "config.yaml").exists() for folder in folders]
+    resumes = [resume and (exists or not any(existing)) for exists in existing]
     workdirs = [
         run_folder.refuse_other_run(configuration.validate(config), resume)
         for config, resume in zip(configs, resumes, strict=True)
@@ -99,107 +100,108 @@ def train_all(
     if through_filter and jax.process_count() > 1:
         problem = "runs in one process, on all of its devices"
         raise InputError("training through the filter", problem, "start one process")
-    outcomes: list[Outcome] = []
+    results: list[TrainingResult] = []
     # Segments are divided by `filtering.over_sequences`, not as a batch of windows is. Only the
     # filter computes in float64, independently of the settings of the process.
     sharing = parallel.sharing(1 if through_filter else devices)
-    with jax.enable_x64(through_filter), sharing, _signals() as received:
+    with jax.enable_x64(through_filter), sharing, _record_signals() as signals:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
-        start = None if resumed else checkpoint.initial_run(configs[0], load)
-        chosen = FilterTask if through_filter else WindowTask
-        task, recordings = set_up(chosen, configs[0], reporter, workers, load)
+        start = None if resumed else checkpoint.load_initial_network(configs[0], load)
+        task_type = FilterTask if through_filter else WindowTask
+        task, data = set_up(task_type, configs[0], reporter, workers, load)
         for config, resume in zip(configs, resumes, strict=True):
-            outcomes.append(_train(task, recordings, config, start, resume, received, reporter))
-            (signum,) = parallel.largest(max(received))
-            if signum and len(outcomes) < len(configs):
-                outcomes[-1] = outcomes[-1]._replace(stopped_by=signum)  # others are missing
+            results.append(_train(task, data, config, start, resume, signals, reporter))
+            (signum,) = parallel.largest(max(signals))
+            if signum and len(results) < len(configs):
+                results[-1] = results[-1]._replace(stopped_by=signum)  # others are missing
                 break
-    return outcomes
+    return results
 
 
 def _train(
     task: Task,
-    recordings: Recordings,
+    data: TrainingData,
     config: TrainConfig,
     start: Run | None,
     resume: bool,
-    received: list[int],
+    signals: list[int],
     reporter: Reporter,
-) -> Outcome:
+) -> TrainingResult:
     """Train one run to its end or until a signal."""
-    epochs, steps, source = config.optim.epochs, task.steps_per_epoch, recordings.source
+    epochs, steps, source = config.optim.epochs, task.steps_per_epoch, data.source
     key = jax.random.key(config.seed)
-    of_init, of_order, of_steps = jax.random.split(key, 3)
-    of_statistics = jax.random.fold_in(key, 3)
-    with_statistics = partial(task.with_statistics, source=source, key=of_statistics)
+    init_key, order_key, step_key = jax.random.split(key, 3)
+    statistics_key = jax.random.fold_in(key, 3)
+    with_statistics = partial(task.with_statistics, source=source, key=statistics_key)
     # Copies, because steps take the memory of their state, and the next seed also starts from
     # `start`.
-    state = parallel.everywhere(task.initial_state(of_init, start and start.variables))
-    at = Position()
-    with run_folder.opened(config, recordings, state.variables, resume) as workdir:
+    state = parallel.everywhere(task.initial_state(init_key, start and start.variables))
+    position = RunPosition()
+    with run_folder.open_run(config, data, state.variables, resume) as workdir:
         for line in task.description(state, workdir):
             reporter.line(line)
         if resume and checkpoint.exists(workdir):
-            state, at = checkpoint.restore(workdir, state)
-            reporter.line(f"resuming at step {at.step}")
-        with Log(workdir, at.epoch, at.step) as log:
+            state, position = checkpoint.restore(workdir, state)
+            reporter.line(f"resuming at step {position.step}")
+        with Log(workdir, position.epoch, position.step) as log:
             saved = time.perf_counter()
-            for epoch in range(at.epoch, epochs):
-                order, end = task.order(of_order, epoch, source), (epoch + 1) * steps
-                began, before, dispatch, rate = time.perf_counter(), at, 1, 0.0
-                while at.step < end:
-                    count, tick = min(dispatch, end - at.step), time.perf_counter()
-                    numbers = jnp.int32(at.step - epoch * steps), jnp.int32(count)
-                    given = *numbers, jnp.float32(at.plateau.factor), of_steps
-                    state, progress = task.take_steps(state, source, order, *given)
-                    at = after_steps(at, count, jax.device_get(progress), workdir)
+            for epoch in range(position.epoch, epochs):
+                order, end = task.order(order_key, epoch, source), (epoch + 1) * steps
+                began, before, dispatch, rate = time.perf_counter(), position, 1, 0.0
+                while position.step < end:
+                    count, tick = min(dispatch, end - position.step), time.perf_counter()
+                    numbers = jnp.int32(position.step - epoch * steps), jnp.int32(count)
+                    factor = jnp.float32(position.plateau.factor)
+                    state, sums = task.take_steps(state, source, order, *numbers, factor, step_key)
+                    position = add_steps(position, count, jax.device_get(sums), workdir)
                     clock = time.perf_counter()
-                    at = at._replace(seconds=before.seconds + clock - began)
-                    rate = (at.step - before.step) * config.optim.batch_size / (clock - began)
-                    wished = round(DISPATCH_SECONDS * count / (clock - tick))
+                    position = position._replace(seconds=before.seconds + clock - began)
+                    rate = (position.step - before.step) * config.optim.batch_size / (clock - began)
+                    target = round(DISPATCH_SECONDS * count / (clock - tick))
                     # Clocks differ between processes, and a signal may reach only one of them.
                     dispatch, due, signum = parallel.largest(
-                        max(1, min(2 * dispatch, wished)),
+                        max(1, min(2 * dispatch, target)),
                         int(clock - saved > CHECKPOINT_SECONDS),
-                        max(received),
+                        max(signals),
                     )
-                    reporter.progress("training", at.step / (epochs * steps), _now(at, task, rate))
-                    if at.step < end and (due or signum):
-                        checkpoint.save(workdir, "latest", with_statistics(state), at)
+                    remark = _describe_progress(position, task, rate)
+                    reporter.progress("training", position.step / (epochs * steps), remark)
+                    if position.step < end and (due or signum):
+                        checkpoint.save(workdir, "latest", with_statistics(state), position)
                         saved = clock
                         if signum:
-                            return Outcome(workdir, at.best, signum)
+                            return TrainingResult(workdir, position.best, signum)
                 state, validation = task.validate(
-                    with_statistics(state), recordings.held_out, of_statistics
+                    with_statistics(state), data.held_out, statistics_key
                 )
-                at, row, improved = finished(at, task, validation, rate)
+                position, row, improved = finish_epoch(position, task, validation, rate)
                 log.add(row)
-                for line in lines(row, improved, task):
+                for line in describe_epoch(row, improved, task):
                     reporter.line(line)
                 for which in ("best", "latest") if improved else ("latest",):
-                    checkpoint.save(workdir, which, state, at)
-                (signum,) = parallel.largest(max(received))
+                    checkpoint.save(workdir, which, state, position)
+                (signum,) = parallel.largest(max(signals))
                 if signum and epoch + 1 < epochs:
-                    return Outcome(workdir, at.best, signum)
-    return Outcome(workdir, at.best, None)
+                    return TrainingResult(workdir, position.best, signum)
+    return TrainingResult(workdir, position.best, None)
 
 
 @contextmanager
-def _signals() -> Iterator[list[int]]:
+def _record_signals() -> Iterator[list[int]]:
     """Append the numbers of SIGTERM and Ctrl-C to a list that begins with 0, instead of ending the
     process; a second Ctrl-C ends it."""
-    received = [0]
+    signals = [0]
 
     def note(signum: int, _: object) -> None:
-        if received[-1] == signal.SIGINT == signum:
+        if signals[-1] == signal.SIGINT == signum:
             raise KeyboardInterrupt
-        received.append(signum)
+        signals.append(signum)
 
     handlers: dict[Any, Any] = {
         signum: signal.signal(signum, note) for signum in (signal.SIGTERM, signal.SIGINT)
     }
     try:
-        yield received
+        yield signals
     finally:
         for signum, handler in handlers.items():
             signal.signal(signum, handler)
@@ -209,52 +211,60 @@ def _signals() -> Iterator[list[int]]:
 # ------------------------------------------------------------------------------------------------
 
 
-def after_steps(at: Position, count: int, progress: Progress, workdir: Path) -> Position:
+def add_steps(
+    position: RunPosition, count: int, dispatch: DispatchSums, workdir: Path
+) -> RunPosition:
     """The position of the run in `workdir` after `count` more steps. Raises `FloatingPointError` if
     one of them failed."""
-    if progress.failed_step >= 0:
+    if dispatch.failed_step >= 0:
         raise FloatingPointError(
             f"{workdir}: the loss or its gradient is not finite at step "
-            f"{int(progress.failed_step)} (epoch {at.epoch}); lower optim.learning_rate, set "
+            f"{int(dispatch.failed_step)} (epoch {position.epoch}); lower optim.learning_rate, set "
             "optim.clip_norm, or look at the data"
         )
-    sums = {name: at.sums.get(name, 0.0) + float(more) for name, more in progress.sums.items()}
-    return at._replace(step=at.step + count, sums=sums)
+    sums = {name: float(figure) for name, figure in dispatch.sums.items()}
+    sums = {name: position.sums.get(name, 0.0) + figure for name, figure in sums.items()}
+    return position._replace(step=position.step + count, sums=sums)
 
 
-def finished(at: Position, task: Task, validation: Row, rate: float) -> tuple[Position, Row, bool]:
-    """The end of an epoch at `at`, trained at `rate` windows or segments per second: the position
-    at which the next one starts, the log's row, and whether the epoch is the best one so far.
+def finish_epoch(
+    position: RunPosition, task: Task, validation: Row, rate: float
+) -> tuple[RunPosition, Row, bool]:
+    """The end of an epoch at `position`, trained at `rate` windows or segments per second: the
+    position at which the next one starts, the log's row, and whether the epoch is the best one so
+    far.
 
     The choice of the best epoch begins anew with the epoch that changes what is trained, and again
     with the first whole epoch after it. Losses before and after the change cannot be compared, and
     a part that has just begun to learn has learnt little. NaN and infinity are never the best.
     """
-    optim, means = task.config.optim, mean_figures(at.sums, task.steps_per_epoch)
-    norms = {name: means.pop(name) for name in at.sums if name.startswith("gradient_norm/")}
+    optim, means = task.config.optim, mean_figures(position.sums, task.steps_per_epoch)
+    norms = {name: means.pop(name) for name in position.sums if name.startswith("gradient_norm/")}
     row: Row = {
-        "epoch": at.epoch,
-        "step": at.step,
+        "epoch": position.epoch,
+        "step": position.step,
         **means,
         **validation,
-        "learning_rate": learning_rate(at, task),
+        "learning_rate": learning_rate(position, task),
         f"{task.unit}_per_second": rate,
-        "seconds": at.seconds,
+        "seconds": position.seconds,
         **norms,
     }
     merit = row["val_loss" if optim.best_by == "loss" else "val_mse"]
-    before = at.step - 2 * task.steps_per_epoch
-    best = None if any(before < change < at.step for change in task.changes) else at.best
+    before = position.step - 2 * task.steps_per_epoch
+    changed = any(before < change < position.step for change in task.changes)
+    best = None if changed else position.best
     improved = math.isfinite(merit) and (best is None or merit < best)
-    plateau = optimizer.watch(at.plateau, row["val_mse"], optim)
+    plateau = optimizer.update_plateau(position.plateau, row["val_mse"], optim)
     best = merit if improved else best
-    return at._replace(epoch=at.epoch + 1, best=best, sums={}, plateau=plateau), row, improved
+    position = position._replace(epoch=position.epoch + 1, best=best, sums={}, plateau=plateau)
+    return position, row, improved
 
 
-def learning_rate(at: Position, task: Task) -> float:
+def learning_rate(position: RunPosition, task: Task) -> float:
     """The network's learning rate at the next step."""
     schedule = optimizer.schedule(task.config.optim, task.steps_per_epoch)
-    return float(schedule(at.step)) * at.plateau.factor
+    return float(schedule(position.step)) * position.plateau.factor
 
 
 def mean_figures(sums: dict[str, float], steps: int) -> Row:
@@ -264,27 +274,28 @@ def mean_figures(sums: dict[str, float], steps: int) -> Row:
     return means | ({"skipped": skipped} if "skipped" in sums else {})
 
 
-def _now(at: Position, task: Task, rate: float) -> str:
+def _describe_progress(position: RunPosition, task: Task, rate: float) -> str:
     """The figures beside the progress bar: the mean loss of the epoch so far, and the speed."""
     steps = task.steps_per_epoch
-    loss = mean_figures(at.sums, at.step - at.epoch * steps)["loss"]
+    loss = mean_figures(position.sums, position.step - position.epoch * steps)["loss"]
     return (
-        f"{at.step}/{task.config.optim.epochs * steps}  epoch {at.epoch + 1}  loss {loss:.4g}  "
-        f"lr {learning_rate(at, task):.2e}  {_speed(task, rate)}"
+        f"{position.step}/{task.config.optim.epochs * steps}  "
+        f"epoch {position.epoch + 1}  loss {loss:.4g}  "
+        f"lr {learning_rate(position, task):.2e}  {_format_speed(task, rate)}"
     )
 
 
-def lines(row: Row, improved: bool, task: Task) -> Iterator[str]:
+def describe_epoch(row: Row, improved: bool, task: Task) -> Iterator[str]:
     """The line of a finished epoch, with the error of each dataset if there are several, and a
     warning if a layer of the head no longer learns."""
     names = task.config.datasets
-    own = ", ".join(f"{name} {row[f'val_rmse/{name}']:.4f}" for name in names if len(names) > 1)
+    errors = ", ".join(f"{name} {row[f'val_rmse/{name}']:.4f}" for name in names if len(names) > 1)
     yield (
         f"epoch {row['epoch'] + 1:4d}/{task.config.optim.epochs}  "
         f"loss {row['loss']:.4g}  val {row['val_loss']:.4g}  val rmse {row['val_rmse']:.4f} m  "
-        f"{f'({own})  ' if own else ''}"
+        f"{f'({errors})  ' if errors else ''}"
         f"{task.remark(row)}lr {row['learning_rate']:.2e}  "
-        f"{_speed(task, row[f'{task.unit}_per_second'])}{'  best' if improved else ''}"
+        f"{_format_speed(task, row[f'{task.unit}_per_second'])}{'  best' if improved else ''}"
     )
     if stuck := stuck_layers(row):
         yield (
@@ -293,7 +304,7 @@ def lines(row: Row, improved: bool, task: Task) -> Iterator[str]:
         )
 
 
-def _speed(task: Task, rate: float) -> str:
+def _format_speed(task: Task, rate: float) -> str:
     return f"{rate:,.0f} {task.unit}/s" if rate >= 10 else f"{rate:.2g} {task.unit}/s"
 
 

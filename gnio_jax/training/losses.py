@@ -71,11 +71,11 @@ def losses(
     Raises `ValueError` if the loss needs more than the network predicts (a velocity for every
     sample).
     """
-    given = (prediction.displacement, prediction.log_std, windows.displacement)
-    chex.assert_equal_shape(given)
-    chex.assert_shape(given, (None, 3))
+    vectors = (prediction.displacement, prediction.log_std, windows.displacement)
+    chex.assert_equal_shape(vectors)
+    chex.assert_shape(vectors, (None, 3))
     error = (windows.displacement - prediction.displacement)[:, :axes]
-    held = prediction._replace(log_std=_held(prediction.log_std, stage))
+    held = prediction._replace(log_std=_hold_log_std(prediction.log_std, stage))
     mse = jnp.mean(jnp.sum(error**2, axis=-1))
     nll = gaussian_nll(held, error, config)
     if config.name == "velocity_and_covariance":
@@ -96,20 +96,24 @@ def _velocity_and_covariance(
     up, L_c the likelihood of the velocities. Velocities are metres per window. Ours: means over the
     samples, sums over the axes, and the lower bound of both log δ.
     """
-    found = prediction.diagnostics
-    if not {"velocity", "velocity_log_std", "task_log_std"} <= found.keys():
+    diagnostics = prediction.diagnostics
+    if not {"velocity", "velocity_log_std", "task_log_std"} <= diagnostics.keys():
         raise ValueError(
             "loss 'velocity_and_covariance' needs a velocity for every sample, "
             "which only the network 'ctin' gives"
         )
     # For a context before the window CTIN would predict velocities for which there is no target.
-    chex.assert_equal_shape([windows.steps, found["velocity"], found["velocity_log_std"]])
-    error = (windows.steps * windows.steps.shape[1] - found["velocity"])[..., :axes]
+    chex.assert_equal_shape(
+        [windows.steps, diagnostics["velocity"], diagnostics["velocity_log_std"]]
+    )
+    error = (windows.steps * windows.steps.shape[1] - diagnostics["velocity"])[..., :axes]
     position = (windows.displacement - prediction.displacement)[:, :axes]
     velocity_loss = jnp.mean(jnp.sum(error**2, axis=-1)) + jnp.mean(jnp.sum(position**2, axis=-1))
-    held = Prediction(found["velocity"], _held(found["velocity_log_std"], stage))
+    held = Prediction(
+        diagnostics["velocity"], _hold_log_std(diagnostics["velocity_log_std"], stage)
+    )
     covariance_loss = gaussian_nll(held, error, config)
-    log_v, log_c = jnp.maximum(found["task_log_std"][0], TASK_LOG_STD_FLOOR)
+    log_v, log_c = jnp.maximum(diagnostics["task_log_std"][0], TASK_LOG_STD_FLOOR)
     return (
         0.5 * jnp.exp(-2 * log_v) * velocity_loss
         + 0.5 * jnp.exp(-2 * log_c) * covariance_loss
@@ -135,7 +139,7 @@ def gaussian_nll(
     return jnp.mean(jnp.sum(0.5 * normalised + log_std, axis=-1))
 
 
-def _held(log_std: Float[jax.Array, "*b 3"], stage: Stage) -> Float[jax.Array, "*b 3"]:
+def _hold_log_std(log_std: Float[jax.Array, "*b 3"], stage: Stage) -> Float[jax.Array, "*b 3"]:
     """The same values, with a gradient only if the uncertainty learns in this stage."""
     held = jax.lax.stop_gradient(log_std)
     return held + jnp.where(stage.log_std_learns, log_std - held, 0.0)

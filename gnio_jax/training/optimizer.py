@@ -29,9 +29,9 @@ PLATEAU_EPOCHS, PLATEAU_FACTOR = 10, 0.1
 """The learning rate is multiplied by the factor after more than this number of epochs without a
 smaller squared error on the validation split (RoNIN, DeepILS)."""
 UNCERTAINTY = ("uncertainty", "log_std")
-"""Names of the networks' modules that give only the uncertainty …"""
+"""Modules that predict only the uncertainty, by name."""
 HEADS = ("head", "displacement")
-"""… and of those that give the displacement."""
+"""Modules that predict the displacement, by name."""
 FILTER_PARTS = {
     "noise": (
         "noise.gyro_density",
@@ -39,7 +39,12 @@ FILTER_PARTS = {
         "noise.gyro_bias_walk",
         "noise.accel_bias_walk",
     ),
-    "measurement": ("noise.measurement_scale", "noise.std_factor", "noise.correlation"),
+    "measurement": (
+        "noise.measurement_scale",
+        "noise.std_factor",
+        "noise.correlation",
+        "measurements",
+    ),
     "start": ("start",),
 }
 """Paths of the numbers of `FilterSettings` that belong to each part of the filter."""
@@ -59,7 +64,8 @@ def filter_numbers(config: TrainConfig) -> dict[str, Float[jax.Array, ""]]:
     if not config.through_filter.learn:
         return {}
     paths = [path for of_part in FILTER_PARTS.values() for path in of_part]
-    return {name: jnp.float32(each) for name, each in free_parameters(config.filter, paths).items()}
+    numbers = free_parameters(config.filter, paths)
+    return {name: jnp.float32(number) for name, number in numbers.items()}
 
 
 def trained_settings(settings: FilterSettings, numbers: dict[str, Any]) -> FilterSettings:
@@ -67,7 +73,7 @@ def trained_settings(settings: FilterSettings, numbers: dict[str, Any]) -> Filte
     return with_written_parameters(settings, numbers, DIGITS)
 
 
-def trainable(variables: Any, learn: Iterable[str]) -> Trainable:
+def select_trained(variables: Any, learn: Iterable[str]) -> Trainable:
     """The variables of the parts `learn`; if there are none, the network's parameters."""
     parts = set(learn)
     if not parts:
@@ -82,12 +88,12 @@ def trainable(variables: Any, learn: Iterable[str]) -> Trainable:
         part = "head" if name in HEADS else "encoder"
         return ("uncertainty" if name in UNCERTAINTY else part) in parts
 
-    found = {
+    selected = {
         collection: {name: leaf for name, leaf in tree.items() if is_trained(collection, name)}
         for collection, tree in variables.items()
         if collection != "batch_stats"
     }
-    return {collection: tree for collection, tree in found.items() if tree}
+    return {collection: tree for collection, tree in selected.items() if tree}
 
 
 # By which steps
@@ -147,11 +153,11 @@ def create(config: TrainConfig, steps_per_epoch: int) -> optax.GradientTransform
     gradient is clipped separately."""
     if not config.through_filter.learn:
         return adam(config.optim, config.loss, steps_per_epoch)
-    each = {
+    optimizers = {
         "params": adam(config.optim, LossConfig(), 1),
         "filter": adam(dataclasses.replace(config.optim, weight_decay=0.0), LossConfig(), 1),
     }
-    return optax.partition(each, _by_path(lambda path: path[0].key))
+    return optax.partition(optimizers, _by_path(lambda path: path[0].key))
 
 
 def learning_rates(config: TrainConfig, steps_per_epoch: int) -> dict[str, optax.Schedule]:
@@ -179,7 +185,7 @@ class Plateau(NamedTuple):
     """Epochs since the smallest error, or since the learning rate was reduced."""
 
 
-def watch(plateau: Plateau, mse: float, config: OptimConfig) -> Plateau:
+def update_plateau(plateau: Plateau, mse: float, config: OptimConfig) -> Plateau:
     """The plateau after an epoch with this squared error on the validation split. An error counts
     as smaller if it is smaller by a ten-thousandth, as in PyTorch."""
     if config.schedule != "plateau":

@@ -25,7 +25,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
 from gnio_jax.training.checkpoint import recordings_by_name
-from gnio_jax.training.recordings import Recordings
+from gnio_jax.training.recordings import TrainingData
 from gnio_jax.training.task import Row
 
 # Made when the module is imported, so type checkers do not know them.
@@ -43,31 +43,31 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     none, or one with other settings. Of several processes only the first one checks this.
     """
     workdir = configuration.default_workdir(config)
-    kept = workdir / "config.yaml"
+    file = workdir / "config.yaml"
     if not parallel.is_first():
         return workdir
     if not resume:
         if workdir.is_file():
             raise InputError(workdir, "is a file", "name a folder with --workdir")
-        if kept.exists():
+        if file.exists():
             remedy = "continue it with --resume, or choose another --workdir"
             raise InputError(workdir, "already holds a run", remedy)
         return workdir
-    if not kept.exists():
+    if not file.exists():
         problem = "holds no run to resume (config.yaml is missing)"
         raise InputError(workdir, problem, "start it without --resume")
-    both = map(configuration.without_places, (config, configuration.load(kept)))
-    ours, theirs = map(configuration.flat, both)
+    configs = map(configuration.without_paths, (config, configuration.load(file)))
+    ours, theirs = map(configuration.flatten, configs)
     for name in ours | theirs:
         if ours.get(name) != theirs.get(name):
             problem = f"'{name}' was {theirs.get(name)} and is now {ours.get(name)}"
-            raise InputError(kept, problem, "resume with the same settings")
+            raise InputError(file, problem, "resume with the same settings")
     return workdir
 
 
 @contextmanager
-def opened(
-    config: TrainConfig, recordings: Recordings, variables: Any, resume: bool
+def open_run(
+    config: TrainConfig, data: TrainingData, variables: Any, resume: bool
 ) -> Iterator[Path]:
     """The work folder, with the config.yaml and splits.yaml of a new run. It is for one training at
     a time: the folder is locked until the context or the process ends.
@@ -76,7 +76,7 @@ def opened(
     recordings, and as `compare_processes` does for the variables at step 0. Of several processes
     the first one writes.
     """
-    compare_processes(config, recordings, variables)
+    compare_processes(config, data, variables)
     workdir = configuration.default_workdir(config)
     if not parallel.is_first():
         yield workdir
@@ -94,9 +94,9 @@ def opened(
             configuration.save(workdir / "config.yaml", config)
         path = workdir / "splits.yaml"
         if path.exists():
-            _refuse_other_recordings(path, recordings.splits)
+            _refuse_other_recordings(path, data.splits)
         else:
-            text = yaml.safe_dump(recordings.splits, sort_keys=False, allow_unicode=True)
+            text = yaml.safe_dump(data.splits, sort_keys=False, allow_unicode=True)
             write_text(path, text)
         yield workdir
     finally:
@@ -106,7 +106,7 @@ def opened(
 def _refuse_other_recordings(path: Path, splits: dict[str, dict[str, int] | list[str]]) -> None:
     """Refuse recordings other than those with which the run was begun. Hold-outs are drawn from the
     recordings of a copy of the data, which may differ between copies, and so may recordings with
-    the same name. An earlier version kept only the names."""
+    the same name."""
     try:
         before = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -115,12 +115,12 @@ def _refuse_other_recordings(path: Path, splits: dict[str, dict[str, int] | list
         raise InputError(path, problem, remedy) from None
     before = before if isinstance(before, dict) else {}
     for split in splits | before:
-        own, theirs = (recordings_by_name(each.get(split)) for each in (splits, before))
-        if None in theirs.values():
-            own = dict.fromkeys(own)
-        if list(own.items()) != list(theirs.items()):
+        ours, theirs = (
+            recordings_by_name(recordings.get(split)) for recordings in (splits, before)
+        )
+        if list(ours.items()) != list(theirs.items()):
             changed = sorted(
-                name for name in own | theirs if own.get(name, -1) != theirs.get(name, -1)
+                name for name in ours | theirs if ours.get(name, -1) != theirs.get(name, -1)
             )
             what = f", e.g. {changed[0]}" if changed else ", their order does"
             problem = (
@@ -130,7 +130,7 @@ def _refuse_other_recordings(path: Path, splits: dict[str, dict[str, int] | list
             raise InputError(path, problem, "resume with the same data")
 
 
-def compare_processes(config: TrainConfig, recordings: Recordings, variables: Any) -> None:
+def compare_processes(config: TrainConfig, data: TrainingData, variables: Any) -> None:
     """Raise `InputError` in every process unless all have the same settings, recordings and weights
     to begin with. Otherwise they would compute different results, or wait for each other without
     end.
@@ -140,19 +140,19 @@ def compare_processes(config: TrainConfig, recordings: Recordings, variables: An
     if jax.process_count() == 1:
         return
 
-    def sampled(tree: Any) -> list[Any]:
+    def sample_tree(tree: Any) -> list[Any]:
         leaves = [np.atleast_1d(leaf) for leaf in jax.tree.leaves(parallel.on_host(tree))]
         return [(leaf.shape, leaf[:: len(leaf) // 999 + 1].tobytes()) for leaf in leaves]
 
-    settings = configuration.flat(configuration.without_places(config))
+    settings = configuration.flatten(configuration.without_paths(config))
     for what, value, remedy in (
         ("settings", settings, "start all with the same options, also --config"),
         (
             "recordings",
-            (recordings.splits, sampled(recordings[:2])),
+            (data.splits, sample_tree(data[:2])),
             "give all of them the same data",
         ),
-        ("weights to begin with", sampled(variables), "start all with the same --init-from"),
+        ("weights to begin with", sample_tree(variables), "start all with the same --init-from"),
     ):
         digest = hashlib.sha256(repr(value).encode()).digest()
         number = int.from_bytes(digest[:4], "big") >> 1

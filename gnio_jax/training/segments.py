@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from gnio_jax import geometry
 from gnio_jax.config import AugmentConfig
-from gnio_jax.data.windows import low_pass_margin, random_low_pass
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import InitialStd
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, spans
+from gnio_jax.training.windows import low_pass_margin, random_low_pass
 from gnio_jax.types import Array, Sequence
 
 
@@ -42,12 +42,12 @@ class SegmentSource(NamedTuple):
     tapped: Bool[Array, "t"]
     """Whether the recording has waypoints: its reference is then interpolated between them."""
     earliest: Int[Array, "p"]
-    """First row at which each segment of an epoch may begin …"""
+    """Earliest first row of each segment of an epoch."""
     latest: Int[Array, "p"]
-    """… and the last one."""
+    """Latest first row of each segment of an epoch."""
 
 
-class Path(NamedTuple):
+class MotionPath(NamedTuple):
     """Motion at K + 1 times: at the start, and at the end of each clone interval."""
 
     rotation: Float[Array, "k+1 3 3"]
@@ -65,15 +65,15 @@ class Segment(NamedTuple):
     """rad/s, raw, s = K·n."""
     accel: Float[Array, "s 3"]
     """m/s², raw."""
-    truth: Path
+    truth: MotionPath
     """The reference."""
     waypoint: Float[Array, "s 2"]
-    """As in `SegmentSource`."""
+    """See `SegmentSource.waypoint`."""
     tapped: Bool[Array, ""]
-    """Likewise."""
+    """See `SegmentSource.tapped`."""
 
 
-Start = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+StartEstimate = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
 """The filter's first estimates: attitude body → world (3, 3), velocity m/s, position m, gyro bias
 rad/s and accelerometer bias m/s² (3,)."""
 
@@ -91,10 +91,10 @@ def segment_source(sequences: Iterable[Sequence], samples: int) -> SegmentSource
     if not parts:
         problem = f"no segment of {samples} samples has a valid reference in any sequence"
         raise InputError("data", problem, "lower through_filter.piece_seconds")
-    return joined(parts)
+    return join_segments(parts)
 
 
-def joined(sources: list[SegmentSource]) -> SegmentSource:
+def join_segments(sources: list[SegmentSource]) -> SegmentSource:
     """The recordings of all sources, one source after the other, as host arrays."""
     parts: list[SegmentSource] = []
     rows = 0
@@ -107,12 +107,12 @@ def joined(sources: list[SegmentSource]) -> SegmentSource:
 
 def _source_of(sequence: Sequence, samples: int) -> SegmentSource:
     """One recording's segments, rows counted from 0."""
-    known = sequence.valid & finite_rows(sequence.velocity)
+    trusted = sequence.valid & finite_rows(sequence.velocity)
     if sequence.imu_valid is not None:  # not from samples that are interpolated across a gap
-        known = known & sequence.imu_valid
+        trusted = trusted & sequence.imu_valid
     earliest: list[np.ndarray] = []
     latest: list[np.ndarray] = []
-    for first, end in spans(known):
+    for first, end in spans(trusted):
         length = end - first
         count = (length - 1) // samples
         if count < 1:
@@ -120,13 +120,13 @@ def _source_of(sequence: Sequence, samples: int) -> SegmentSource:
         shares = first + (np.arange(count + 1) * (length - samples)) // count
         earliest.append(shares[:-1])
         latest.append(shares[1:] - 1)
-    orientation = np.where(known[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
+    orientation = np.where(trusted[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
     nothing = [np.zeros(0, np.int64)]
-    waypoint = np.full((len(known), 2), np.nan)
+    waypoint = np.full((len(trusted), 2), np.nan)
     if sequence.waypoints is not None:
         step = sequence.time[1] - sequence.time[0]
         rows = np.rint((sequence.waypoints.time - sequence.time[0]) / step).astype(int)
-        waypoint[np.clip(rows, 0, len(known) - 1)] = sequence.waypoints.position
+        waypoint[np.clip(rows, 0, len(trusted) - 1)] = sequence.waypoints.position
     return SegmentSource(
         gyro=sequence.gyro,
         accel=sequence.accel,
@@ -134,7 +134,7 @@ def _source_of(sequence: Sequence, samples: int) -> SegmentSource:
         velocity=sequence.velocity,
         position=sequence.position,
         waypoint=waypoint,
-        tapped=np.full(len(known), sequence.waypoints is not None),
+        tapped=np.full(len(trusted), sequence.waypoints is not None),
         earliest=np.concatenate(earliest or nothing).astype(np.int32),
         latest=np.concatenate(latest or nothing).astype(np.int32),
     )
@@ -164,20 +164,24 @@ def cut_segment(
         for signal in (source.gyro, source.accel, source.waypoint)
     )
     truth = (at_clones(signal) for signal in (source.rotation, source.velocity, source.position))
-    return Segment(gyro, accel, Path(*truth), waypoint, jnp.asarray(source.tapped)[start])
+    return Segment(gyro, accel, MotionPath(*truth), waypoint, jnp.asarray(source.tapped)[start])
 
 
-def turned_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
+def turn_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
     """The segment as if it had been walked in a world turned by `angle` (rad) about the vertical.
     The IMU's samples are the same. Jittable."""
     turn = geometry.exp(jnp.stack([jnp.zeros_like(angle), jnp.zeros_like(angle), angle]))
     rotation, velocity, position = segment.truth
-    truth = Path(jnp.einsum("ij,kjl->kil", turn, rotation), velocity @ turn.T, position @ turn.T)
+    truth = MotionPath(
+        jnp.einsum("ij,kjl->kil", turn, rotation), velocity @ turn.T, position @ turn.T
+    )
     return segment._replace(truth=truth, waypoint=segment.waypoint @ turn[:2, :2].T)
 
 
-def low_passed(key: PRNGKeyArray, segments: Segment, config: AugmentConfig, rate: float) -> Segment:
-    """A batch of segments of which a random share is low-passed (`data.windows.random_low_pass`).
+def low_pass_segments(
+    key: PRNGKeyArray, segments: Segment, config: AugmentConfig, rate: float
+) -> Segment:
+    """A batch of segments of which a random share is low-passed (`windows.random_low_pass`).
 
     Network and filter see a slower sensor; the low-pass is in the body's frame. Beyond its ends a
     segment continues with its first and last sample. Jittable.
@@ -191,11 +195,13 @@ def low_passed(key: PRNGKeyArray, segments: Segment, config: AugmentConfig, rate
     return segments._replace(accel=imu[:, :, :3], gyro=imu[:, :, 3:])
 
 
-def draw_start(key: PRNGKeyArray, truth: Path, std: InitialStd, spread: float) -> Start:
+def draw_start(
+    key: PRNGKeyArray, truth: MotionPath, std: InitialStd, spread: float
+) -> StartEstimate:
     """First estimates with errors drawn from `spread` times `std`, from the truth and from zero
     biases. The attitude is exp(θ) R, with θ in the world frame. Jittable."""
     draws = spread * jax.random.normal(key, (5, 3), jnp.float64)
-    tilt_tilt_yaw = jnp.stack([jnp.asarray(each) for each in (std.tilt, std.tilt, std.yaw)])
+    tilt_tilt_yaw = jnp.stack([jnp.asarray(angle) for angle in (std.tilt, std.tilt, std.yaw)])
     return (
         geometry.matmul(geometry.exp(tilt_tilt_yaw * draws[0]), truth.rotation[0]),
         truth.velocity[0] + std.velocity * draws[1],

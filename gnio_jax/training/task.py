@@ -54,8 +54,8 @@ class BatchLosses(NamedTuple):
     """False if the filter diverged: the loss is then meaningless."""
 
 
-class Progress(NamedTuple):
-    """Figures of the steps of one dispatch."""
+class DispatchSums(NamedTuple):
+    """Sums over the steps of one dispatch."""
 
     sums: dict[str, Float[jax.Array, ""]]
     """Sums over the steps of `loss`, its parts and `gradient_norm/<part>` (`gradient_norms`). A
@@ -87,7 +87,7 @@ class Task(ABC):
     gradient is not finite, or if the filter diverged. None: the first step that is not finite ends
     the run.
     """
-    joined: ClassVar[Callable[[list[Any]], Any]]
+    join: ClassVar[Callable[[list[Any]], Any]]
     """A function that joins the windows or segments of several datasets, one after the other, on
     the host."""
 
@@ -129,7 +129,7 @@ class Task(ABC):
         estimated anew, if the settings ask for it."""
         return state
 
-    def calibrated(self, state: TrainState, held_out: dict[str, Any]) -> TrainState:
+    def calibrate_uncertainty(self, state: TrainState, held_out: dict[str, Any]) -> TrainState:
         """The state with its uncertainty calibrated, if it has constants for that."""
         return state
 
@@ -143,7 +143,7 @@ class Task(ABC):
 
     def trainable(self, variables: Any) -> Trainable:
         """The trained variables."""
-        return optimizer.trainable(variables, self.config.through_filter.learn)
+        return optimizer.select_trained(variables, self.config.through_filter.learn)
 
     def validate(
         self, state: TrainState, held_out: dict[str, Any], key: PRNGKeyArray
@@ -151,40 +151,40 @@ class Task(ABC):
         """The state that is kept, calibrated, and its figures on the validation split. For several
         datasets these are means over the datasets that have them, and the losses and errors of each
         are added."""
-        state = self.calibrated(state, held_out)
-        rows = {name: self.figures_of(state, each, key) for name, each in held_out.items()}
+        state = self.calibrate_uncertainty(state, held_out)
+        rows = {name: self.figures_of(state, source, key) for name, source in held_out.items()}
         first, *others = rows.values()
         if not others:
             return state, first
         row: Row = {}
         for figure in dict.fromkeys(itertools.chain(*rows.values())):
-            found = [each[figure] for each in rows.values() if figure in each]
-            row[figure] = sum(found) / len(found)
+            values = [figures[figure] for figures in rows.values() if figure in figures]
+            row[figure] = sum(values) / len(values)
         for figure in ("val_loss", "val_mse", "val_rmse"):
-            row |= {f"{figure}/{name}": each[figure] for name, each in rows.items()}
+            row |= {f"{figure}/{name}": figures[figure] for name, figures in rows.items()}
         return state, row
 
-    def weighted(self, key: PRNGKeyArray, entries: Int[jax.Array, "m"]) -> Int[jax.Array, "n"]:
+    def select_visits(self, key: PRNGKeyArray, entries: Int[jax.Array, "m"]) -> Int[jax.Array, "n"]:
         """The part of `entries`, one for each window or segment, that an epoch visits: for each
         dataset the number that its weight gives, in no order. If an epoch does not visit all of
         them equally often, `key` decides which ones it visits."""
-        weights, found = self.config.data.weights, []
+        weights, chosen = self.config.data.weights, []
         if not weights:
             return entries
         ends = itertools.accumulate(self.parts)
         for number, (end, count, weight) in enumerate(zip(ends, self.parts, weights, strict=True)):
-            own = entries[end - count : end]
-            times, rest = divmod(visits(count, weight), count)
-            drawn = jax.random.permutation(jax.random.fold_in(key, number), own)
-            found += [own] * times + [drawn[:rest]]
-        return jnp.concatenate(found)
+            members = entries[end - count : end]
+            times, remainder = divmod(visit_count(count, weight), count)
+            drawn = jax.random.permutation(jax.random.fold_in(key, number), members)
+            chosen += [members] * times + [drawn[:remainder]]
+        return jnp.concatenate(chosen)
 
     def initial_state(self, key: PRNGKeyArray, start: Any | None) -> TrainState:
         """The state at step 0: with drawn parameters, or with the variables `start` of a run. The
         filter's numbers are always those of the settings, even if training starts from a run."""
         variables = {"batch_stats": {}, **models.initialise(self.model, key, self.config.data.seen)}
         if start is not None:
-            variables = overlaid(variables, start)
+            variables = overlay(variables, start)
         if numbers := optimizer.filter_numbers(self.config):
             variables["filter"] = numbers
         trained = self.trainable(variables)
@@ -192,9 +192,9 @@ class Task(ABC):
         adam = optimizer.create(self.config, self.steps_per_epoch)
         return TrainState(jnp.int32(0), variables, adam.init(trained))
 
-    def take_steps(self, *given: Any) -> tuple[TrainState, Progress]:
+    def take_steps(self, *arguments: Any) -> tuple[TrainState, DispatchSums]:
         """`train_steps` of this task. The old state is used up."""
-        return train_steps(*given, task=self)
+        return train_steps(*arguments, task=self)
 
 
 # The step
@@ -212,7 +212,7 @@ def train_steps(
     key: PRNGKeyArray,
     *,
     task: Task,
-) -> tuple[TrainState, Progress]:
+) -> tuple[TrainState, DispatchSums]:
     """Take `count` steps of an epoch, from its step number `first` on, in one dispatch.
 
     order: what the epoch visits of `source`; factor: scales the scheduled learning rate
@@ -227,12 +227,14 @@ def train_steps(
     adam = optimizer.create(task.config, task.steps_per_epoch)
     learning_rates = optimizer.learning_rates(task.config, task.steps_per_epoch)
 
-    def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
-        state, progress = carry
+    def one_step(
+        i: jax.Array, carry: tuple[TrainState, DispatchSums]
+    ) -> tuple[TrainState, DispatchSums]:
+        state, dispatch = carry
         which = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
         batch = task.draw(jax.random.fold_in(key, state.step), source, which)
         trained = task.trainable(state.variables)
-        gradient, found = gradient_of(trained, state.variables, batch, state.step, task)
+        gradient, losses = gradient_of(trained, state.variables, batch, state.step, task)
         stage = loss_stage(task.config.loss, state.step, task.steps_per_epoch)
         update: Any
         update, opt_state = adam.update(
@@ -241,29 +243,29 @@ def train_steps(
         for name, direction in update.items():
             rate = -jnp.float32(learning_rates[name](state.step))
             update[name] = optax.tree.scale(factor, optax.tree.scale(rate, direction))
-        variables = merged(state.variables, optax.apply_updates(trained, update))
-        variables["batch_stats"] = found.batch_stats
+        variables = merge_trained(state.variables, optax.apply_updates(trained, update))
+        variables["batch_stats"] = losses.batch_stats
         new = TrainState(state.step, variables, opt_state)
 
         # Loss and gradient are checked before the update is kept: a gradient that is not finite
         # must not reach a checkpoint, even if its loss is finite.
-        figures = found.figures | gradient_norms(gradient)
-        sound = found.healthy & jnp.isfinite(jnp.stack(list(figures.values()))).all()
-        failed_step = progress.failed_step
+        figures = losses.figures | gradient_norms(gradient)
+        sound = losses.healthy & jnp.isfinite(jnp.stack(list(figures.values()))).all()
+        failed_step = dispatch.failed_step
         if task.skip_above is None:
             failed_step = jnp.where(~sound & (failed_step < 0), state.step, failed_step)
         else:
             sound = sound & (optax.tree.norm(gradient) <= task.skip_above)
             new = jax.tree.map(lambda new, old: jnp.where(sound, new, old), new, state)
-            figures = {name: jnp.where(sound, each, 0.0) for name, each in figures.items()}
+            figures = {name: jnp.where(sound, value, 0.0) for name, value in figures.items()}
             figures["skipped"] = jnp.where(sound, 0.0, 1.0)
-        sums = jax.tree.map(jnp.add, progress.sums, figures)
+        sums = jax.tree.map(jnp.add, dispatch.sums, figures)
         new = new._replace(step=jnp.add(state.step, 1))
-        return parallel.replicate(new), Progress(sums, failed_step)
+        return parallel.replicate(new), DispatchSums(sums, failed_step)
 
     names = [*task.figures, *gradient_norms(task.trainable(state.variables))]
     names += [] if task.skip_above is None else ["skipped"]
-    start = (state, Progress({name: jnp.zeros((), float) for name in names}, jnp.int32(-1)))
+    start = (state, DispatchSums({name: jnp.zeros((), float) for name in names}, jnp.int32(-1)))
     return jax.lax.fori_loop(jnp.int32(0), count, one_step, start)
 
 
@@ -273,15 +275,15 @@ def gradient_of(
     """Gradient of the loss of a batch by the trained variables, and the losses."""
 
     def objective(trained: Trainable) -> tuple[jax.Array, BatchLosses]:
-        found = task.losses(merged(variables, trained), batch, step)
-        return found.figures["loss"], found
+        losses = task.losses(merge_trained(variables, trained), batch, step)
+        return losses.figures["loss"], losses
 
-    gradient, found = jax.grad(objective, has_aux=True)(trained)
+    gradient, losses = jax.grad(objective, has_aux=True)(trained)
     chex.assert_trees_all_equal_structs(gradient, trained)
-    return gradient, found
+    return gradient, losses
 
 
-def merged(variables: Any, trained: Trainable) -> Any:
+def merge_trained(variables: Any, trained: Trainable) -> Any:
     """All variables, with the trained ones in their places."""
     return {name: {**tree, **trained.get(name, {})} for name, tree in variables.items()}
 
@@ -296,15 +298,16 @@ def gradient_norms(gradient: Trainable) -> dict[str, Float[jax.Array, ""]]:
         part = "/".join(names[: 2 if names[0] == "head" else 1])
         part = part if collection == "params" else f"{collection}/{part}"
         squares.setdefault(f"gradient_norm/{part}", []).append(jnp.sum(leaf**2))
-    return {part: jnp.sqrt(sum(found)) for part, found in squares.items()}
+    return {part: jnp.sqrt(sum(terms)) for part, terms in squares.items()}
 
 
-def visits(count: int, weight: float) -> int:
+def visit_count(count: int, weight: float) -> int:
     """Number of windows or segments that an epoch visits of a dataset with `count` of them."""
     return round(weight * count)
 
 
-def overlaid(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+def overlay(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     """`tree` with the leaves that `other` has in the same places."""
-    own, given = (traverse_util.flatten_dict(each, keep_empty_nodes=True) for each in (tree, other))
-    return traverse_util.unflatten_dict({path: given.get(path, own[path]) for path in own})
+    flatten = functools.partial(traverse_util.flatten_dict, keep_empty_nodes=True)
+    leaves, others = flatten(tree), flatten(other)
+    return traverse_util.unflatten_dict({path: others.get(path, leaves[path]) for path in leaves})

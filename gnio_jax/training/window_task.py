@@ -21,19 +21,19 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
-from gnio_jax.data.windows import (
+from gnio_jax.models.layers import MOMENTUM
+from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
+from gnio_jax.training.task import BatchLosses, Row, Task, TrainState
+from gnio_jax.training.windows import (
     WindowSource,
     augment,
     gather,
-    joined,
+    join_windows,
     low_pass,
     low_pass_margin,
     shift_windows,
     window_source,
 )
-from gnio_jax.models.layers import MOMENTUM
-from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
-from gnio_jax.training.task import BatchLosses, Row, Task, TrainState
 from gnio_jax.types import Prediction, Sequence, Windows
 
 
@@ -42,7 +42,7 @@ class WindowTask(Task):
 
     unit = "windows"
     figures = ("loss", "mse", "nll")
-    joined = staticmethod(joined)
+    join = staticmethod(join_windows)
 
     @staticmethod
     def source_of(
@@ -82,7 +82,7 @@ class WindowTask(Task):
     def order(self, key: PRNGKeyArray, epoch: int, source: WindowSource) -> Int[jax.Array, "m"]:
         """Numbers of the windows, permuted."""
         key = jax.random.fold_in(key, epoch)
-        return jax.random.permutation(key, self.weighted(key, jnp.asarray(source.visited)))
+        return jax.random.permutation(key, self.select_visits(key, jnp.asarray(source.visited)))
 
     def draw(
         self, key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"]
@@ -104,8 +104,8 @@ class WindowTask(Task):
         windows, _ = batch
         stage = loss_stage(self.config.loss, step, self.steps_per_epoch)
         prediction, changed = apply_training(self.model, variables, batch)
-        found = losses(prediction, windows, self.config.loss, stage, predicted_axes(self.model))
-        figures = {"loss": found.total, "mse": found.mse, "nll": found.nll}
+        values = losses(prediction, windows, self.config.loss, stage, predicted_axes(self.model))
+        figures = {"loss": values.total, "mse": values.mse, "nll": values.nll}
         return BatchLosses(figures, changed.get("batch_stats", {}), jnp.bool_(True))
 
     def with_statistics(
@@ -116,20 +116,23 @@ class WindowTask(Task):
         order = statistics_order(key, source, self)
         return estimate_statistics(state, source, order, key, task=self)
 
-    def calibrated(self, state: TrainState, held_out: dict[str, WindowSource]) -> TrainState:
+    def calibrate_uncertainty(
+        self, state: TrainState, held_out: dict[str, WindowSource]
+    ) -> TrainState:
         if not has_statistics(state, "log_std", "log_factor"):
             return state
         stage = self.last_stage(state)
-        each = [validate(state, source, stage, task=self) for source in held_out.values()]
-        found = jax.tree.map(lambda *figures: sum(figures) / len(each), *each)
-        return calibrated(state, found, isotropic=self.config.model.equivariance != "none")
+        validations = [validate(state, source, stage, task=self) for source in held_out.values()]
+        mean = jax.tree.map(lambda *figures: sum(figures) / len(figures), *validations)
+        isotropic = self.config.model.equivariance != "none"
+        return calibrate_uncertainty(state, mean, isotropic)
 
     def figures_of(self, state: TrainState, held_out: WindowSource, key: PRNGKeyArray) -> Row:
-        found = validate(state, held_out, self.last_stage(state), task=self)
-        loss, mse, nll = (float(each) for each in found.losses)
+        validation = validate(state, held_out, self.last_stage(state), task=self)
+        loss, mse, nll = map(float, validation.losses)
         row: Row = {"val_loss": loss, "val_mse": mse, "val_nll": nll, "val_rmse": math.sqrt(mse)}
-        normalised = zip("xyz", found.axis_normalised, strict=True)
-        return row | {f"val_normalised/{axis}": float(each) for axis, each in normalised}
+        normalised = zip("xyz", validation.axis_normalised, strict=True)
+        return row | {f"val_normalised/{axis}": float(value) for axis, value in normalised}
 
     def last_stage(self, state: TrainState) -> Stage:
         """The stage of the step that led to `state`."""
@@ -169,8 +172,8 @@ def predicted_axes(model: nn.Module) -> int:
 def has_statistics(state: TrainState, *names: str) -> bool:
     """Whether the network has statistics of one of these names: "mean" of a normalisation,
     "log_std" or "log_factor" of an uncertainty that validation calibrates (`models.heads`)."""
-    found = jax.tree_util.tree_leaves_with_path(state.variables["batch_stats"])
-    return any(path[-1].key in names for path, _ in found)
+    leaves = jax.tree_util.tree_leaves_with_path(state.variables["batch_stats"])
+    return any(path[-1].key in names for path, _ in leaves)
 
 
 def statistics_order(
@@ -180,7 +183,7 @@ def statistics_order(
     those of an epoch, drawn from `key` alone."""
     optim = task.config.optim
     order_key, _ = jax.random.split(key)
-    visited = task.weighted(order_key, jnp.asarray(source.visited))
+    visited = task.select_visits(order_key, jnp.asarray(source.visited))
     size = optim.batch_size
     batches = min(-(-optim.statistics_windows // size), len(visited) // size)
     return jax.random.permutation(order_key, visited)[: batches * size]
@@ -270,15 +273,17 @@ def validate(
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
         windows = parallel.split(gather(source, parallel.split(which_weight[0]), config.data.seen))
-        each = jax.vmap(one_window)(model.apply(state.variables, windows.imu), windows)
-        return jax.tree.map(lambda x: jnp.tensordot(which_weight[1], x, 1), each)
+        figures = jax.vmap(one_window)(model.apply(state.variables, windows.imu), windows)
+        return jax.tree.map(lambda x: jnp.tensordot(which_weight[1], x, 1), figures)
 
     return jax.tree.map(
         lambda x: jnp.sum(x, axis=0) / count, jax.lax.map(one_batch, (which, weight))
     )
 
 
-def calibrated(state: TrainState, found: Validation, isotropic: bool = False) -> TrainState:
+def calibrate_uncertainty(
+    state: TrainState, validation: Validation, isotropic: bool = False
+) -> TrainState:
     """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that
     validation found with it.
 
@@ -288,7 +293,7 @@ def calibrated(state: TrainState, found: Validation, isotropic: bool = False) ->
     """
     mse, normalised = (
         axes.at[:2].set(axes[:2].mean()) if isotropic else axes
-        for axes in (found.axis_mse, found.axis_normalised)
+        for axes in (validation.axis_mse, validation.axis_normalised)
     )
 
     def fitted(path: tuple, leaf: jax.Array) -> jax.Array:

@@ -11,7 +11,7 @@ from gnio_jax.commands import app, console
 @pytest.fixture
 def gnio(monkeypatch, capsys):
     """What `gnio` prints, with these lines on its standard input."""
-    monkeypatch.setattr("gnio_jax.evaluation.plots.DOTS_PER_INCH", 30)
+    monkeypatch.setattr("gnio_jax.drawing.DOTS_PER_INCH", 30)
 
     def call(*words, lines=()):
         content = "\n".join(lines).encode("utf-8", "surrogateescape")

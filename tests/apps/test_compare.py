@@ -9,11 +9,11 @@ from gnio_jax import config as configuration
 from gnio_jax.apps import compare as comparison
 from gnio_jax.config import CompareConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept, tabulate
+from gnio_jax.evaluation import reuse, tabulate
 from tests.support.reports import LOST, report_of, write_report, write_run
 
 GROUPS = {"a": "ann", "b": "ann", "c": "bob"}
-FILTER = configuration.plain(TrainConfig().filter)
+FILTER = configuration.to_plain(TrainConfig().filter)
 
 
 def write(run, ates, name="synthetic_test_ekf", drop=(), groups=GROUPS, more=None, **settings):
@@ -48,8 +48,8 @@ def test_by_hand(runs, monkeypatch):
     found = compare(runs / "plain", runs / "new")
     plain, new = found.cells["ate"]
     assert [row.label for row in found.rows] == ["plain", "new"] and plain.difference is None
-    assert plain.mean.seeds == pytest.approx([8 / 3, 4.0])
-    assert new.mean.seeds == pytest.approx([7 / 3])
+    assert plain.summary.seeds == pytest.approx([8 / 3, 4.0])
+    assert new.summary.seeds == pytest.approx([7 / 3])
     difference = second(found)
     assert difference.mean == pytest.approx(-1.0) and difference.gain == pytest.approx(30.0)
     reach = 12.7062 * 4 / 3  # t of one degree of freedom
@@ -128,15 +128,17 @@ def test_names_without_a_seed_stand_for_all_seeds(tmp_path):
 
 
 def test_runs_are_evaluated_where_they_are_not_yet_and_read_once(runs, monkeypatch):
-    made, looked, look = [], [], kept.look
+    made, looked, look = [], [], reuse.find_existing
 
     def evaluate(config, progress, workers, **_):
         made.append((config.workdir, config.split, config.estimator, workers))
         name = config.workdir.removeprefix(f"{runs}/")
         write(runs / name, {"a": 4.0}, "synthetic_val_ekf", split="val")
 
-    monkeypatch.setattr(kept, "evaluate", evaluate)
-    monkeypatch.setattr(kept, "look", lambda asked: looked.append(asked.workdir) or look(asked))
+    monkeypatch.setattr(reuse, "evaluate", evaluate)
+    monkeypatch.setattr(
+        reuse, "find_existing", lambda asked: looked.append(asked.workdir) or look(asked)
+    )
     config = CompareConfig((f"{runs}/plain", f"{runs}/new"), split="val", metrics=("ate",))
     found = comparison.compare(config, workers=3)
     names = [f"{runs}/{name}" for name in ("plain_s0", "plain_s1", "new_s0")]

@@ -25,7 +25,7 @@ from tests.support.rerun_files import columns_of
 CONFIG = TrainConfig(
     data=DataConfig(rate=50.0),
     model=ModelConfig(name="tiny"),
-    filter=FilterSettings(zero_velocity_std=0.02),
+    filter=FilterSettings(measurements={"zero_velocity": {"std": 0.02}}),
 )
 RATE = 50.0
 PATIENCE = 120
@@ -134,8 +134,8 @@ def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monk
     calibrated = found._replace(config=dataclasses.replace(found.config, filter=options))
     passed = []
 
-    def noted(*_, considered, **__):
-        passed.append(considered)
+    def noted(_, ekf, **__):
+        passed.append(ekf.considered)
         return Tracker.__new__(Tracker)
 
     monkeypatch.setattr(live, "Tracker", noted)

@@ -190,27 +190,6 @@ def test_what_is_damaged(package, tmp_path, monkeypatch):
     refused(tmp_path / "broken.zip", "cannot be read")
 
 
-def test_a_package_of_the_first_version(run, package):
-    """Its settings and its card are files, whose SHA-256 the manifest has."""
-    manifest = json.loads((package / "manifest.json").read_text())
-    wanted, card = packages.load_pretrained(package), manifest.pop("card")
-    (package / "config.yaml").write_text(configuration.text(wanted.config))
-    (package / "README.md").write_text("\n".join(card))
-    kept = "format name network data license epoch step made_by".split()
-    about = {name: manifest[name] for name in kept} | {"version": 1, "files": {}}
-    for path in package.iterdir():
-        content = path.read_bytes()
-        digest = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-        about["files"] |= {path.name: digest} if path.name != "manifest.json" else {}
-    (package / "manifest.json").write_text(json.dumps(about))
-    found = packages.load_pretrained(package)
-    assert found.config == wanted.config and found.step == wanted.step
-    jax.tree.map(np.testing.assert_array_equal, found.variables, wanted.variables)
-    assert packages.card_of(package).splitlines() == card
-    (package / "config.yaml").write_text("seed: 1")
-    refused(package, "'config.yaml' is not the file", "SHA-256")
-
-
 def test_names_are_found_and_listed(published, run, monkeypatch, tmp_path, gnio):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(packages, "SHIPPED", tmp_path)
@@ -291,8 +270,8 @@ def test_the_shipped_network_answers():
     assert np.linalg.norm(prediction.displacement) < 0.1
     # Training starts from it by its name.
     config = dataclasses.replace(configuration.load("pedestrian"), init_from="pedestrian")
-    first = checkpoint.initial_run(config, gnio_jax.load_pretrained)
+    first = checkpoint.load_initial_network(config, gnio_jax.load_pretrained)
     assert first is not None and first.step > 0
     other = dataclasses.replace(config, model=dataclasses.replace(config.model, width=8))
     with pytest.raises(InputError, match=r"pedestrian: its model.width is 32.* describe the same"):
-        checkpoint.initial_run(other, gnio_jax.load_pretrained)
+        checkpoint.load_initial_network(other, gnio_jax.load_pretrained)

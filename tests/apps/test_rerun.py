@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.apps import rerun
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Recording
+from gnio_jax.evaluation import PreparedRecording
 from tests.support.estimates import estimate, with_covariance
 from tests.support.rerun_files import columns_of
 
@@ -18,8 +18,10 @@ def recording_of(walk, rate=50.0):
     stamps = walk.trajectory.time
     time = np.arange(round(rate * (stamps[-1] - stamps[0]))) / rate
     gyro, accel = (np.sin(np.outer(time, [1.0, 2.0, 3.0]) + k) for k in (0.0, 1.0))
-    unseen = dict.fromkeys(Recording._fields)
-    return Recording(**unseen | {"name": walk.name, "time": stamps, "gyro": gyro, "accel": accel})
+    unseen = dict.fromkeys(PreparedRecording._fields)
+    return PreparedRecording(
+        **unseen | {"name": walk.name, "time": stamps, "gyro": gyro, "accel": accel}
+    )
 
 
 def seconds(column):

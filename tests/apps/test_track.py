@@ -7,16 +7,18 @@ import dataclasses
 import importlib.util
 import json
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.apps import packages
-from gnio_jax.apps.importing import Imported
+from gnio_jax.apps.importing import Imported, import_recording
 from gnio_jax.apps.track import Summary, _warnings, track
-from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, EvaluateConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.resampling import resample
+from gnio_jax.evaluation import evaluate
 from gnio_jax.evaluation.trajectory import read_tum
 from gnio_jax.types import Sequence, Waypoints
 from tests.support import bag_files, known_walk, logger_files, tiny_run
@@ -31,7 +33,7 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("home") / "runs"
     with tiny_run.known():
         settings = changed(considered={"raw_gyro_bias": 0.02})
-        settings = dataclasses.replace(settings, zero_velocity_std=0.02)
+        settings = dataclasses.replace(settings, measurements={"zero_velocity": {"std": 0.02}})
         tiny_run.save(folder / "mute", dataclasses.replace(CONFIG, filter=settings), size=0.0)
         tiny_run.save(folder / "walker", CONFIG)
         yield folder
@@ -255,14 +257,14 @@ def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, m
     figures = shown[0].figures["part"]
     assert figures["ate"] == summary["errors"]["ate"]
     assert figures["path_length"] == summary["path_length"] != summary["errors"]["path_length"]
-    assert shown[0].about["reference"].startswith("known for 24% of the time")
+    assert shown[0].facts["reference"].startswith("known for 24% of the time")
 
 
 def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monkeypatch):
-    given = {}
+    filters = []
 
-    def prepare(_, windows, std, **how):
-        given.update(how, std=std)
+    def prepare(_, windows, ekf, **options):
+        filters.append(ekf)
         raise InterruptedError
 
     monkeypatch.setattr("gnio_jax.apps.track.prepare", prepare)
@@ -273,7 +275,7 @@ def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monk
     walk = Imported(without_poses("walk", np.arange(620) / 100), (), ())
     with pytest.raises(InterruptedError):
         track(walk, weights, tmp_path / "t")
-    assert given["std"].velocity == 0.7 and given["raw_gyro_bias"] == 0.02
+    assert filters[0].start.velocity == 0.7 and filters[0].raw_gyro_bias == 0.02
 
 
 FIGURES = (0.0, 100.0, 80.0, 1.0, 2.0, 0.0, 0.0, 0.5, 1.0)
@@ -299,3 +301,32 @@ SUMMARY = Summary("walk", "net", "walks", *FIGURES, {}, (), (), "")
 def test_what_is_worth_a_warning(changes, words):
     found = _warnings(SUMMARY._replace(**changes), own_rate=100.0, rate=100.0)
     assert [line[: len(words)] for line in found] == [words] if words else found == []
+
+
+@pytest.mark.parametrize("network", ["mute", "walker"])
+def test_evaluation_and_track_of_one_walk_are_equal_to_the_bit(runs, tmp_path, network):
+    """From the same start: what is measured is what is tracked, with the measurements that the
+    settings list."""
+    time, folder = np.arange(0, 6.02, 0.02), tmp_path / "walks"
+    folder.mkdir()
+    orientation = known_walk.attitude(time).as_quat(scalar_first=True)
+    columns = [time, known_walk.rate(time), known_walk.force(time), orientation]
+    names = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z,qw,qx,qy,qz,px,py,pz"
+    rows = np.column_stack([*columns, known_walk.position(time)])
+    np.savetxt(folder / "walk.csv", rows, delimiter=",", header=names, comments="", fmt="%.9f")
+    walk = import_recording(folder / "walk.csv")
+    tracked = track(walk, packages.choose(runs / network), tmp_path / "t").estimate
+    config = EvaluateConfig(
+        workdir=str(runs / network),
+        dataset="csv",
+        data_root=str(folder),
+        init="static",
+        gyro_bias="rest",
+        plots=False,
+    )
+    (evaluated,) = evaluate(config).estimates
+    assert np.ptp(tracked.trajectory.position) > 0.01
+    for part in ("trajectory", "filtered", "states"):
+        jax.tree.map(
+            np.testing.assert_array_equal, getattr(tracked, part), getattr(evaluated, part)
+        )

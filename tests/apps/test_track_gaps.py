@@ -10,19 +10,19 @@ import pytest
 from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation import estimate, no_displacements, prepare
-from gnio_jax.filtering import InitialStd
-from gnio_jax.filtering.settings import filter_setup
+from gnio_jax.filtering import InitialStd, make_filter
 from gnio_jax.types import Sequence
 from tests.support import known_walk
 
 RATE, SECONDS = 50.0, 5.0
 WINDOWS = DataConfig(rate=RATE)
-SETTINGS = FilterSettings(zero_velocity_std=0.02, gap_gyro_std=0.8, gap_accel_std=0.8)
-FILTER = filter_setup(WINDOWS, SETTINGS)._replace(
-    initial_std=InitialStd(
-        1e-3, 1e-3, velocity=0.01, position=0.01, gyro_bias=1e-5, accel_bias=1e-3
-    )
+SETTINGS = FilterSettings(
+    start=InitialStd(1e-3, 1e-3, velocity=0.01, position=0.01, gyro_bias=1e-5, accel_bias=1e-3),
+    measurements={"zero_velocity": {"std": 0.02}},
+    gap_gyro_std=0.8,
+    gap_accel_std=0.8,
 )
+FILTER = make_filter(WINDOWS, SETTINGS)
 """Sure of its start, so that what it doubts is the hole."""
 HOLE = (1.5, 4.0)
 """s: the samples between are missing."""
@@ -63,7 +63,7 @@ def nees(prepared):
 
 @pytest.mark.slow
 def test_the_true_end_of_a_hole_lies_within_what_the_filter_says():
-    prepared, _ = prepare(recordings(), WINDOWS, FILTER.initial_std)
+    prepared, _ = prepare(recordings(), WINDOWS, FILTER)
     found = nees(prepared)
     assert 0.4 < found.mean() < 1.6 and (2 * found < 11.8).mean() > 0.97  # 99.7 % of χ² with 2
     # The lines across the hole taken for measurements:

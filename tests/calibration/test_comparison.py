@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import calibration, filtering
 from gnio_jax.calibration import comparison
 from gnio_jax.calibration.comparison import Change, Effect
-from gnio_jax.calibration.fit import Considered, Fit
+from gnio_jax.calibration.fit import ConsiderFit, InnovationFit
 from gnio_jax.commands import app
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings
-from gnio_jax.evaluation import Displacements, Estimate, Recording, Trajectory
+from gnio_jax.evaluation import Displacements, PreparedRecording, SequenceEstimate, Trajectory
 from gnio_jax.evaluation.prepare import Start
-from gnio_jax.filtering.settings import filter_config
 from tests.support.filter_settings import changed
 from tests.support.walks import simulate
 
@@ -28,11 +27,13 @@ def recording(name, time, position, rotation, gyro, accel, start):
     quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1, axis=1)
     reference = Trajectory(time, position, quaternion)
     nothing = np.full((1, 3), np.nan)
-    return Recording(name, name, "", time, gyro, accel, None, start, None, reference, nothing, ())
+    return PreparedRecording(
+        name, name, "", time, gyro, accel, None, start, None, reference, nothing, ()
+    )
 
 
 def simulated():
-    """A walk with a raw gyro and one with another, and their displacements."""
+    """A walk with a raw gyro and one with a compensated gyro, and their displacements."""
     noise, std = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4), filtering.InitialStd(gyro_bias=5e-3)
     runs = simulate(7, 2, STRIDES, N, CLONES, 1 / DATA.rate, noise, std, SIGMA)
     time, walks, displacements = DATA.stride_seconds * np.arange(STRIDES + 1), [], []
@@ -50,12 +51,12 @@ def simulated():
 
 def filtered(walk, displacement, settings):
     """Positions and attitudes of the filter, with its first ones."""
-    config, start = filter_config(DATA, settings), walk.start
+    ekf, start = filtering.make_filter(DATA, settings), walk.start
     level = settings.raw_gyro_bias if start.raw_gyro else settings.start.gyro_bias
     pose = start.rotation, start.velocity, start.position, start.gyro_bias, 0
-    state = filtering.initial_state(config, *pose, settings.start, level)
+    state = filtering.initial_state(ekf, *pose, level)
     signals = walk.gyro, walk.accel, *displacement[:2]
-    history = filtering.run_filter(state, *signals, config, settings.noise)[1]
+    history = filtering.run_filter(ekf, state, *signals)[1]
     rotation = np.concatenate([start.rotation[None], history.rotation])
     return np.concatenate([start.position[None], history.position]), Rotation.from_matrix(rotation)
 
@@ -76,7 +77,7 @@ def errors(walk, position, attitude):
 
 
 def test_both_filters_run_as_their_settings_say():
-    """The start has their uncertainty too, and nothing is correlated before the calibration."""
+    """The start has their uncertainty, and no error is correlated before the calibration."""
     walks, displacements = simulated()
     before = changed(noise={"gyro_density": 1e-3, "measurement_scale": 9.0})
     before = dataclasses.replace(before, raw_gyro_bias=0.05)
@@ -103,7 +104,9 @@ def along_x(speeds, diverged=()):
     for number, speed in enumerate(speeds):
         position = time[:, None] * [1.0, 0.0, 0.0]
         path = np.where((time[:, None] > 5) & (number in diverged), np.nan, speed * position)
-        yield Estimate("walk", *(Trajectory(time, points, level) for points in (path, position)))
+        yield SequenceEstimate(
+            "walk", *(Trajectory(time, points, level) for points in (path, position))
+        )
 
 
 def test_a_mean_is_over_the_walks_on_which_neither_filter_diverges(monkeypatch):
@@ -167,7 +170,10 @@ def test_an_error_that_grows_is_a_warning(metric, before, after, figures):
     ],
 )
 def test_a_group_of_fewer_than_five_recordings_is_a_warning(raw, others, few):
-    fit, worse = Fit(FilterSettings(), 0.0, 0.0, 3, ("the fit stopped",)), Change(1.0, 2.0)
+    fit, worse = (
+        InnovationFit(FilterSettings(), 0.0, 0.0, 3, ("the fit stopped",)),
+        Change(1.0, 2.0),
+    )
     result = calibration.Calibration(
         FilterSettings(),
         fit,
@@ -182,13 +188,13 @@ def test_a_group_of_fewer_than_five_recordings_is_a_warning(raw, others, few):
     assert [line.split(":")[0] for line in lines] == few
 
 
-def test_the_command_shows_what_diverged_and_what_the_recordings_are(monkeypatch, tmp_path, capsys):
+def test_the_command_shows_divergences_and_recordings(monkeypatch, tmp_path, capsys):
     errors = {"ate": Change(3.05, 11.25), "path_length_ratio": Change(0.65, None)}
-    fit = Fit(FilterSettings(), 0.0, 0.0, 3)
+    fit = InnovationFit(FilterSettings(), 0.0, 0.0, 3)
     result = calibration.Calibration(
         FilterSettings(),
         fit,
-        Considered(FilterSettings(), 1.0, 1.0),
+        ConsiderFit(FilterSettings(), 1.0, 1.0),
         Effect(errors, Change(2, 1), 12),
         12,
         3,

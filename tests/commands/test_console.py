@@ -13,6 +13,8 @@ from rich.table import Table
 from gnio_jax.commands import console
 from gnio_jax.errors import InputError
 
+ROOT = Path(__file__).parents[2]
+
 
 @pytest.fixture(autouse=True)
 def handlers(monkeypatch):
@@ -20,6 +22,7 @@ def handlers(monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
     for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
         monkeypatch.setenv(name, os.environ.get(name, "0"))
+    monkeypatch.setenv("MPLBACKEND", "agg")
     yield
     signal.signal(signal.SIGTERM, before)
 
@@ -52,6 +55,32 @@ def test_run_ends_in_one_line_and_a_status(main, status, line, capsys):
             console.run(main)
         assert left.value.code == status
     assert capsys.readouterr() == ("", line)
+
+
+def test_variables_of_jax_and_matplotlib_do_not_end_in_a_traceback(monkeypatch, capsys):
+    """A platform that is not here, the backend of a notebook, and the search for NaN."""
+
+    def traced():
+        raise FloatingPointError("invalid value (nan) encountered in stage")
+
+    with pytest.raises(FloatingPointError):
+        console.run(traced)
+    monkeypatch.setenv("JAX_DEBUG_NANS", "1")
+    with pytest.raises(SystemExit) as end:
+        console.run(traced)
+    assert end.value.code == 2 and "JAX_DEBUG_NANS: gnio marks missing" in capsys.readouterr().err
+    environment = os.environ | {"JAX_PLATFORMS": "cuda"}
+    commands = "from gnio_jax.commands.app import main; import sys; main(sys.argv[1:])"
+    for words, status in ((["doctor"], 0), (["track", "examples/walk.csv", "--out", "no"], 2)):
+        line = [sys.executable, "-c", commands, *words]
+        result = subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True)
+        output = result.stdout + result.stderr
+        assert result.returncode == status, output
+        assert "JAX has no device of the platform 'cuda' here; unset it" in output
+        assert "Traceback" not in output
+    monkeypatch.setenv("MPLBACKEND", "module://a_notebook.backend")
+    console.run(lambda: None)
+    assert os.environ["MPLBACKEND"] == "agg"
 
 
 def test_names_of_files_are_no_controls_of_the_terminal(capsys):

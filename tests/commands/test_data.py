@@ -13,7 +13,7 @@ from matplotlib import image
 from gnio_jax import data
 from gnio_jax.apps.importing import read_imported
 from gnio_jax.commands import app
-from gnio_jax.data import loading
+from gnio_jax.data import conversion
 from gnio_jax.data.dataset import RecordingSource
 from gnio_jax.data.readers import DATASETS, tlio
 from gnio_jax.data.readers import csv_files as csv
@@ -183,7 +183,7 @@ def test_convert_keeps_every_figure_and_the_splits(root, capsys):
 
 
 def test_a_conversion_is_whole_or_not_there(root, monkeypatch):
-    real, converted, reads, read = loading.write_hdf5, root.parent / "converted", [], tlio.read
+    real, converted, reads, read = conversion.write_hdf5, root.parent / "converted", [], tlio.read
     monkeypatch.setattr(tlio, "read", lambda folder: reads.append(folder.name) or read(folder))
 
     def stopped(path, sequence):
@@ -192,12 +192,12 @@ def test_a_conversion_is_whole_or_not_there(root, monkeypatch):
         real(path, sequence)
 
     command = ["data", "convert", "tlio", "converted", "--data-root", str(root)]
-    monkeypatch.setattr(loading, "write_hdf5", stopped)
+    monkeypatch.setattr(conversion, "write_hdf5", stopped)
     with pytest.raises(SystemExit) as left:
         app.main(command)
     assert left.value.code == 130 and "also" in reads
     assert sorted(path.name for path in root.parent.iterdir()) == ["heads"]
-    monkeypatch.setattr(loading, "write_hdf5", real)
+    monkeypatch.setattr(conversion, "write_hdf5", real)
     run(*command)
     files = {path.name: path.read_bytes() for path in converted.iterdir()}
 
@@ -251,7 +251,7 @@ def test_a_piece_never_takes_the_file_of_another_recording(tmp_path):
         about = dataclasses.replace(data.get("tlio"), recordings=lambda *_, given=given: given)
         problem = rf"'{of}.*' and '{of}.*' would be one file, {file}\.h5"
         with pytest.raises(InputError, match=problem):
-            loading.convert(about, tmp_path, tmp_path / "out", "test")
+            conversion.convert(about, tmp_path, tmp_path / "out", "test")
         assert not (tmp_path / "out").exists()
 
 
@@ -338,7 +338,7 @@ def test_a_mistake_is_one_line_and_status_2(root, place, capsys, arguments, expe
     (place / "taken" / "train.txt").write_text("a\n")
     (place / "folder.h5").mkdir()
     (place / "ours").mkdir()
-    (place / "ours" / loading.CONVERSION).write_text('{"dataset": "tlio", "rate": 50.0}')
+    (place / "ours" / conversion.CONVERSION).write_text('{"dataset": "tlio", "rate": 50.0}')
     before = sorted(place.rglob("*"))
     with pytest.raises(SystemExit) as left, warnings.catch_warnings():
         app.main(["data", *arguments])

@@ -55,7 +55,7 @@ def test_help_explains_every_option(words, command, capsys):
     text = shown(capsys, *words, "-H")
     assert "None" not in text  # what is not given is told in words
     if words == ("train",):
-        assert all(name in text for name in config.names())
+        assert all(name in text for name in config.experiment_names())
         known = "--optim.epochs INT Passes over the training windows. (default: 200)"
         assert known in joined(text)
     found = options.options_of(options.options_type(command))

@@ -74,4 +74,9 @@ def test_a_config_is_found_by_its_name_from_anywhere(tmp_path, monkeypatch):
         assert f"{wrong}: no such config file; did you mean '{hint}'?" in told
     (tmp_path / "quickstart").mkdir()
     assert parse("--config", "quickstart").model.width == 16
-    assert set(config.names()) >= {"gnio_tlio", "gnio_oxiod", "gnio_oxiod_small", "quickstart"}
+    assert set(config.experiment_names()) >= {
+        "gnio_tlio",
+        "gnio_oxiod",
+        "gnio_oxiod_small",
+        "quickstart",
+    }

@@ -65,7 +65,7 @@ def test_every_config_of_the_repository_is_valid_and_names_its_command():
     commands |= {name: f"gnio tables comparison --base tables/{name}" for name in budgets}
     for name, file in (files | budgets).items():
         config = configuration.validate(configuration.load(file), str(file))
-        assert configuration.parse(configuration.text(config), "its own text") == config
+        assert configuration.parse(configuration.to_yaml(config), "its own text") == config
         assert commands[name] in file.read_text()
         model, optim = config.model, config.optim
         same_budget = (model.name, model.width, optim.batch_size) == ("gnio", 16, 128)

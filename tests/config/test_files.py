@@ -1,7 +1,6 @@
-"""Strict YAML, checks, settings of the command line and files of earlier versions."""
+"""Strict YAML, checks and settings of the command line."""
 
 import dataclasses
-import math
 import os
 import threading
 from pathlib import Path
@@ -15,15 +14,12 @@ from gnio_jax.commands.options import Call
 from gnio_jax.config import (
     CorrelatedError,
     FilterSettings,
-    InitialStd,
     NoiseModel,
     ThroughFilter,
     TrainConfig,
 )
 from gnio_jax.errors import InputError
 from tests.support.filter_settings import changed
-
-DEGREE = math.pi / 180  # as the earlier version multiplied
 
 
 def read(text):
@@ -131,7 +127,7 @@ def test_numbers_are_those_of_yaml_1_2():
 def test_text_that_looks_like_something_else_survives_its_file():
     for name in ("1e-3", "010", "yes", "null", "2020-01-01", "~", "a: b", "1:30"):
         config = TrainConfig(workdir=name, filter=changed(noise={"correlation": CorrelatedError()}))
-        assert read(configuration.text(config)) == config
+        assert read(configuration.to_yaml(config)) == config
 
 
 def experiment_of(*words):
@@ -215,7 +211,7 @@ def test_words_of_a_command_line_are_values():
         (str | tuple[str, ...], ["one", "two"], ("one", "two")),
         (Path, ["010"], Path("010")),
     ):
-        found = configuration.value_from_words(hint, words, "--x")
+        found = configuration.parse_words(hint, words, "--x")
         assert found == value and type(found) is type(value)
     for hint, words, problem in (
         (int, ["3.5"], "--x: must be a whole number, found 3.5"),
@@ -225,7 +221,7 @@ def test_words_of_a_command_line_are_values():
         (tuple[int, ...], ["1", "a"], "--x: must be a whole number, found 'a'"),
     ):
         with pytest.raises(InputError) as refused:
-            configuration.value_from_words(hint, words, "--x")
+            configuration.parse_words(hint, words, "--x")
         assert str(refused.value) == problem
 
 
@@ -234,48 +230,3 @@ def test_settings_of_a_program_may_be_numbers_of_numpy():
     assert configuration.validate(config) is config
     with pytest.raises(InputError, match=r"config: field 'filter\.noise\.gyro_density'"):
         configuration.validate(TrainConfig(filter=changed(noise={"gyro_density": np.float32(0)})))
-
-
-RECORDED = Path(__file__).parents[1] / "recorded" / "config" / "earlier_version.yaml"
-OLD = RECORDED.read_text(encoding="utf-8")
-
-
-def test_the_config_of_an_old_run_is_the_same_experiment():
-    found = read(OLD)
-    assert (found.dataset, found.workdir, found.seed) == ("oxiod", "runs/oxiod", 3)
-    assert found.filter == FilterSettings(
-        NoiseModel(
-            0.02,
-            0.03,
-            1.021e-06,
-            0.0104,
-            (0.9455, 0.8488, 0.8295),
-            1.073,
-            CorrelatedError(0.8971, 3.281),
-        ),
-        InitialStd(2.0 * DEGREE, 0.1 * DEGREE, 0.7, 0.001, 0.0002, 0.02),
-        configuration.ConsideredStd(0.003941, 0.1742, 4.273 * DEGREE, 0.03128),
-        mahalanobis_fail_scale=2.0,
-        window_rotation="tlio",
-    )
-    assert found.augment.noise == (0.001, 0.01) and found.loss.outlier_sigmas == 10.0
-    assert (found.model.width, found.optim.epochs, found.data.train_split) == (16, 24, "train")
-    assert read(configuration.text(found)) == found
-    white = read(OLD.replace("share: 0.8971", "share: 0.0"))
-    assert white.filter.noise.correlation is None
-    folded = OLD.replace("folds: 1, left_out: 0", "folds: 4, left_out: 1")
-    assert read(folded).data.train_split == "train-1of4"
-
-
-def test_an_old_file_that_asks_for_what_is_gone_is_refused():
-    for before, after, problem in (
-        ("scale_error_std: 0.0", "scale_error_std: 0.1", "'filter.scale_error_std' is 0.1, and"),
-        ("ema_decay: 0.0", "ema_decay: 0.99", "field 'optim.ema_decay' is 0.99, and there is no"),
-        ("tilt_std_degrees: 2.0", "tilt_std_degrees: a", "'filter.tilt_std_degrees' must be a num"),
-        ("gyro_density: 0.02", "gyro_density: -1.0", "'filter.noise.gyro_density' must be posit"),
-        ("yaw_std_degrees: 0.1", f"yaw_std_degrees: 1{'0' * 400}", "is larger than any number"),
-        (OLD, "checkpoint_every_seconds: 600.0", "unknown field 'checkpoint_every_seconds'"),
-    ):
-        with pytest.raises(InputError) as refused:
-            read(OLD.replace(before, after))
-        assert problem in str(refused.value)

@@ -6,11 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import evaluation
 from gnio_jax.config import DataConfig
-from gnio_jax.data import windows
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.validation import validate
 from gnio_jax.errors import InputError
+from gnio_jax.training import windows
 from gnio_jax.types import Waypoints
 from tests.support import known_walk as walk
 

@@ -14,15 +14,11 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data import hdf5, registry
+from gnio_jax.data.conversion import check_recording, find_recordings
 from gnio_jax.data.dataset import RecordingSource, Refusal
-from gnio_jax.data.loading import (
-    check_recording,
-    find_recordings,
-    in_processes,
-    read_recording,
-    read_split,
-)
+from gnio_jax.data.loading import read_recording, read_split
 from gnio_jax.data.readers import DATASETS
+from gnio_jax.data.workers import in_processes
 from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
 from tests.support.circle import circle

@@ -22,7 +22,7 @@ def test_a_header_is_the_first_line_or_the_last_comment_above_numbers(tmp_path):
     np.testing.assert_array_equal(read_text(path).take("a", "b"), [[1.0, 2.0]])
     path.write_text("# one, two\n1,5;2\n3,5;4\n")
     np.testing.assert_array_equal(
-        read_text(path, ";", header=False, decimal=",").take(0, 1), [[1.5, 2.0], [3.5, 4.0]]
+        read_text(path, ";", header=False).take(0, 1), [[1.5, 2.0], [3.5, 4.0]]
     )
 
 

@@ -7,10 +7,10 @@ from gnio_jax.config import DataConfig, TrainConfig
 from gnio_jax.data import loading
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.waypoints import level_attitude, with_poses
-from gnio_jax.data.windows import window_source
 from gnio_jax.numerics import rotations
 from gnio_jax.reporting import Lines
 from gnio_jax.training.recordings import read_split
+from gnio_jax.training.windows import window_source
 from gnio_jax.types import Waypoints
 from tests.support.surveyor import RATE, survey
 

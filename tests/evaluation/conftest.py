@@ -3,15 +3,16 @@
 import pytest
 
 from gnio_jax.data.simulated import walks as simulated
+from tests.support import tiny_run
 from tests.support.estimates import estimate, reported
-from tests.support.estimators import RATE
+from tests.support.estimators import RATE, TRAINED
 from tests.support.trajectories import lost
 
 
 @pytest.fixture(autouse=True)
 def few_dots(monkeypatch):
     """Pictures are drawn in a quarter of the time."""
-    monkeypatch.setattr("gnio_jax.evaluation.plots.DOTS_PER_INCH", 30)
+    monkeypatch.setattr("gnio_jax.drawing.DOTS_PER_INCH", 30)
 
 
 @pytest.fixture
@@ -35,6 +36,13 @@ def clean():
     return simulated.pedestrian(5, 5, "pocket", 15.0, RATE, imu_errors=False)
 
 
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The folder of a run of the smallest network."""
+    with tiny_run.known():
+        yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", TRAINED)
+
+
 @pytest.fixture(scope="session")
 def estimates():
     return [
@@ -45,8 +53,8 @@ def estimates():
 
 
 @pytest.fixture(scope="session")
-def made(estimates):
-    groups = {each.name: each.name[:4] for each in estimates}
+def made_report(estimates):
+    groups = {estimate.name: estimate.name[:4] for estimate in estimates}
     return reported(estimates, groups, {"blind": ["start: rough"]}, {"short": "0.5 s"})
 
 
@@ -54,6 +62,6 @@ def made(estimates):
 def with_divergence(estimates):
     """The walks again, the second lost after 20 s, and a third that is whole."""
     second = estimates[1]._replace(trajectory=lost(estimates[1].trajectory, 200))
-    of = [estimates[0], second, estimates[2], estimate("room 3", 3)]
+    walks = [estimates[0], second, estimates[2], estimate("room 3", 3)]
     groups = {"room 1/walk": "A", "room 1:walk": "B", "blind": "C", "room 3": "D"}
-    return of, reported(of, groups)
+    return walks, reported(walks, groups)

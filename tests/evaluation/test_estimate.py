@@ -4,6 +4,8 @@ perfect inputs.
 The filter runs over two recordings of one length at a time: two programs serve nearly all tests.
 """
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from gnio_jax import evaluation
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.evaluation import infer, metrics
 from gnio_jax.evaluation.estimate import PERFECT_STD, _batches, mean_over_windows, perfect
-from gnio_jax.filtering import ConsideredStd, CorrelatedError, filter_setup
+from gnio_jax.filtering import ConsideredStd, CorrelatedError, make_filter
 from tests.support.estimators import (
     CONFIG,
     NETWORK,
@@ -35,11 +37,11 @@ from tests.support.filter_settings import changed
 
 def test_imu_only_is_strap_down_integration(walks):
     recordings = ready(walks[:2], gyro_bias="reference")
-    (found, _), bias = imu_only(recordings), recordings[0].start.gyro_bias
+    (estimate, _), bias = imu_only(recordings), recordings[0].start.gyro_bias
     rotation = rotations(walks[0].orientation[0]).as_matrix()
     velocity, position = walks[0].velocity[0], walks[0].position[0]
     dt, gravity, path = 1 / RATE, np.array([0, 0, -9.81]), [(position, velocity, rotation)]
-    for k in range(CONFIG.stride * (len(found.trajectory.time) - 1)):
+    for k in range(CONFIG.stride * (len(estimate.trajectory.time) - 1)):
         step = rotation @ walks[0].accel[k] * dt
         position = position + velocity * dt + 0.5 * step * dt + 0.5 * gravity * dt**2
         velocity = velocity + step + gravity * dt
@@ -48,24 +50,24 @@ def test_imu_only_is_strap_down_integration(walks):
             path.append((position, velocity, rotation))
     assert len(path) == 150
     positions, velocities, attitudes = map(np.stack, zip(*path, strict=True))
-    np.testing.assert_allclose(found.trajectory.position, positions, atol=1e-9)
-    np.testing.assert_allclose(found.states.velocity, velocities, atol=1e-9)
-    turned = rotations(found.trajectory.orientation).as_matrix()
+    np.testing.assert_allclose(estimate.trajectory.position, positions, atol=1e-9)
+    np.testing.assert_allclose(estimate.states.velocity, velocities, atol=1e-9)
+    turned = rotations(estimate.trajectory.orientation).as_matrix()
     np.testing.assert_allclose(turned, attitudes, atol=1e-10)
     rows = slice(0, len(path) * CONFIG.stride, CONFIG.stride)
-    np.testing.assert_array_equal(found.trajectory.time, walks[0].time[rows])
-    np.testing.assert_array_equal(found.reference.position, walks[0].position[rows])
-    np.testing.assert_allclose(found.states.gyro_bias, np.tile(bias, (150, 1)), rtol=1e-12)
-    assert not found.states.accel_bias.any() and np.isnan(found.states.innovation).all()
-    variance = np.einsum("nii->ni", found.filtered.covariance)
-    np.testing.assert_allclose(found.states.std[:, 6:9] ** 2, variance, rtol=1e-6)
-    assert np.isnan(found.filtered.accepted).all() and found.states.std.shape == (150, 15)
+    np.testing.assert_array_equal(estimate.trajectory.time, walks[0].time[rows])
+    np.testing.assert_array_equal(estimate.reference.position, walks[0].position[rows])
+    np.testing.assert_allclose(estimate.states.gyro_bias, np.tile(bias, (150, 1)), rtol=1e-12)
+    assert not estimate.states.accel_bias.any() and np.isnan(estimate.states.innovation).all()
+    variance = np.einsum("nii->ni", estimate.filtered.covariance)
+    np.testing.assert_allclose(estimate.states.std[:, 6:9] ** 2, variance, rtol=1e-6)
+    assert np.isnan(estimate.filtered.accepted).all() and estimate.states.std.shape == (150, 15)
 
 
-def test_integration_against_a_loop(walks):
-    """Before all windows, which begin after the context of the first, it moves as that does."""
+def test_the_sum_of_displacements_equals_a_loop(walks):
+    """The strides in the context of the first window move as that window does."""
     recordings = ready(walks[:1], orientation="reference")
-    (found,), (predicted,) = summed(recordings), infer(NETWORK, recordings, CONFIG)
+    (estimate,), (predicted,) = summed(recordings), infer(NETWORK, recordings, CONFIG)
     turns = rotations(walks[0].orientation).as_matrix()
     context, last = CONFIG.context // CONFIG.stride, recordings[0].strides - 10
     position, path = walks[0].position[0], [walks[0].position[0]]
@@ -77,16 +79,16 @@ def test_integration_against_a_loop(walks):
         ]
         position = position + np.mean(moves, axis=0)
         path.append(position)
-    np.testing.assert_allclose(found.trajectory.position, path, atol=1e-9)
-    np.testing.assert_array_equal(found.displacements.value[1:], predicted.value)
-    assert np.isnan(found.displacements.value[: 10 + context]).all()
-    assert found.states is None and found.filtered is None
-    (still,) = evaluation.never_moves([found])
+    np.testing.assert_allclose(estimate.trajectory.position, path, atol=1e-9)
+    np.testing.assert_array_equal(estimate.displacements.value[1:], predicted.value)
+    assert np.isnan(estimate.displacements.value[: 10 + context]).all()
+    assert estimate.states is None and estimate.filtered is None
+    (still,) = evaluation.never_moves([estimate])
     assert (still.trajectory.position == walks[0].position[0]).all()
     assert metrics.measure(still.trajectory, still.reference).values["path_length_ratio"] == 0
 
 
-def test_a_stride_without_a_window_goes_on_as_before():
+def test_a_stride_without_a_window_repeats_the_movement_before():
     nan = np.nan
     steps = np.array([nan, nan, 1, 1, nan, nan, nan, 2])[:, None] * np.ones(3)
     np.testing.assert_allclose(mean_over_windows(steps, 2)[:, 0], [1, 1, 1, 1, 1, 1, 1, 2, 2])
@@ -103,31 +105,34 @@ def test_a_stride_without_a_window_goes_on_as_before():
     ],
 )
 def test_perfect_displacements_leave_little_error(walks, how, filtered, ate):
-    """Half a window ahead or behind would be 0.6 m."""
-    for found in with_truth(ready(walks[:2], gyro_bias="reference", **how), filtered=filtered):
-        values = metrics.measure(found.trajectory, found.reference).values
+    """An error of half a window in time would be 0.6 m."""
+    for estimate in with_truth(ready(walks[:2], gyro_bias="reference", **how), filtered=filtered):
+        values = metrics.measure(estimate.trajectory, estimate.reference).values
         assert values["ate"] < ate and values["path_length_ratio"] == pytest.approx(1, abs=0.06)
 
 
-def test_true_displacements_lack_nothing_that_was_calibrated(walks):
+def test_the_filter_of_true_displacements_ignores_the_calibration(walks):
     recordings = ready(walks[:2], gyro_bias="reference")
     noise = {"std_factor": (3.0, 1.0, 1.0), "measurement_scale": 40.0}
     calibrated = changed(OPTIONS, noise={**noise, "correlation": CorrelatedError()})
-    both = (with_truth(recordings, options=options) for options in (OPTIONS, calibrated))
-    for plain, found in zip(*both, strict=True):
-        np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
-        std = found.displacements.std[-1]
+    estimates = (with_truth(recordings, options=options) for options in (OPTIONS, calibrated))
+    for plain, calibrated_estimate in zip(*estimates, strict=True):
+        np.testing.assert_array_equal(
+            calibrated_estimate.trajectory.position, plain.trajectory.position
+        )
+        std = calibrated_estimate.displacements.std[-1]
         np.testing.assert_allclose(std, PERFECT_STD, rtol=1e-12)
     of_gyro = {"gyro_bias": 1e-3, "raw_gyro_bias": 0.02}
     considered = changed(
         calibrated, considered={**of_gyro, "scale": 0.1, "heading": 0.1, "slope": 0.1}
     )
-    assert perfect(filter_setup(CONFIG, considered)).considered == ConsideredStd(**of_gyro)
+    assert perfect(make_filter(CONFIG, considered)).considered == ConsideredStd(**of_gyro)
 
 
-def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks):
-    """By ∂p/∂b_g of the filter, here of runs whose gyro is off by a little, and whose network does
-    not look at its windows. That of a raw gyro is larger along the vertical at the start."""
+def test_consider_covariance_widens_the_covariance_and_moves_nothing(walks):
+    """The derivative of positions by the gyro bias is that of runs whose gyro differs a little and
+    whose network ignores its windows. The bias of a raw gyro is larger along the vertical at the
+    start."""
     recordings = ready(walks[:2], gyro_bias="reference")
     raw = recordings[1].start._replace(raw_gyro=True)
     recordings = [recordings[0], recordings[1]._replace(start=raw)]
@@ -137,13 +142,13 @@ def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks):
         return tight(recordings, alike, options=options)
 
     options = changed(OPTIONS, considered={"gyro_bias": 1e-3, "raw_gyro_bias": 5e-3})
-    both = run(recordings, OPTIONS), run(recordings, options)
+    estimates = run(recordings, OPTIONS), run(recordings, options)
     ahead, behind = (
-        [run([with_gyro_bias(each, off) for each in recordings], OPTIONS) for off in axes]
+        [run([with_gyro_bias(recording, off) for recording in recordings], OPTIONS) for off in axes]
         for axes in (1e-5 * np.eye(3), -1e-5 * np.eye(3))
     )
-    for row, (plain, found) in enumerate(zip(*both, strict=True)):
-        np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
+    for row, (plain, considered) in enumerate(zip(*estimates, strict=True)):
+        np.testing.assert_array_equal(considered.trajectory.position, plain.trajectory.position)
         moved = np.stack(
             [
                 (a[row].trajectory.position - b[row].trajectory.position) / 2e-5
@@ -156,14 +161,14 @@ def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks):
             up = raw.rotation[2]
             variance = variance + 25e-6 * np.outer(up, up)
         added = moved @ variance @ moved.swapaxes(1, 2)
-        wanted = plain.filtered.covariance + added
+        expected = plain.filtered.covariance + added
         assert added[-1].max() > 1e-6
-        np.testing.assert_allclose(found.filtered.covariance, wanted, rtol=1e-2, atol=1e-6)
-        std = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
-        np.testing.assert_allclose(found.states.std[:, 6:9], std, rtol=1e-2)
-        # A constant bias is there from the start.
+        np.testing.assert_allclose(considered.filtered.covariance, expected, rtol=1e-2, atol=1e-6)
+        std = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
+        np.testing.assert_allclose(considered.states.std[:, 6:9], std, rtol=1e-2)
+        # A constant bias exists from the start.
         at_start = np.sqrt(plain.states.std[0, 9:12] ** 2 + np.diag(variance))
-        np.testing.assert_allclose(found.states.std[0, 9:12], at_start, rtol=1e-12)
+        np.testing.assert_allclose(considered.states.std[0, 9:12], at_start, rtol=1e-12)
 
 
 def with_gyro_bias(recording, off):
@@ -179,29 +184,34 @@ def same(a, b, tolerance):
 
 
 def test_batches_change_nothing(walks):
-    recordings, told = ready(walks), []
+    recordings, progress = ready(walks), []
     for way, tolerance in ((tight, 1e-5), (with_truth, 1e-9)):
-        pairs = way(recordings, batch_size=2, progress=told.append)
+        pairs = way(recordings, batch_size=2, progress=progress.append)
         others = [*way(recordings[::-2]), *way(recordings[1:])]  # the third with the first, ...
-        assert told == sorted(told) and len(told) == 2 and told.pop(1) == 1.0 and told.pop()
-        for each, found in zip(recordings, pairs, strict=True):
-            assert len(found.trajectory.time) == len(each.time)
-            for other in (own for own in others if own.name == each.name):
-                same(found, other, tolerance)
+        assert (
+            progress == sorted(progress)
+            and len(progress) == 2
+            and progress.pop(1) == 1.0
+            and progress.pop()
+        )
+        for recording, estimate in zip(recordings, pairs, strict=True):
+            assert len(estimate.trajectory.time) == len(recording.time)
+            for other in (other for other in others if other.name == recording.name):
+                same(estimate, other, tolerance)
                 np.testing.assert_allclose(
-                    found.trajectory.position, other.trajectory.position, atol=1e-6
+                    estimate.trajectory.position, other.trajectory.position, atol=1e-6
                 )
 
 
-def test_batches_are_of_few_lengths_and_little_padded():
+def test_batches_have_few_lengths_and_little_padding():
     strides = list(range(9, 3000, 11))
-    found = {strides[batch.members[0]]: batch.intervals for batch in _batches(strides, 1)}
-    assert all(own <= padded <= max(20, 1.26 * own) for own, padded in found.items())
-    assert found.keys() == set(strides) and len(set(found.values())) < 30
+    padding = {strides[batch.members[0]]: batch.intervals for batch in _batches(strides, 1)}
+    assert all(length <= padded <= max(20, 1.26 * length) for length, padded in padding.items())
+    assert padding.keys() == set(strides) and len(set(padding.values())) < 30
     assert {len(batch.members) for batch in _batches(strides, 16)} == {16}
 
 
-def test_what_the_filter_calls_void_has_diverged(walks):
+def test_an_unhealthy_filter_has_diverged(walks):
     accel, row = walks[0].accel.copy(), 91
     accel[450] *= 1e5
     void, whole = tight(ready([walks[0]._replace(accel=accel), walks[1]]))
@@ -209,14 +219,16 @@ def test_what_the_filter_calls_void_has_diverged(walks):
     assert np.argmax(np.linalg.norm(void.states.velocity, axis=1) > 100) == row
     for field in void.trajectory[1:]:
         assert np.isfinite(field[:row]).all() and np.isnan(field[row:]).all()
-    words = f"filter: diverged at {row / 10:.1f} s; the poses from then on are invalid"
+    speed = np.linalg.norm(void.states.velocity[row])
+    cause = f"a speed of {speed:.0f} m/s, above the limit of 100 m/s"
+    words = f"filter: diverged at {row / 10:.1f} s ({cause}); the poses from then on are invalid"
     assert void.notes == (words,) and whole.notes == ()
     scores = evaluation.score([void, whole])
-    assert [name for name, own in scores.items() if own.diverged] == [void.name]
+    assert [name for name, measures in scores.items() if measures.diverged] == [void.name]
 
 
-def test_tight_and_loose_see_the_same_windows(clean, walks):
-    """With an exact IMU the filter's attitude is the reference's, as long as no measurement
+def test_tight_and_loose_coupling_cut_the_same_windows(clean, walks):
+    """With an exact IMU the filter has the attitude of the reference, as long as no measurement
     disturbs it."""
     recordings = ready([clean, walks[1]], orientation="reference")
     (inside, _), (before, _) = (way(recordings, network(0.1, 4.0)) for way in (tight, loose))
@@ -225,34 +237,35 @@ def test_tight_and_loose_see_the_same_windows(clean, walks):
     np.testing.assert_array_equal(np.isnan(one.value), np.isnan(other.value))
     np.testing.assert_allclose(one.value[first:], other.value[first:], atol=2e-3)
     np.testing.assert_allclose(one.std[first:], other.std[first:], rtol=2e-2)
-    gates = (each.diagnostics["gate"][first:] for each in (one, other))
+    gates = (displacements.diagnostics["gate"][first:] for displacements in (one, other))
     np.testing.assert_allclose(*gates, atol=2e-2)
     np.testing.assert_allclose(inside.trajectory.position, before.trajectory.position, atol=2e-2)
-    # Else the agreement would say nothing.
+    # The displacements vary; if they did not, the agreement would say nothing.
     assert np.std(one.value[first:], axis=0).max() > 0.01
 
 
 @pytest.mark.parametrize("way", [tight, loose, summed])
-def test_every_estimator_takes_waypoints_along(walks, way):
-    both = ready([walks[0], with_waypoints(walks[1])], orientation="filter")
-    (first, second), (own, _) = way(both), way(ready(walks[:2], orientation="filter"))
-    np.testing.assert_allclose(first.trajectory.position, own.trajectory.position, atol=1e-6)
-    assert first.waypoints is None and second.waypoints is both[1].waypoints
+def test_every_estimator_keeps_the_waypoints(walks, way):
+    recordings = ready([walks[0], with_waypoints(walks[1])], orientation="filter")
+    (first, second), (with_poses, _) = way(recordings), way(ready(walks[:2], orientation="filter"))
+    np.testing.assert_allclose(first.trajectory.position, with_poses.trajectory.position, atol=1e-6)
+    assert first.waypoints is None and second.waypoints is recordings[1].waypoints
     score = evaluation.score([second])[second.name].values
     assert np.isfinite(score["waypoint_rms"])
 
 
 @pytest.mark.parametrize("how", [{}, {"init": "static"}])
-def test_the_filter_starts_as_sure_as_its_options_say(walks, how):
-    """Of a start from the reference all of it, of a static one what that does not find."""
+def test_the_filter_starts_with_the_uncertainty_of_its_options(walks, how):
+    """A start from the reference has all of it, a static start what it does not measure."""
     std = TLIO_STD._replace(yaw=0.3, gyro_bias=0.02, accel_bias=0.2)
-    recordings = ready(walks[:2], std=std, **how)
-    (found, _), own = imu_only(recordings), recordings[0].start.std
-    assert (own.yaw, own.gyro_bias) == (0.3, 0.02)
-    wanted = np.repeat(np.array(own), [2, 1, 3, 3, 3, 3])
-    np.testing.assert_allclose(found.states.std[0], wanted, rtol=1e-12)
+    ekf = make_filter(CONFIG, dataclasses.replace(OPTIONS, start=std))
+    recordings = ready(walks[:2], ekf=ekf, **how)
+    (estimate, _), start_std = imu_only(recordings), recordings[0].start.std
+    assert (start_std.yaw, start_std.gyro_bias) == (0.3, 0.02)
+    expected = np.repeat(np.array(start_std), [2, 1, 3, 3, 3, 3])
+    np.testing.assert_allclose(estimate.states.std[0], expected, rtol=1e-12)
     raw = recordings[0].start._replace(level_gyro_bias=0.05)
-    (found, _) = imu_only([recordings[0]._replace(start=raw), recordings[1]])
+    (estimate, _) = imu_only([recordings[0]._replace(start=raw), recordings[1]])
     up = raw.rotation[2]
-    wanted[9:12] = np.sqrt(0.05**2 * (1 - up**2) + 0.02**2 * up**2)
-    np.testing.assert_allclose(found.states.std[0], wanted, rtol=1e-9)
+    expected[9:12] = np.sqrt(0.05**2 * (1 - up**2) + 0.02**2 * up**2)
+    np.testing.assert_allclose(estimate.states.std[0], expected, rtol=1e-9)

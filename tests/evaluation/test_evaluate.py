@@ -11,25 +11,14 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.config import EvaluateConfig, ModelConfig, TrainConfig
-from gnio_jax.errors import InputError
+from gnio_jax.config import EvaluateConfig
 from gnio_jax.evaluation import evaluate, report
 from gnio_jax.evaluation.evaluate import folder_name, folder_of, resolve
-from tests.support import tiny_run
-from tests.support.estimators import CONFIG, with_waypoints
+from tests.support.estimators import TRAINED, with_waypoints
 from tests.support.filter_settings import changed
 from tests.support.reports import report_of, write_report
 
 ROOT = Path(__file__).parents[2]
-TRAINED = TrainConfig(
-    data=CONFIG, model=ModelConfig(name="tiny"), filter=changed(start={"velocity": 0.7})
-)
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    with tiny_run.known():
-        yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", TRAINED)
 
 
 @pytest.fixture
@@ -44,8 +33,8 @@ def command(monkeypatch, walks):
     first = walks[2]._replace(name="short", valid=np.arange(len(walks[2].time)) > 600)
 
     def short(name, root=None, split="test", workers=1, progress=None):
-        given = (name, split) == ("synthetic", "test")
-        return [*walks[:2], first] if given else load(name, root, split)
+        is_default = (name, split) == ("synthetic", "test")
+        return [*walks[:2], first] if is_default else load(name, root, split)
 
     monkeypatch.setattr(data, "load", short)
 
@@ -56,7 +45,7 @@ def command(monkeypatch, walks):
     return call
 
 
-def asked(workdir, **options):
+def evaluate_run(workdir, **options):
     """An evaluation whose filter runs over two walks at a time, and its metrics.json."""
     options = {"batch_size": 2, "plots": False, **options}
     done = evaluate(EvaluateConfig(str(workdir), **options))
@@ -69,17 +58,19 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     folder = workdir / "eval" / "synthetic_test_ekf"
     assert "\x1b" not in printed.out and printed.err == ""
     assert f"results: {folder}" in printed.out and "never_moves" in printed.out
-    found = json.loads((folder / "metrics.json").read_text())
-    assert list(found["sequences"]) == ["synthetic_1_handheld", "synthetic_2_handheld"]
-    assert list(found["left_out"]) == ["short"]
-    own = found["settings"]
-    assert own["coupling"] == "tight" and own["epoch"] == 1 and own["data_root"] is None
-    assert own["filter"]["start"]["velocity"] == 0.7
-    assert own["recordings"]["synthetic_1_handheld"] == pytest.approx(15.0, abs=0.05)
-    assert [one["group"] for one in found["sequences"].values()] == ["person 1", "person 2"]
-    assert [one["placement"] for one in found["sequences"].values()] == ["handheld"] * 2
-    assert found["mean"]["ate"] > 0 and own["definitions"] == report.DEFINITIONS
-    assert found["reference_rows"]["perfect_displacements"]["mean"]["ate"] < 0.1
+    content = json.loads((folder / "metrics.json").read_text())
+    assert list(content["sequences"]) == ["synthetic_1_handheld", "synthetic_2_handheld"]
+    assert list(content["left_out"]) == ["short"]
+    settings = content["settings"]
+    assert (
+        settings["coupling"] == "tight" and settings["epoch"] == 1 and settings["data_root"] is None
+    )
+    assert settings["filter"]["start"]["velocity"] == 0.7
+    assert settings["recordings"]["synthetic_1_handheld"] == pytest.approx(15.0, abs=0.05)
+    assert [one["group"] for one in content["sequences"].values()] == ["person 1", "person 2"]
+    assert [one["placement"] for one in content["sequences"].values()] == ["handheld"] * 2
+    assert content["mean"]["ate"] > 0 and settings["definitions"] == report.DEFINITIONS
+    assert content["reference_rows"]["perfect_displacements"]["mean"]["ate"] < 0.1
     assert len(np.loadtxt(folder / "trajectories" / "synthetic_1_handheld.txt")) == 150
     assert len(list((folder / "plots").iterdir())) == 3
     page = (folder / "report.html").read_text(encoding="utf-8")
@@ -91,86 +82,81 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     assert "has learnt from" not in "".join(capsys.readouterr())
     (workdir / "splits.yaml").write_text("train: {synthetic_2_handheld: 1500, other: 1}")
     command("--workdir", workdir, *imu_only)
-    told = "".join(capsys.readouterr())
-    assert "the network has learnt from 1 of 3 recordings, e.g. synthetic_2_handheld" in told
+    output = "".join(capsys.readouterr())
+    assert "the network has learnt from 1 of 3 recordings, e.g. synthetic_2_handheld" in output
     assert (tmp_path / "w.rrd").exists() == bool(rerun)
     names = {p.name for p in (workdir / "eval").iterdir()}
     others = {"synthetic_test_integrate", "synthetic_test_imu_only_static-init"}
     assert names == {"synthetic_test_ekf", *others}
     summed = workdir / "eval" / "synthetic_test_integrate"
-    found = json.loads((summed / "metrics.json").read_text())
-    own = found["settings"]
-    assert own["orientation_source"] == "reference" and own["coupling"] is None
-    assert "nis" not in found["mean"] and not (summed / "plots").exists()
+    content = json.loads((summed / "metrics.json").read_text())
+    settings = content["settings"]
+    assert settings["orientation_source"] == "reference" and settings["coupling"] is None
+    assert "nis" not in content["mean"] and not (summed / "plots").exists()
     assert not list((workdir / "eval").glob("synthetic_test_i*/report.html"))
 
 
-def test_walks_with_waypoints_beside_those_with_poses_and_alone(
+def test_walks_with_waypoints_are_evaluated_with_walks_with_poses_and_alone(
     workdir, walks, monkeypatch, no_pictures
 ):
     posed = walks[:2]
-    tapped = [with_waypoints(each)._replace(name=f"tapped {k}") for k, each in enumerate(posed)]
+    tapped = [with_waypoints(walk)._replace(name=f"tapped {k}") for k, walk in enumerate(posed)]
     loaded = [*posed, *tapped]
     monkeypatch.setattr(data, "load", lambda *_: loaded)
-    done, found = asked(workdir, plots=True)
-    first, _, second, _ = found["sequences"].values()
-    assert "ate" in first and "leg_ratio" not in first and "reference" not in found["settings"]
+    done, content = evaluate_run(workdir, plots=True)
+    first, _, second, _ = content["sequences"].values()
+    assert "ate" in first and "leg_ratio" not in first and "reference" not in content["settings"]
     assert "ate" not in second and second["legs"] == 3 and second["waypoint_rms"] > 0
     assert second["nis"] > 0 and "waypoints, no poses" in second["notes"][0]
-    rows = found["reference_rows"]
+    rows = content["reference_rows"]
     assert rows["never_moves"]["mean"]["leg_ratio"] == 0
-    assert [*rows["perfect_displacements"]["sequences"]] == [each.name for each in posed]
+    assert [*rows["perfect_displacements"]["sequences"]] == [walk.name for walk in posed]
     assert "at waypoints" in (done.folder / "report.html").read_text(encoding="utf-8")
     taps = sorted(path.name for path in (done.folder / "waypoints").iterdir())
     assert taps == ["tapped_0.txt", "tapped_1.txt"]
 
     loaded[:] = tapped
-    alone, _ = asked(workdir, estimator="imu_only")
+    alone, _ = evaluate_run(workdir, estimator="imu_only")
     assert alone.report.settings["reference"] == "waypoints"
     assert alone.report.settings["initial_state"] == "static"
     assert list(alone.report.reference_rows) == ["never_moves"]
-    for refused, remedy in (
-        ({"alignment": "se3"}, "leave it out"),
-        ({"estimator": "integrate"}, "--orientation filter"),
-    ):
-        with pytest.raises(InputError, match=f"^tapped 0: has waypoints.*{remedy}"):
-            asked(workdir, **refused)
 
 
 class Reached(Exception):
     """The stage that a test looks at."""
 
 
-@pytest.mark.parametrize("asked, least", [({"coupling": "loose"}, np.exp(-4.0)), ({}, 0.0)])
-def test_what_the_filter_is_sure_of_reaches_the_stages(workdir, walks, monkeypatch, asked, least):
-    """The start, a raw gyro, and the smallest standard deviation of a displacement, which has none
-    where displacements are summed."""
-    module, given = sys.modules[evaluate.__module__], {}
+@pytest.mark.parametrize(
+    "choice, least", [({"coupling": "loose"}, np.exp(-4.0)), ({"estimator": "integrate"}, 0.0)]
+)
+def test_uncertainties_of_the_filter_reach_the_stages(workdir, walks, monkeypatch, choice, least):
+    """These are the start, a raw gyro, and the smallest standard deviation of a displacement, which
+    is 0 if displacements are summed."""
+    module, arguments = sys.modules[evaluate.__module__], {}
     original = module.prepare
 
-    def prepare(sequences, windows, std, **how):
-        given.update(how, std=std)
-        return original(sequences, windows, std, **how)
+    def prepare(sequences, windows, ekf, **how):
+        arguments.update(ekf=ekf)
+        return original(sequences, windows, ekf, **how)
 
     def infer(*_, **how):
-        given.update(how)
+        arguments.update(how)
         raise Reached
 
     monkeypatch.setattr(module, "prepare", prepare)
     monkeypatch.setattr(module, "infer", infer)
     monkeypatch.setattr(data, "load", lambda *_: walks[:1])
-    options = {"set": ("filter.raw_gyro_bias=0.02",), **(asked or {"estimator": "integrate"})}
     with pytest.raises(Reached):
-        evaluate(EvaluateConfig(str(workdir), **options))
-    assert given["std"].velocity == 0.7 and given["raw_gyro_bias"] == 0.02
-    assert given["least_std"] == pytest.approx(least)
+        evaluate(EvaluateConfig(str(workdir), set=("filter.raw_gyro_bias=0.02",), **choice))
+    assert arguments["ekf"].start.velocity == 0.7 and arguments["ekf"].raw_gyro_bias == 0.02
+    assert arguments["least_std"] == pytest.approx(least)
 
 
-def test_folders_tell_choices_apart():
+def test_the_name_of_a_folder_has_the_choices():
     slower = changed(TRAINED.filter, start={"velocity": 0.5})
     loose = {"coupling": "loose", "orientation": "device", "init": "static"}
     summed = {"estimator": "integrate", "orientation": "filter", "gyro_bias": "rest"}
-    for asked, name in (
+    for options, name in (
         ({"orientation": "filter"}, "ekf"),
         ({"coupling": "loose", "orientation": "reference"}, "ekf_loose"),
         (loose, "ekf_loose_device-orientation_static-init"),
@@ -180,43 +166,41 @@ def test_folders_tell_choices_apart():
             "ekf_se3-alignment_latest_start.velocity-0.5",
         ),
     ):
-        config = resolve(EvaluateConfig("w", **asked), TRAINED)
+        config = resolve(EvaluateConfig("w", **options), TRAINED)
         assert folder_name(config, TRAINED) == f"synthetic_test_{name}"
 
 
-def test_figures_of_other_recordings_are_left_alone(tmp_path, monkeypatch):
+def test_figures_of_other_recordings_keep_their_folder(tmp_path, monkeypatch):
     roots = [tmp_path / name / "csv" for name in "ABC"]
     for root in roots:
         root.mkdir(parents=True)
 
-    def evaluated(**asked):
-        config = resolve(EvaluateConfig("w", dataset="csv", **asked), TRAINED)
+    def evaluated(**evaluate_run):
+        config = resolve(EvaluateConfig("w", dataset="csv", **evaluate_run), TRAINED)
         folder = folder_of(tmp_path / "run", config, TRAINED)
         of = {"data_root": config.data_root, "definitions": 1}  # of an older version, too
         return write_report(folder, report_of({"a": 1.0}, {"a": "x"}, **of))
 
     folders = [evaluated(data_root=str(root)) for root in roots]
     assert folders[0].name == "csv_test_ekf" and len(set(folders)) == 3
-    assert all(each.name.startswith("csv_test_ekf_csv-") for each in folders[1:])
+    assert all(folder.name.startswith("csv_test_ekf_csv-") for folder in folders[1:])
     monkeypatch.chdir(tmp_path)
-    for own, root in zip(folders, roots, strict=True):
-        assert evaluated(data_root=f"A/../{root.relative_to(tmp_path)}") == own
+    for folder, root in zip(folders, roots, strict=True):
+        assert evaluated(data_root=f"A/../{root.relative_to(tmp_path)}") == folder
         monkeypatch.setenv("GNIO_DATA", str(root.parent))
-        assert evaluated() == own
+        assert evaluated() == folder
     shutil.rmtree(folders[0])
     assert evaluated(data_root=str(roots[1])) == folders[1]  # its figures stand in one place
     assert resolve(EvaluateConfig("w", data_root="A"), TRAINED).data_root is None  # it is computed
 
 
-def test_what_is_not_asked_for_is_the_runs():
-    found = resolve(EvaluateConfig("w", set=("filter.noise.measurement_scale=3",)), TRAINED)
-    assert found.dataset == "synthetic" and found.orientation == "filter"
-    assert found.filter == changed(TRAINED.filter, noise={"measurement_scale": 3.0})
+def test_options_default_to_those_of_the_run():
+    config = resolve(EvaluateConfig("w", set=("filter.noise.measurement_scale=3",)), TRAINED)
+    assert config.dataset == "synthetic" and config.orientation == "filter"
+    assert config.filter == changed(TRAINED.filter, noise={"measurement_scale": 3.0})
     assert resolve(EvaluateConfig("w", coupling="loose"), TRAINED).orientation == "reference"
-    own = changed(start={"velocity": 0.2})
-    assert resolve(EvaluateConfig("w", filter=own), TRAINED).filter == own
-    with pytest.raises(InputError, match="leave it out"):
-        evaluate(EvaluateConfig("w", estimator="imu_only", orientation="device"))
+    settings = changed(start={"velocity": 0.2})
+    assert resolve(EvaluateConfig("w", filter=settings), TRAINED).filter == settings
 
 
 def test_mistakes_are_one_line_and_leave_nothing(workdir, command, capsys):

@@ -9,16 +9,19 @@ from tests.support.estimators import CONFIG, NETWORK, RATE, ready, rotations, su
 
 
 @pytest.mark.parametrize("reading, context", [("single", 0.0), ("per_sample", 0.4)])
-def test_windows_are_cut_with_the_given_attitude(walks, reading, context):
+def test_windows_are_cut_with_the_attitude_of_the_recording(walks, reading, context):
     config = DataConfig(rate=RATE, window_rotation=reading, context_seconds=context)
     recordings = ready(walks[:2], config, orientation="reference")
     predicted = infer(NETWORK, recordings, config)
-    for walk, found, each in zip(walks[:2], predicted, recordings, strict=True):
+    for walk, displacements, recording in zip(walks[:2], predicted, recordings, strict=True):
         turns = rotations(walk.orientation).as_matrix()
-        assert found.value.shape == found.std.shape == (each.strides, 3)
+        assert displacements.value.shape == displacements.std.shape == (recording.strides, 3)
         first = config.seen // config.stride - 1  # the stride in which the first window ends
-        assert np.isnan(found.value[:first]).all() and np.isfinite(found.value[first:]).all()
-        for row in range(first, each.strides, 17):
+        assert (
+            np.isnan(displacements.value[:first]).all()
+            and np.isfinite(displacements.value[first:]).all()
+        )
+        for row in range(first, recording.strides, 17):
             end = (row + 1) * config.stride
             start, rows = end - config.window, range(end - config.seen, end)
             at = [j if reading == "per_sample" else start for j in rows]
@@ -26,42 +29,42 @@ def test_windows_are_cut_with_the_given_attitude(walks, reading, context):
                 unyaw(turns[start]) @ np.einsum("tij,tj->ti", turns[at], signal[rows]).mean(0)
                 for signal in (walk.accel, walk.gyro)
             ]
-            np.testing.assert_allclose(found.value[row], 0.05 * means[0], atol=2e-6)
-            np.testing.assert_allclose(np.log(found.std[row]), means[1] - 3, atol=1e-5)
-        assert set(found.diagnostics) == {"gate"}
+            np.testing.assert_allclose(displacements.value[row], 0.05 * means[0], atol=2e-6)
+            np.testing.assert_allclose(np.log(displacements.std[row]), means[1] - 3, atol=1e-5)
+        assert set(displacements.diagnostics) == {"gate"}
 
 
-def test_the_first_gyro_bias_is_taken_off_the_windows_and_the_attitude(clean):
+def test_the_first_gyro_bias_is_subtracted_from_windows_and_attitude(clean):
     bias = np.array([0.1, -0.05, 0.02])
     biased = clean._replace(gyro=clean.gyro + bias)
-    (plain,), (found,) = (
+    (plain,), (shifted,) = (
         ready([walk], gyro_bias="reference", orientation="filter") for walk in (clean, biased)
     )
-    np.testing.assert_allclose(found.start.gyro_bias - plain.start.gyro_bias, bias, atol=1e-12)
-    np.testing.assert_allclose(found.attitude, plain.attitude, atol=1e-9)
-    a, b = infer(NETWORK, [plain, found], CONFIG)
+    np.testing.assert_allclose(shifted.start.gyro_bias - plain.start.gyro_bias, bias, atol=1e-12)
+    np.testing.assert_allclose(shifted.attitude, plain.attitude, atol=1e-9)
+    a, b = infer(NETWORK, [plain, shifted], CONFIG)
     np.testing.assert_allclose(a.std, b.std, rtol=1e-5)
 
 
-def test_no_standard_deviation_is_below_the_least(walks):
+def test_no_standard_deviation_is_below_the_smallest_one(walks):
     recordings = ready(walks[:1], orientation="reference")
-    (plain,), (found,) = (infer(NETWORK, recordings, CONFIG, least_std=x) for x in (0.0, 0.05))
-    np.testing.assert_allclose(found.std, np.maximum(plain.std, 0.05), rtol=1e-12)
+    (plain,), (bounded,) = (infer(NETWORK, recordings, CONFIG, least_std=x) for x in (0.0, 0.05))
+    np.testing.assert_allclose(bounded.std, np.maximum(plain.std, 0.05), rtol=1e-12)
     assert np.nanmin(plain.std) < 0.05 < np.nanmax(plain.std)
 
 
-def test_a_displacement_across_a_gap_of_the_imu_is_none(walks):
-    there = np.ones(len(walks[0].time), bool)
-    there[203:240] = False
+def test_a_window_across_a_gap_of_the_imu_has_no_displacement(walks):
+    measured = np.ones(len(walks[0].time), bool)
+    measured[203:240] = False
     config = DataConfig(rate=RATE, context_seconds=0.4)
-    sequences = [walks[0]._replace(imu_valid=there), walks[0]]
+    sequences = [walks[0]._replace(imu_valid=measured), walks[0]]
     recordings = ready(sequences, config, orientation="reference")
     holed, whole = infer(NETWORK, recordings, config)
-    for row, (found, expected) in enumerate(zip(holed.value, whole.value, strict=True)):
+    for row, (value, expected) in enumerate(zip(holed.value, whole.value, strict=True)):
         end = (row + 1) * config.stride
-        if end >= config.seen and there[end - config.seen : end].all():
-            np.testing.assert_array_equal(found, expected)
+        if end >= config.seen and measured[end - config.seen : end].all():
+            np.testing.assert_array_equal(value, expected)
         else:
-            assert np.isnan(found).all()
+            assert np.isnan(value).all()
     (path, *_) = summed(recordings, config=config)
     assert np.isfinite(path.trajectory.position).all()

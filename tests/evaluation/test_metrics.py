@@ -1,5 +1,5 @@
-"""Each metric against values by hand, plain loops and drawn errors; and all of a sequence: names,
-reasons, divergence."""
+"""Each metric against values by hand, plain loops and drawn errors; and the metrics of a sequence
+with their names and reasons."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.metrics import Filtered
-from gnio_jax.evaluation.trajectory import Trajectory, Undefined, align, write_tum
+from gnio_jax.evaluation.trajectory import Trajectory, align, write_tum
 from tests.support.trajectories import (
     PITCHES,
     STEP,
@@ -36,18 +36,18 @@ def rms(errors):
 def test_absolute_errors_of_an_offset_and_of_a_jump():
     path = walk()
     estimate = path.position + np.array([3.0, 4.0, 12.0])
-    found = metrics.measure(path._replace(position=estimate), path, "none").values
-    wanted = {"ate": 13.0, "ate_2d": 5.0}
-    wanted |= {"ate_ronin": 13.0 / np.sqrt(3), "ate_ronin_2d": 5.0 / np.sqrt(2)}
-    assert {name: found[name] for name in wanted} == pytest.approx(wanted)
+    values = metrics.measure(path._replace(position=estimate), path, "none").values
+    expected = {"ate": 13.0, "ate_2d": 5.0}
+    expected |= {"ate_ronin": 13.0 / np.sqrt(3), "ate_ronin_2d": 5.0 / np.sqrt(2)}
+    assert {name: values[name] for name in expected} == pytest.approx(expected)
     assert metrics.rte(estimate, path.position, STEP) == pytest.approx(0.0, abs=1e-12)
     jump = np.array([[0.0, 0, 0], [2.0, 0, 0]])
     assert metrics.ate(jump, 0 * jump) == pytest.approx(np.sqrt(2))
     stretched = path._replace(position=path.position * [1.1, 1.0, 1.0])
-    found = metrics.measure(stretched, masked(path, slice(0, 99)), "none").values
+    values = metrics.measure(stretched, masked(path, slice(0, 99)), "none").values
     errors = 0.1 * np.abs(path.position[99:, 0])
     for name, of in {"mean": np.mean, "median": np.median, "max": np.max}.items():
-        assert found[f"ate_{name}"] == pytest.approx(of(errors)) == found[f"ate_{name}_2d"]
+        assert values[f"ate_{name}"] == pytest.approx(of(errors)) == values[f"ate_{name}_2d"]
 
 
 def test_drift():
@@ -55,32 +55,28 @@ def test_drift():
     truth[:, 0] = np.arange(101) * STEP * 2
     estimate = truth * [1.05, 1, 1]
     assert metrics.drift(estimate, truth, STEP) == pytest.approx(5.0)
-    with pytest.raises(Undefined, match="under 1 m"):
-        metrics.drift(estimate * 0.01, truth * 0.01, STEP)
     holed = truth.copy()
-    holed[20:80] = np.nan  # the estimate goes wrong there too
+    holed[20:80] = np.nan  # the error of the estimate grows in the hole too
     assert metrics.drift(estimate, holed, STEP) == pytest.approx(5.0)
 
 
-def test_rte_against_a_loop_with_a_gap_and_scaled_where_the_walk_is_short():
-    truth, apart = walk(), 600
+def test_rte_equals_a_loop_and_is_scaled_for_a_short_walk():
+    truth, lag = walk(), 600
     estimate, reference = perturbed(truth), masked(truth, slice(620, 640))
     error = estimate.position - reference.position
-    pairs = [(i, i + apart) for i in range(300)]
+    pairs = [(i, i + lag) for i in range(300)]
     errors = [error[j] - error[i] for i, j in pairs if np.isfinite(error[[i, j]]).all()]
     assert len(errors) == 280
-    found = metrics.measure(estimate, reference, "none").values
-    assert found["rte_60s"] == pytest.approx(rms(errors), rel=1e-12)
-    assert found["rte_60s_ronin_2d"] == pytest.approx(found["rte_60s_2d"] / np.sqrt(2))
+    values = metrics.measure(estimate, reference, "none").values
+    assert values["rte_60s"] == pytest.approx(rms(errors), rel=1e-12)
+    assert values["rte_60s_ronin_2d"] == pytest.approx(values["rte_60s_2d"] / np.sqrt(2))
     still, off = np.zeros((301, 3)), np.zeros((301, 3))
     off[:, 0] = np.linspace(0, 2.0, 301)  # 2 m in 30 s
     assert metrics.rte(off, still, STEP) == pytest.approx(4.0)
-    with pytest.raises(Undefined, match="single"):
-        metrics.rte(off[:1], still[:1], STEP)
 
 
 @pytest.mark.parametrize("metres", [1.0, 10.0])
-def test_rte_distance_against_a_loop_and_of_a_scaled_line(metres):
+def test_rte_distance_equals_a_loop_and_the_error_of_a_scaled_line(metres):
     truth, estimate = (path.position[:, :2] for path in (walk(), perturbed(walk())))
     reference = truth.copy()
     reference[300] = np.nan
@@ -93,33 +89,31 @@ def test_rte_distance_against_a_loop_and_of_a_scaled_line(metres):
                 j += 1
             if walked >= metres - 1e-9:
                 errors.append(estimate[j] - estimate[i] - truth[j] + truth[i])
-    found = metrics.rte_distance(estimate, reference, metres)
-    assert found == pytest.approx(rms(errors), rel=1e-9)
+    value = metrics.rte_distance(estimate, reference, metres)
+    assert value == pytest.approx(rms(errors), rel=1e-9)
     line = np.zeros((501, 2))
     line[:, 0] = np.arange(501) * 0.125
     assert metrics.rte_distance(line * 1.1, line, metres) == pytest.approx(0.1 * metres)
-    with pytest.raises(Undefined, match="100 m"):
-        metrics.rte_distance(line, line, 100.0)
 
 
-def test_rpe_against_a_loop():
+def test_rpe_equals_a_loop():
     truth, seconds = walk(tilt=0.3), 10.0
     estimate = perturbed(truth)
-    apart, errors, errors_se3 = round(seconds / STEP), [], []
+    lag, errors, errors_se3 = round(seconds / STEP), [], []
     turns, turns_true = (
         Rotation.from_quat(t.orientation, scalar_first=True) for t in (estimate, truth)
     )
-    for i in range(len(truth.time) - apart):
+    for i in range(len(truth.time) - lag):
         _, _, z, w = (turns[i] * turns_true[i].inv()).as_quat()
         angle = -2 * np.arctan(z / w)  # the twist about z, turned back
-        moved, true = (path.position[i + apart] - path.position[i] for path in (estimate, truth))
+        moved, true = (path.position[i + lag] - path.position[i] for path in (estimate, truth))
         errors.append(Rotation.from_euler("z", angle).apply(moved) - true)
         errors_se3.append(turns[i].inv().apply(moved) - turns_true[i].inv().apply(true))
     for dims in (2, 3):
-        found = metrics.rpe(estimate, truth, STEP, seconds, dims)
-        assert found == pytest.approx(rms(np.array(errors)[:, :dims]), rel=1e-9)
-    found = metrics.rpe(estimate, truth, STEP, seconds, full=True)
-    assert found == pytest.approx(rms(errors_se3), rel=1e-9)
+        value = metrics.rpe(estimate, truth, STEP, seconds, dims)
+        assert value == pytest.approx(rms(np.array(errors)[:, :dims]), rel=1e-9)
+    value = metrics.rpe(estimate, truth, STEP, seconds, full=True)
+    assert value == pytest.approx(rms(errors_se3), rel=1e-9)
 
 
 def test_path_length_of_a_scaled_circle_and_of_noise():
@@ -129,18 +123,18 @@ def test_path_length_of_a_scaled_circle_and_of_noise():
     assert metrics.path_length(circle, STEP) == pytest.approx(length, rel=1e-12)
     holes = circle.copy()
     holes[300:400] = np.nan
-    # The chord across ten seconds is no way that anybody was seen to walk.
+    # The chord across ten seconds without a reference is not counted.
     assert metrics.path_length(holes, STEP) == pytest.approx(109 / 120 * length, rel=1e-12)
     scattered = circle.copy()
     scattered[::3] = np.nan
     assert metrics.path_length(scattered, STEP) == pytest.approx(length, rel=0.01)
     for scale, reference in ((0.8, circle), (0.0, circle), (0.8, holes)):
-        found = metrics.path_length_ratio(circle * scale, reference, STEP)
-        assert found == pytest.approx(scale)
+        ratio = metrics.path_length_ratio(circle * scale, reference, STEP)
+        assert ratio == pytest.approx(scale)
     truth = np.zeros((1201, 3))
     truth[:, 0] = np.arange(1201) * STEP
     noisy = truth + np.random.default_rng(0).normal(0, 0.02, truth.shape)
-    # The odd rows at the end count too.
+    # The last rows, which are no whole second, count too.
     assert metrics.path_length(truth[:996], STEP) == pytest.approx(99.5)
     assert metrics.path_length_ratio(noisy, truth, STEP) == pytest.approx(1.0, abs=2e-3)
     assert np.linalg.norm(np.diff(noisy, axis=0), axis=1).sum() > 1.05 * 120
@@ -154,9 +148,6 @@ def test_stationary_drift():
     estimate = truth.copy()
     estimate[:, 1] += np.arange(1000) * STEP * 0.02  # 1.2 m a minute
     assert metrics.stationary_drift(estimate, truth, STEP) == pytest.approx(1.2, rel=1e-3)
-    moving = truth[401:700]
-    with pytest.raises(Undefined, match="never stands"):
-        metrics.stationary_drift(moving, moving, STEP)
     for rows in (20, 21):  # still for 1.9 and for 2 s
         brief = np.zeros((60, 3))
         brief[:, 0] = np.r_[np.arange(15), np.full(rows, 15), np.arange(16, 61 - rows)] * STEP
@@ -172,41 +163,39 @@ def test_yaw_errors_wrap():
     assert metrics.yaw_rmse(level(yaw_true + np.radians(10)), truth) == pytest.approx(10.0)
     growing = yaw_true + np.radians(5) * np.linspace(0, 100, 601)  # 500° in 60 s, several turns
     assert metrics.yaw_drift(level(growing), truth, STEP) == pytest.approx(500 * 60, rel=1e-9)
-    with pytest.raises(Undefined, match="10 s"):
-        metrics.yaw_drift(truth[:50], truth[:50], STEP)
 
 
 @pytest.mark.parametrize("pitch", PITCHES)
 def test_yaw_errors_of_a_tilted_phone(pitch):
-    """A little tilt is none, though the body's x axis may be vertical: 0.1° of noise about both
-    horizontal axes on a perfect path. A wrong heading is measured, and undone."""
+    """A noise of 0.1° about both horizontal axes is no yaw error, though the body's x axis may be
+    vertical. A wrong heading is measured, and removed by the alignment."""
     truth = pitched(pitch)
     noise = np.zeros((900, 3))
     noise[:, :2] = np.random.default_rng(1).normal(0, np.radians(0.1), (900, 2))
     turn = Rotation.from_rotvec(noise) * Rotation.from_quat(np.roll(truth.orientation, -1, 1))
-    found = metrics.measure(truth._replace(orientation=quaternions(turn)), truth).values
+    values = metrics.measure(truth._replace(orientation=quaternions(turn)), truth).values
     most = {"yaw_rmse": 0.01, "yaw_drift": 1.0, "rpe_1s": 1e-4, "rpe_10s": 1e-3, "ate": 1e-3}
-    assert all(found[name] < limit for name, limit in most.items())
+    assert all(values[name] < limit for name, limit in most.items())
     turn = Rotation.from_euler("z", 40, degrees=True)
     estimate = moved_by(truth, turn, [5.0, -3.0, 1.0])
     assert metrics.measure(estimate, truth, "none").values["yaw_rmse"] == pytest.approx(40.0)
     assert metrics.rte(estimate.position, truth.position, STEP, 10.0) > 1.0
-    found = metrics.measure(estimate, truth, filtered=filtered(EYES)).values
+    values = metrics.measure(estimate, truth, filtered=filtered(EYES)).values
     for name in ("rpe_1s", "rpe_10s_2d", "rpe_se3", "ate", "nees", "yaw_rmse"):
-        assert found[name] == pytest.approx(0, abs=1e-6)
+        assert values[name] == pytest.approx(0, abs=1e-6)
 
 
-def test_nees_of_a_consistent_filter():
+def test_the_nees_of_a_consistent_filter_is_one():
     random = np.random.default_rng(0)
     root = random.normal(size=(20000, 3, 3))
     covariance = np.einsum("nij,nkj->nik", root, root) + 0.1 * np.eye(3)
     error = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), random.normal(size=(20000, 3)))
     squared = metrics.normalised_squared(error, covariance)
     unit = np.array([1e-9, 1.0, 1e9])  # it does not depend on units
-    found = metrics.normalised_squared(unit * error, unit[:, None] * covariance * unit)
-    wanted = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
-    for each in (squared, found):
-        np.testing.assert_allclose(each, wanted, rtol=1e-9)
+    scaled = metrics.normalised_squared(unit * error, unit[:, None] * covariance * unit)
+    expected = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
+    for result in (squared, scaled):
+        np.testing.assert_allclose(result, expected, rtol=1e-9)
     assert metrics.mean_normalised(squared, 3) == pytest.approx(1.0, abs=0.03)
     assert metrics.coverage(squared, 3) == pytest.approx(95, abs=0.7)
     assert metrics.coverage(np.array([1.0, np.nan, 7.8, 7.9]), 3) == pytest.approx(200 / 3)
@@ -215,20 +204,21 @@ def test_nees_of_a_consistent_filter():
 
 def test_nees_does_not_depend_on_the_frame():
     truth, sigma = walk(), np.array([2.0, 1.0, 0.5])
-    own = filtered(np.broadcast_to(np.diag(sigma**2), (900, 3, 3)))
+    results = filtered(np.broadcast_to(np.diag(sigma**2), (900, 3, 3)))
     error = np.random.default_rng(3).normal(size=(900, 3)) * sigma
     error[0] = 0
     estimate = truth._replace(position=truth.position + error)
     turned = moved_by(truth, TURNED, [1.0, 2.0, 3.0])
     straight, elsewhere = (
-        metrics.measure(estimate, reference, filtered=own).values for reference in (truth, turned)
+        metrics.measure(estimate, reference, filtered=results).values
+        for reference in (truth, turned)
     )
     for name in ("nees", "nees_2d", "nees_coverage", "nees_coverage_2d"):
         assert straight[name] == pytest.approx(elsewhere[name])
     assert straight["nees"] == pytest.approx(np.mean(np.sum((error / sigma) ** 2, 1)) / 3)
 
 
-def test_a_singular_or_indefinite_covariance_is_no_consistent_one():
+def test_a_singular_or_indefinite_covariance_has_an_infinite_nees():
     truth, covariance = walk(), EYES.copy()
     for bad in (
         np.full((3, 3), np.nan),
@@ -246,48 +236,53 @@ def test_a_singular_or_indefinite_covariance_is_no_consistent_one():
         assert measures.reasons["nees"] == "the filter's covariance is not positive definite"
 
 
-def test_untrusted_rows_count_nowhere():
+def test_no_metric_counts_an_untrusted_row():
     truth = walk()
-    estimate, reference, kept = perturbed(truth), masked(truth, slice(100, 150)), np.ones(900, bool)
-    kept[100:150] = False
+    estimate, reference, trusted = (
+        perturbed(truth),
+        masked(truth, slice(100, 150)),
+        np.ones(900, bool),
+    )
+    trusted[100:150] = False
     wrong = estimate._replace(position=estimate.position.copy())
-    wrong.position[~kept] += 1e3
-    ate = rms((estimate.position - truth.position)[kept])
+    wrong.position[~trusted] += 1e3
+    ate = rms((estimate.position - truth.position)[trusted])
     assert metrics.ate(wrong.position, reference.position) == pytest.approx(ate)
     a, b = metrics.measure(wrong, reference), metrics.measure(estimate, reference)
     assert a == b and not a.reasons
 
 
 def test_a_reference_without_orientation_is_no_divergence():
-    """Its rows count where no attitude is needed; the first that has one aligns the estimate."""
+    """Its rows count where no attitude is needed. The first row with an attitude aligns the
+    estimate."""
     truth = walk()
     reference = truth._replace(orientation=truth.orientation.copy())
     reference.orientation[:50] = np.nan
     estimate = moved_by(truth, TURNED, [5.0, -3.0, 1.0])
-    found = metrics.measure(estimate, reference)
-    assert not found.reasons
+    measures = metrics.measure(estimate, reference)
+    assert not measures.reasons
     for name in ("ate", "rpe_10s", "rpe_se3", "yaw_rmse"):
-        assert found.values[name] == pytest.approx(0, abs=1e-6)
+        assert measures.values[name] == pytest.approx(0, abs=1e-6)
     broken = estimate._replace(orientation=estimate.orientation.copy())
-    broken.orientation[-50:] = np.nan  # of the estimate it is
+    broken.orientation[-50:] = np.nan  # an estimate without an orientation has no error
     assert np.isnan(metrics.yaw_rmse(broken.orientation, reference.orientation))
     assert np.isnan(metrics.rpe(broken, reference, STEP, 1.0))
 
 
-def test_names_and_reasons():
+def test_metrics_have_names_and_reasons():
     truth = walk()
-    own = filtered(EYES, 3.0)
-    own.nis[0], own.accepted[:2] = np.nan, [np.nan, 0.0]
-    found = metrics.measure(perturbed(truth), truth, filtered=own)
-    assert not found.reasons
+    results = filtered(EYES, 3.0)
+    results.nis[0], results.accepted[:2] = np.nan, [np.nan, 0.0]
+    measures = metrics.measure(perturbed(truth), truth, filtered=results)
+    assert not measures.reasons
     with_poses = set(metrics.NAMES) - metrics.OF_WAYPOINTS.keys()
-    assert with_poses == found.values.keys() - {"duration", "path_length"}
-    wanted = {"nis": 1.0, "duration": 89.9, "accepted": 100 * 898 / 899}
-    assert {name: found.values[name] for name in wanted} == pytest.approx(wanted)
+    assert with_poses == measures.values.keys() - {"duration", "path_length"}
+    expected = {"nis": 1.0, "duration": 89.9, "accepted": 100 * 898 / 899}
+    assert {name: measures.values[name] for name in expected} == pytest.approx(expected)
     blind = metrics.measure(truth, masked(truth, slice(None)))
     assert blind.values["ate"] is None and blind.reasons["ate"] == "no trusted reference"
     assert blind.values["duration"] == pytest.approx(89.9)
-    # Nor is an error infinite that there cannot be.
+    # An error that cannot be measured is not infinite.
     gone = metrics.measure(lost(truth, 500), masked(truth, slice(None)))
     assert gone.values["ate"] is None and gone.reasons["ate"] == "no trusted reference"
     pair = (Trajectory(*(part[:5] for part in path)) for path in (lost(truth, 3), truth))
@@ -301,23 +296,25 @@ def test_names_and_reasons():
 
 def test_a_diverged_estimate_has_infinite_errors():
     truth = walk()
-    estimate, own = perturbed(truth), filtered(EYES, 3.0)
-    whole = metrics.measure(estimate, truth, filtered=own)
-    broken = metrics.measure(lost(estimate, 500), truth, filtered=own)
-    given = {"duration", "path_length"}
+    estimate, results = perturbed(truth), filtered(EYES, 3.0)
+    whole = metrics.measure(estimate, truth, filtered=results)
+    broken = metrics.measure(lost(estimate, 500), truth, filtered=results)
+    of_reference = {"duration", "path_length"}
     shares = {"nees_coverage", "nees_coverage_2d", "nis_coverage", "accepted"}
     assert broken.values.keys() == whole.values.keys() and not whole.reasons
     infinite = {name for name, value in broken.values.items() if value == np.inf}
-    assert infinite == whole.values.keys() - given - shares
+    assert infinite == whole.values.keys() - of_reference - shares
     assert all(broken.values[name] == 0 for name in shares)
-    assert all(broken.values[name] == whole.values[name] for name in given)
+    assert all(broken.values[name] == whole.values[name] for name in of_reference)
     assert set(broken.reasons.values()) == {"the estimate is not finite from 50.0 s on"}
     assert broken.diverged and not whole.diverged
     far = estimate._replace(position=np.full((900, 3), 1e300))
     far.position[0] = 0
-    found = metrics.measure(far, truth)
-    assert found.values["ate"] == np.inf and found.reasons["ate"].startswith("the error is too")
-    assert found.diverged
+    measures = metrics.measure(far, truth)
+    assert measures.values["ate"] == np.inf and measures.reasons["ate"].startswith(
+        "the error is too"
+    )
+    assert measures.diverged
 
 
 def test_agreement_with_evo(tmp_path):
@@ -350,11 +347,3 @@ def test_agreement_with_evo(tmp_path):
     other.align(reference)
     aligned = align(estimate, truth, "se3").position
     assert metrics.ate(aligned, truth.position) == rmse(evo.APE(part), other)
-
-
-def test_a_reference_with_other_stamps_is_no_reference():
-    truth = walk()
-    later = truth._replace(time=truth.time + 5.0)
-    for reference in (later, Trajectory(*(part[:-1] for part in truth))):
-        with pytest.raises(ValueError, match="has other stamps than the estimate"):
-            metrics.measure(truth, reference)

@@ -9,16 +9,18 @@ import subprocess
 import numpy as np
 import pytest
 
-from gnio_jax.config import TrainConfig
-from gnio_jax.evaluation import Estimate, Trajectory, page, plots, report
-from tests.support.estimates import SETTINGS, estimate, reported, with_covariance
+from gnio_jax.evaluation import SequenceEstimate, Trajectory, page
+from gnio_jax.evaluation.views import ellipses, make_view
+from tests.support.estimates import estimate, reported, with_covariance
 
 EVIL = "</script><script>alert('x')</script><b onmouseover=alert(1)>&amp; $$x$$"
 
 
 def run_of(estimates, *more, **named):
-    made = reported(estimates, notes={estimates[0].name: ["start: rough"]})
-    return page.of_report(made, [plots.view(each) for each in estimates], *more, **named)
+    report = reported(estimates, notes={estimates[0].name: ["start: rough"]})
+    return page.describe_report(
+        report, [make_view(estimate) for estimate in estimates], *more, **named
+    )
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,9 @@ def walks():
 @pytest.fixture(scope="module")
 def runs(walks):
     summed = [
-        Estimate(e.name, e.trajectory._replace(position=1.1 * e.trajectory.position), e.reference)
+        SequenceEstimate(
+            e.name, e.trajectory._replace(position=1.1 * e.trajectory.position), e.reference
+        )
         for e in walks
     ]
     ours = run_of(walks, "gnio evaluate --workdir 'a b'", "seed: 3")
@@ -49,22 +53,22 @@ def written(runs, tmp_path_factory):
 def test_thinned_curves_keep_the_largest_innovation(walks):
     nis = np.full(400, 2.0)
     nis[[0, 201]], nis[3:6] = [np.nan, 70.0], np.nan
-    seen = plots.view(walks[0]._replace(filtered=walks[0].filtered._replace(nis=nis)))
-    found = page.columns(seen, 150)
-    assert len(found["time"]) == 134 and found["time"][1] == pytest.approx(0.3)
-    np.testing.assert_allclose(found["x"][:3], seen.position[:9:3, 0], rtol=1e-6)
-    assert found["nis"][67] == 70.0 and found["nis"][0] == 2.0 and np.isnan(found["nis"][1])
-    assert "scale_x" not in found and np.isfinite(found["gate_x"][-1])
-    assert all(len(values) == 134 and values.dtype == np.float32 for values in found.values())
+    view = make_view(walks[0]._replace(filtered=walks[0].filtered._replace(nis=nis)))
+    curves = page.make_columns(view, 150)
+    assert len(curves["time"]) == 134 and curves["time"][1] == pytest.approx(0.3)
+    np.testing.assert_allclose(curves["x"][:3], view.position[:9:3, 0], rtol=1e-6)
+    assert curves["nis"][67] == 70.0 and curves["nis"][0] == 2.0 and np.isnan(curves["nis"][1])
+    assert "scale_x" not in curves and np.isfinite(curves["gate_x"][-1])
+    assert all(len(values) == 134 and values.dtype == np.float32 for values in curves.values())
 
 
 def test_the_map_has_room_for_the_ellipses(walks):
     walk = walks[0]
     for size in (1.0, 1e6):
-        seen = run_of([with_covariance(walk, size * walk.filtered.covariance)])
-        view = seen.views[0]
+        run = run_of([with_covariance(walk, size * walk.filtered.covariance)])
+        view = run.views[0]
         wide, half = view.position[:, 0], 3 * np.sqrt(view.filtered.covariance[:, 0, 0])
-        room = page.frame([seen], "walk")["x"]
+        room = page.frame([run], "walk")["x"]
         assert room == pytest.approx([(wide - half).min(), (wide + half).max()])
     nowhere = Trajectory(walk.reference.time, *(part * np.nan for part in walk.reference[1:]))
     lost = walk._replace(trajectory=nowhere, reference=nowhere)
@@ -72,7 +76,7 @@ def test_the_map_has_room_for_the_ellipses(walks):
 
 
 class Loads(html.parser.HTMLParser):
-    """What the tags of a page load, and how many there are of each."""
+    """The places from which the tags of a page load, and the tags."""
 
     def __init__(self, text):
         super().__init__()
@@ -104,50 +108,19 @@ def test_the_page_is_one_file_that_loads_nothing(written, runs):
     assert "never moves" in shown
 
 
-def test_without_a_reference_nothing_is_called_an_error(estimates):
+def test_a_page_without_a_reference_shows_no_error(estimates):
     run = run_of([estimates[2]._replace(name="a<b_c-d e")])
-    run = run._replace(warnings=("it <moves>",), about={"weights": "of walks"})
+    run = run._replace(warnings=("it <moves>",), facts={"weights": "of walks"})
     text = page.render("blind", [run])
     assert text.count("of walks") == 1 and "warning: it &lt;moves&gt;" in text
     assert text.index("it &lt;moves&gt;") < text.index('class="figures"') < text.index("of walks")
     assert "error (m)" not in text
     assert r"3\\u03c3 (m)" in text  # as JSON in a script has it
     assert '"value":"start"' in text
-    assert re.search(r"<label hidden>sequence", text)  # of a single one none is chosen
+    assert re.search(r"<label hidden>sequence", text)  # a single sequence needs no choice
     assert "<td>a&lt;b_<wbr>c-<wbr>d <wbr>e</td>" in text  # names break between their words
-    # χ² does not go by the name of the network's gate.
+    # The levels of χ² have another name than the network's gate.
     assert "refused above 11.3" in text and '"gate (11' not in text
-
-
-def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
-    settings = SETTINGS | {"model": "gnio", "checkpoint": "best", "step": 7}
-    settings |= {"rate": 100.0, "window_seconds": 1.0, "context_seconds": 0.0}
-    summed = {"estimator": "integrate", "coupling": None, "orientation_source": "device"}
-    of = {
-        "ours": {},
-        "summed": summed,
-        "again": {},
-        "older": {"definitions": 1},
-        "other": {"step": 8},
-        "another": {"split": "val"},
-        "elsewhere": {"data_root": "/elsewhere"},
-        "longer": {"recordings": {**SETTINGS["recordings"], "blind": 50.0}},
-    }
-    for name, changes in of.items():
-        own = made._replace(settings=settings | changes)
-        report.write(tmp_path / name, own, estimates, TrainConfig(), plots=False)
-    (tmp_path / "broken").mkdir()
-    (tmp_path / "broken" / "metrics.json").write_text("{")
-    found = page.beside(tmp_path / "ours", settings)
-    assert [run.name for run in found] == ["again", "integrate, device orientation"]
-    first = found[0]
-    assert first.figures == {name: own.values for name, own in made.scores.items()}
-    seen = {view.name: view for view in first.views}
-    whole = plots.view(estimates[0])
-    np.testing.assert_allclose(seen["room 1/walk"].position, whole.position, atol=1e-6)
-    np.testing.assert_allclose(seen["room 1/walk"].reference, whole.reference, atol=1e-8)
-    assert not seen["blind"].known and first.remarks[0] == "blind: start: rough"
-    assert first.summary["never moves"]["path_length_ratio"] == 0
 
 
 BROWSERS = "chromium", "chromium-browser", "google-chrome"
@@ -175,27 +148,28 @@ const waiting = setInterval(() => {
   document.body.innerText = JSON.stringify({...found, problems});
 }, 50);
 </script>"""
-"""What a reader does, and what the page then shows, in the place of the page."""
+"""A script that acts as a reader, and puts what the page then shows in its place."""
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason="no Chromium here (apt-get install chromium)")
 @pytest.mark.parametrize("width", [1500, 500])
-def test_in_a_browser(written, walks, tmp_path, width):
-    """Equal axes, though the map is wider than high; on a phone it is one column."""
+def test_a_browser_shows_the_page(written, walks, tmp_path, width):
+    """The axes have one scale, though the map is wider than high. On a phone the page has one
+    column."""
     before, end, after = written.read_text(encoding="utf-8").rpartition("</body>")
     probed = tmp_path / "probed.html"
     probed.write_text(f"{before}{PROBE}{end}{after}", encoding="utf-8")
     options = "--headless --no-sandbox --disable-gpu --virtual-time-budget=30000 --dump-dom".split()
     command = [BROWSER, *options, f"--window-size={width},900", probed.as_uri()]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
-    found = json.loads(html.unescape(re.search(r"<body[^>]*>(.*)</body>", shown, re.DOTALL)[1]))
-    assert found["perMetre"][0] == pytest.approx(found["perMetre"][1], rel=0.02)
-    assert found["beyond"] <= 0 and found["problems"] == [] and found["chosen"] == EVIL
-    whole = plots.view(walks[0])
-    (x, y), shapes = whole.position[120, :2], plots.ellipses(whole.filtered.covariance)
+    readings = json.loads(html.unescape(re.search(r"<body[^>]*>(.*)</body>", shown, re.DOTALL)[1]))
+    assert readings["perMetre"][0] == pytest.approx(readings["perMetre"][1], rel=0.02)
+    assert readings["beyond"] <= 0 and readings["problems"] == [] and readings["chosen"] == EVIL
+    whole = make_view(walks[0])
+    (x, y), shapes = whole.position[120, :2], ellipses(whole.filtered.covariance)
     error = np.linalg.norm((whole.position - whole.reference)[120, :2])
-    wanted = f"12.0 s  ·  x {x:.1f} m, y {y:.1f} m  ·  error {error:.2f} m"
-    assert found["first"].startswith(wanted)
-    assert f"3σ {shapes.major[120]:.2f} × {shapes.minor[120]:.2f} m" in found["first"]
-    assert found["second"].startswith("20.0 s") and found["second"] != found["first"]
+    expected = f"12.0 s  ·  x {x:.1f} m, y {y:.1f} m  ·  error {error:.2f} m"
+    assert readings["first"].startswith(expected)
+    assert f"3σ {shapes.major[120]:.2f} × {shapes.minor[120]:.2f} m" in readings["first"]
+    assert readings["second"].startswith("20.0 s") and readings["second"] != readings["first"]

@@ -1,19 +1,21 @@
-"""Starts, biases and cuts of recordings against what is known of them."""
+"""Starts, biases and cuts of recordings against those of simulated walks."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
 from gnio_jax import evaluation
-from gnio_jax.config.schema import TLIO_STD
+from gnio_jax.config import FilterSettings
 from gnio_jax.data.simulated import walks as simulated
-from gnio_jax.errors import InputError
-from gnio_jax.filtering import FilterConfig
+from gnio_jax.filtering import make_filter
 from gnio_jax.filtering.state import GYRO_BIAS
 from gnio_jax.numerics import yaw
 from tests.support.estimators import CONFIG, RATE, ready, rotations
+from tests.support.filter_settings import changed
 
 
-def test_start_is_the_first_trusted_sample_or_the_first_of_all(walks):
+def test_a_recording_starts_at_its_first_trusted_sample_or_at_its_first(walks):
     hidden = walks[0]._replace(valid=np.arange(len(walks[0].time)) >= 137)
     (recording,) = ready([hidden])
     assert recording.time[0] == walks[0].time[137]
@@ -23,8 +25,8 @@ def test_start_is_the_first_trusted_sample_or_the_first_of_all(walks):
     assert len(recording.gyro) == recording.strides * CONFIG.stride
     (recording,) = ready([hidden], init="static", from_first=True)
     assert recording.time[0] == walks[0].time[0] and not recording.start.position.any()
-    known = np.isfinite(recording.reference.position).all(1)
-    np.testing.assert_array_equal(known, recording.time >= walks[0].time[137])
+    trusted = np.isfinite(recording.reference.position).all(1)
+    np.testing.assert_array_equal(trusted, recording.time >= walks[0].time[137])
 
 
 BIAS = np.array([0.01, -0.02, 0.005])
@@ -64,7 +66,7 @@ def test_gyro_bias_from_reference_and_from_rest(walks, swaying):
     (recording,) = ready([biased], gyro_bias="reference")
     np.testing.assert_allclose(recording.start.gyro_bias, true + more, atol=1e-4)
     assert "10 s against the reference" in recording.notes[0]
-    biased = with_hole(biased, slice(100, 150))  # where the reference is there, the gyro is not
+    biased = with_hole(biased, slice(100, 150))  # the gyro lacks rows that the reference has
     biased.gyro[100:150] += 3.0
     (recording,) = ready([biased], gyro_bias="reference")
     np.testing.assert_allclose(recording.start.gyro_bias, true + more, atol=1e-4)
@@ -82,7 +84,7 @@ def test_short_sequences_are_left_out_by_name(walks):
     )
     lost = with_hole(walks[0], slice(30, None))._replace(name="lost")
     prepared, left_out = evaluation.prepare([short, lost, walks[1]], CONFIG)
-    assert [each.name for each in prepared] == [walks[1].name]
+    assert [recording.name for recording in prepared] == [walks[1].name]
     assert left_out.keys() == {"short", "lost"}
     assert left_out["short"].startswith("1.02 s measured from its first trusted sample on, too ")
     assert left_out["lost"].startswith("0.60 s ")
@@ -90,45 +92,46 @@ def test_short_sequences_are_left_out_by_name(walks):
 
 @pytest.mark.parametrize("compensated", ["no", "Android's gyro bias"])
 def test_a_raw_gyro_starts_with_a_wider_bias(walks, swaying, compensated):
-    """Not where the phone takes a bias off, nor where a rest has shown it."""
+    """It does not if the phone subtracts a bias, or if a rest has shown the bias."""
     attributes = {"imu_compensated": compensated, "placement": "unknown"}
     walk = walks[0]._replace(attributes=attributes)
-    (recording,) = ready([walk], raw_gyro_bias=0.05)
-    own = evaluation.prepare([walk], CONFIG)[0][0].start.level_gyro_bias
-    expected = 0.05 if compensated == "no" else own
-    assert recording.start.level_gyro_bias == expected and own < 0.01
-    assert recording.start.std.gyro_bias == own
-    state = recording.start.state(FilterConfig(1 / RATE, 10, 10))
+    ekf = dataclasses.replace(make_filter(CONFIG, FilterSettings()), raw_gyro_bias=0.05)
+    (recording,) = ready([walk], ekf=ekf)
+    std = evaluation.prepare([walk], CONFIG)[0][0].start.level_gyro_bias
+    expected = 0.05 if compensated == "no" else std
+    assert recording.start.level_gyro_bias == expected and std < 0.01
+    assert recording.start.std.gyro_bias == std
+    state = recording.start.state(ekf)
     up, covariance = np.asarray(state.rotation)[2], state.core_covariance[GYRO_BIAS, GYRO_BIAS]
     assert 0.01 < up[2] < 0.99  # no axis of the phone is vertical
     spreads = np.sqrt(np.linalg.eigvalsh(covariance))
-    np.testing.assert_allclose(spreads, [own, expected, expected], rtol=1e-6)
-    np.testing.assert_allclose(up @ covariance @ up, own**2, rtol=1e-6)
+    np.testing.assert_allclose(spreads, [std, expected, expected], rtol=1e-6)
+    np.testing.assert_allclose(up @ covariance @ up, std**2, rtol=1e-6)
     assert recording.start.raw_gyro == (compensated == "no") and recording.placement == ""
-    rest = resting(swaying, BIAS)._replace(attributes=attributes)
-    (recording,) = ready([rest], gyro_bias="rest", raw_gyro_bias=0.05)
-    assert recording.start.level_gyro_bias == own
+    resting_walk = resting(swaying, BIAS)._replace(attributes=attributes)
+    (recording,) = ready([resting_walk], ekf=ekf, gyro_bias="rest")
+    assert recording.start.level_gyro_bias == std
 
 
-def test_other_rates_are_resampled():
+def test_sequences_of_another_rate_are_resampled():
     walk = simulated.pedestrian(1, 1, "handheld", 6.0, 200.0)
     (recording,) = ready([walk])
     assert np.diff(recording.time) == pytest.approx(CONFIG.stride / RATE)
 
 
 def with_hole(sequence, rows):
-    """The IMU follows lines over the rows, and says so."""
-    there, row = np.ones(len(sequence.time), bool), np.arange(len(sequence.time))
-    there[rows] = False
+    """The sequence with straight lines in the place of some rows of the IMU, which are marked."""
+    measured, row = np.ones(len(sequence.time), bool), np.arange(len(sequence.time))
+    measured[rows] = False
     gyro, accel = (
-        np.column_stack([np.interp(row, row[there], axis[there]) for axis in each.T])
-        for each in (sequence.gyro, sequence.accel)
+        np.column_stack([np.interp(row, row[measured], axis[measured]) for axis in signal.T])
+        for signal in (sequence.gyro, sequence.accel)
     )
-    return sequence._replace(gyro=gyro, accel=accel, imu_valid=there)
+    return sequence._replace(gyro=gyro, accel=accel, imu_valid=measured)
 
 
-def test_a_line_across_a_gap_is_no_rest(clean):
-    """A walker whose log lacks its first second rests no more than any other."""
+def test_an_interpolated_gap_is_no_rest(clean):
+    """A log that lacks its first second has no rest there."""
     shake = 3 * np.sin(np.arange(len(clean.time)))[:, None] * [0.0, 1.0, 1.0]
     shaken = clean._replace(accel=clean.accel + shake, gyro=clean.gyro + shake / 3)
     holed = with_hole(shaken, slice(1, round(RATE)))
@@ -137,7 +140,7 @@ def test_a_line_across_a_gap_is_no_rest(clean):
     assert recording.start.std.velocity == 1.0 and recording.start.std.tilt > 0.01
 
 
-def test_a_rest_that_lacks_some_samples_is_a_rest(swaying):
+def test_a_rest_may_lack_some_samples(swaying):
     second = round(RATE)
     holed = with_hole(resting(swaying, BIAS, second), slice(5, 5 + second // 3))
     holed.gyro[10:15] += 1.0
@@ -146,35 +149,23 @@ def test_a_rest_that_lacks_some_samples_is_a_rest(swaying):
     assert "mean of 1 s of rest" in recording.notes[0] and recording.start.std.velocity < 0.1
 
 
-def test_a_static_start_is_as_far_off_level_as_the_accelerometer_may_be(clean):
+def test_the_tilt_of_a_static_start_has_the_uncertainty_of_the_accelerometer(clean):
     tilts = []
     for bias in (0.02, 0.2):
-        (recording,) = ready([clean], std=TLIO_STD._replace(accel_bias=bias), init="static")
+        ekf = make_filter(CONFIG, changed(start={"accel_bias": bias}))
+        (recording,) = ready([clean], ekf=ekf, init="static")
         tilts.append(recording.start.std.tilt)
         assert recording.start.std.accel_bias == bias
     spread = np.sqrt(tilts[0] ** 2 - (0.02 / 9.81) ** 2)
     assert tilts[1] == pytest.approx(np.hypot(spread, 0.2 / 9.81), rel=1e-3)
 
 
-def test_what_a_sequence_lacks_is_named_with_the_remedy(walks):
-    nowhere = walks[0]._replace(valid=np.zeros(len(walks[0].time), bool))
-    for how, remedy in [
-        ({}, "--init static"),
-        ({"init": "static", "gyro_bias": "reference"}, "--gyro-bias zero"),
-        ({"init": "static", "orientation": "reference"}, "--orientation filter"),
-    ]:
-        with pytest.raises(InputError, match=remedy):
-            ready([nowhere], **how)
-    with pytest.raises(InputError, match="no device orientation"):
-        ready([walks[0]._replace(device_orientation=None)], orientation="device")
-
-
-def test_the_devices_attitude_has_the_yaw_of_the_start(walks):
+def test_the_attitude_of_the_device_gets_the_yaw_of_the_start(walks):
     (recording,) = ready(walks[:1], orientation="device")
-    own = rotations(walks[0].device_orientation[: len(recording.attitude)]).as_matrix()
-    turn = recording.attitude[0] @ own[0].T
+    device = rotations(walks[0].device_orientation[: len(recording.attitude)]).as_matrix()
+    turn = recording.attitude[0] @ device[0].T
     np.testing.assert_allclose(turn[2], [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(recording.attitude, turn @ own, atol=1e-12)
+    np.testing.assert_allclose(recording.attitude, turn @ device, atol=1e-12)
     start = rotations(walks[0].orientation[:1]).as_matrix()
     np.testing.assert_allclose(yaw(recording.attitude[:1]), yaw(start), atol=1e-12)
 
@@ -190,6 +181,6 @@ def test_the_gyro_bridges_an_attitude_that_is_missing(walks):
     # 1.4 s of gyro with its bias.
     np.testing.assert_allclose(bridged[190:260], truth[190:260], atol=0.03)
     zeros = gap._replace(orientation=walks[0].orientation.copy())
-    zeros.orientation[200:260] = 0.0  # what is not trusted need be no rotation
+    zeros.orientation[200:260] = 0.0  # an untrusted row need not be a rotation
     (other,) = ready([zeros], orientation="reference")
     np.testing.assert_array_equal(other.attitude, bridged)

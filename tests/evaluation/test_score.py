@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory, score_files
 from gnio_jax.evaluation.trajectory import write_tum
 from tests.support.command_lines import run
@@ -43,7 +42,7 @@ def test_poses_are_matched_as_evo_matches_them(files, of_truth, of_estimate):
     places = files(truth, estimate)
     reference, other = sync.associate_trajectories(*map(read_tum_trajectory_file, places))
     for how in ("none", "se3"):
-        own = score_files(*places, how).scores["odometry"].values
+        values = score_files(*places, how).scores["odometry"].values
         if how == "se3":
             other.align(reference)
         ape = metrics.APE(metrics.PoseRelation.translation_part)
@@ -51,63 +50,47 @@ def test_poses_are_matched_as_evo_matches_them(files, of_truth, of_estimate):
         statistics = ape.get_all_statistics()
         names = {"ate": "rmse", "ate_mean": "mean", "ate_median": "median", "ate_max": "max"}
         for name, theirs in names.items():
-            assert own[name] == pytest.approx(statistics[theirs], rel=1e-6), (how, name)
+            assert values[name] == pytest.approx(statistics[theirs], rel=1e-6), (how, name)
 
 
-def test_of_two_poses_beside_one_of_the_reference_the_nearer_counts(files):
+def test_the_nearer_of_two_poses_counts(files):
     truth = walk()
-    near, far = (truth._replace(time=truth.time + late) for late in (0.003, -0.007))
+    near, far = (truth._replace(time=truth.time + delay) for delay in (0.003, -0.007))
     wrong = far._replace(position=far.position + 1.0)
-    pairs = (np.stack(both, 1) for both in zip(wrong, near, strict=True))
-    estimate = Trajectory(*(each.reshape(-1, *each.shape[2:]) for each in pairs))
+    pairs = (np.stack(poses, 1) for poses in zip(wrong, near, strict=True))
+    estimate = Trajectory(*(part.reshape(-1, *part.shape[2:]) for part in pairs))
     assert score_files(*files(truth, estimate), "none").scores["odometry"].values["ate"] < 1e-6
 
 
-def test_no_pose_is_lost_where_stamps_are_uneven(files):
-    """Every second pose lies 20 ms behind the one before it, and is a metre off."""
+def test_every_pose_counts_if_stamps_are_uneven(files):
+    """Every second pose is 20 ms after the one before it, and has an error of 1 m."""
     whole = walk()
     time = np.stack([whole.time, whole.time + 0.02], 1).ravel()
     truth = Trajectory(time, *(np.repeat(part, 2, axis=0) for part in whole[1:]))
     off = np.tile([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], (len(whole.time), 1))
     estimate = truth._replace(position=truth.position + off)
     places = files(truth, estimate)
-    found = score_files(*places, "none")
-    assert found.scores["odometry"].values["ate"] == pytest.approx(np.sqrt(0.5), rel=1e-6)
-    assert f"{len(time):,} poses" in found.settings["split"]
+    report = score_files(*places, "none")
+    assert report.scores["odometry"].values["ate"] == pytest.approx(np.sqrt(0.5), rel=1e-6)
+    assert f"{len(time):,} poses" in report.settings["split"]
 
 
-def test_what_is_over_time_keeps_its_time(files):
-    """A second has as many rows as the stamps say, also where poses are missing: a heading that is
-    wrong throughout costs displacements nothing."""
+def test_metrics_over_time_use_the_stamps(files):
+    """A second has as many rows as the stamps say, also where poses are missing. A constant error
+    of the heading does not change displacements."""
     truth = walk()
     estimate = moved_by(truth, SPIN, [5.0, 1.0, 0.0])
     holed = Trajectory(*(np.delete(part, slice(300, 417), axis=0) for part in estimate))
-    found = score_files(*files(truth, holed)).scores["odometry"].values
-    assert found["rpe_1s"] < 1e-6 and found["ate"] < 1e-6
-    assert found["duration"] == pytest.approx(truth.time[-1] - truth.time[0])
+    values = score_files(*files(truth, holed)).scores["odometry"].values
+    assert values["rpe_1s"] < 1e-6 and values["ate"] < 1e-6
+    assert values["duration"] == pytest.approx(truth.time[-1] - truth.time[0])
 
 
-def test_the_table_is_that_of_an_evaluation(files, capsys):
+def test_the_command_prints_the_table_of_an_evaluation(files, capsys):
     truth = walk()
     estimate = truth._replace(position=truth.position * [1.02, 1.02, 1.0])
     run("score", *map(str, files(truth, estimate)), "--alignment", "none")
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     ate = 0.02 * np.sqrt(np.mean(np.sum(truth.position[:, :2] ** 2, axis=1)))
-    assert f" {ate:.2f} " in told and "1.02" in told and "never_moves" in told
-    assert "odometry.txt against 900 poses of truth.txt" in told and "none alignment" in told
-
-
-@pytest.mark.parametrize(
-    "rows, shift, words",
-    [
-        (slice(None), 1e4, "fewer than two stamps are the same to 0.01 s"),
-        (slice(0, 1), 0.0, "single pose"),
-        ([0, 1, 2, 899], 0.0, "only 4 stamps in 90 s, unevenly spaced"),
-    ],
-)
-def test_files_of_other_clocks_are_refused(files, rows, shift, words):
-    truth = walk()
-    other = Trajectory(*(part[rows] for part in truth))
-    places = files(other._replace(time=other.time + shift), truth)
-    with pytest.raises(InputError, match=f"odometry.txt: .*{words}.*truth.txt"):
-        score_files(*places)
+    assert f" {ate:.2f} " in output and "1.02" in output and "never_moves" in output
+    assert "odometry.txt against 900 poses of truth.txt" in output and "none alignment" in output

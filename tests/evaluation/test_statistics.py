@@ -19,15 +19,15 @@ def seeds_of(ates, names=None):
 ALONE = {name: name for name in "abcdefgh"}
 
 
-def test_it_is_students_interval_of_the_groups_means():
-    """Of groups of one size, in any order; there is none of one group, nor of what is infinite."""
+def test_the_interval_is_students_over_the_means_of_groups():
+    """Groups have one size and any order. One group has no interval, nor has an infinite value."""
     values = np.random.default_rng(0).normal(5.0, 2.0, 7)
-    wanted = stats.t.interval(0.95, 6, values.mean(), stats.sem(values))
-    assert interval(values, range(7)) == pytest.approx(wanted)
+    expected = stats.t.interval(0.95, 6, values.mean(), stats.sem(values))
+    assert interval(values, range(7)) == pytest.approx(expected)
     values, means = np.array([1.0, 5.0, 1.2, 5.2, 2.0, 2.2]), np.array([1.1, 5.1, 2.1])
-    wanted = stats.t.interval(0.95, 2, means.mean(), stats.sem(means))
-    assert interval(values, "xyxyzz") == pytest.approx(wanted)
-    assert interval(values[::-1], "zzyxyx") == pytest.approx(wanted)
+    expected = stats.t.interval(0.95, 2, means.mean(), stats.sem(means))
+    assert interval(values, "xyxyzz") == pytest.approx(expected)
+    assert interval(values[::-1], "zzyxyx") == pytest.approx(expected)
     assert interval(values, ["x"] * 6) is None
     assert interval(values[:0], []) is None
     assert interval(np.array([1.0, np.inf]), "xy") is None
@@ -35,28 +35,28 @@ def test_it_is_students_interval_of_the_groups_means():
 
 
 def test_divergence_never_improves_a_summary():
-    """The worst of six errors diverge: the mean is of the others and counts them, the median gets
-    no smaller, and is infinite with half."""
+    """The worst of six errors diverge: the mean and its number are those of the others, and the
+    median never decreases; it is infinite if half of them diverged."""
     errors = [1.0, 2.0, 3.0, 4.0, 5.0, 60.0]
     groups = dict(zip("abcdef", "xxxyyy", strict=True))
-    found = [
+    summaries = [
         summarise(seeds_of([errors[: 6 - bad] + [LOST] * bad]), "ate", groups)
         for bad in (0, 1, 3, 6)
     ]
-    assert [s.diverged for s in found] == [0, 1, 3, 6]
-    assert [s.sequences for s in found] == [6, 5, 3, 0]
-    assert [s.estimates for s in found] == [6] * 4
-    assert [s.median for s in found] == [3.5, 3.5, np.inf, np.inf]
-    assert [s.mean for s in found] == [12.5, 3.0, 2.0, None]
+    assert [s.diverged for s in summaries] == [0, 1, 3, 6]
+    assert [s.sequences for s in summaries] == [6, 5, 3, 0]
+    assert [s.estimates for s in summaries] == [6] * 4
+    assert [s.median for s in summaries] == [3.5, 3.5, np.inf, np.inf]
+    assert [s.mean for s in summaries] == [12.5, 3.0, 2.0, None]
     # Of 1, 2, 3 and 4, 5: sums of deviations −3 and 3, standard error √2 √18 / 5, t of 1 degree.
     reach = 12.7062 * np.sqrt(2 * 18) / 5
-    assert found[1].interval == pytest.approx((3 - reach, 3 + reach), rel=1e-5)
-    assert found[1].groups == 2
-    assert [s.interval for s in found[2:]] == [None, None]  # one group is left, or none
+    assert summaries[1].interval == pytest.approx((3 - reach, 3 + reach), rel=1e-5)
+    assert summaries[1].groups == 2
+    assert [s.interval for s in summaries[2:]] == [None, None]  # one group remains, or none
 
 
-def test_divergence_is_of_the_sequence_and_leaves_every_mean():
-    """Of four: whole, lost, whole with a bad covariance, without a reference and lost."""
+def test_a_diverged_sequence_is_in_no_mean():
+    """Walk a is whole, b diverged, c has a bad covariance, d has no reference and diverged."""
     fields = ("ate", "nees", "nees_coverage", "accepted", "path_length")
     rows = {
         "a": (1.0, 2.0, 90.0, 80.0, 10.0),
@@ -65,27 +65,29 @@ def test_divergence_is_of_the_sequence_and_leaves_every_mean():
     }
     scores = {name: measures(**dict(zip(fields, row, strict=True))) for name, row in rows.items()}
     scores["d"] = Measures({"ate": None, "nis": LOST, "accepted": 3.0}, {}, True)
-    found = {metric: summarise([scores], metric, ALONE) for metric in (*fields, "nis")}
+    summaries = {metric: summarise([scores], metric, ALONE) for metric in (*fields, "nis")}
     means = dict(zip(fields, (2.0, np.inf, 45.0, 75.0, 15.0), strict=True))
-    assert {metric: of.mean for metric, of in found.items()} == means | {"nis": None}
-    assert {m: of.sequences for m, of in found.items()} == dict.fromkeys(fields, 2) | {"nis": 0}
+    assert {metric: of.mean for metric, of in summaries.items()} == means | {"nis": None}
+    assert {m: of.sequences for m, of in summaries.items()} == dict.fromkeys(fields, 2) | {"nis": 0}
     lost = dict.fromkeys(fields, 1) | {"nis": 1, "accepted": 2}
-    assert {metric: of.diverged for metric, of in found.items()} == lost
-    assert found["nees"].interval is None
+    assert {metric: of.diverged for metric, of in summaries.items()} == lost
+    assert summaries["nees"].interval is None
     reach = 12.7062 * 5  # t of one degree of freedom
-    assert found["path_length"].interval == pytest.approx((15 - reach, 15 + reach), rel=1e-4)
-    assert found["ate"].median == 3.0 and found["nees"].median == np.inf
+    assert summaries["path_length"].interval == pytest.approx((15 - reach, 15 + reach), rel=1e-4)
+    assert summaries["ate"].median == 3.0 and summaries["nees"].median == np.inf
 
 
-def test_seeds_are_averaged_over_the_sequences_that_all_have():
-    found = summarise(seeds_of([[1.0, 2.0, 9.0], [3.0, 4.0]]), "ate", ALONE)
-    assert found.seeds == [1.5, 3.5] and found.mean == 2.5 and found.std == pytest.approx(2**0.5)
-    assert found.estimates == 4  # † is of these
+def test_seeds_are_averaged_over_the_sequences_of_all_seeds():
+    summary = summarise(seeds_of([[1.0, 2.0, 9.0], [3.0, 4.0]]), "ate", ALONE)
+    assert (
+        summary.seeds == [1.5, 3.5] and summary.mean == 2.5 and summary.std == pytest.approx(2**0.5)
+    )
+    assert summary.estimates == 4  # † is of these
     whole = seeds_of([[1.0, 2.0], [3.0, 4.0]])
     whole[1]["a"] = measures(ate=None)
     assert summarise(whole, "ate", ALONE).seeds == [2.0, 4.0]
     mixed = seeds_of([[1.0, 2.0], [3.0, LOST]]), seeds_of([[LOST, LOST], [1.0, 1.0]])
-    assert [summarise(each, "ate", ALONE).median for each in mixed] == [2.5, np.inf]
+    assert [summarise(seeds, "ate", ALONE).median for seeds in mixed] == [2.5, np.inf]
 
 
 def test_the_interval_of_a_share_ends_where_shares_do():
@@ -100,54 +102,62 @@ def test_the_interval_of_a_share_ends_where_shares_do():
 
 def test_sequences_are_paired_by_name():
     first, second = seeds_of([[9.0, 2.0, 4.0]]), seeds_of([[50.0, 2.0, 1.0]], "hcb")
-    found = compare(second, first, "ate", ALONE)
-    assert (found.compared, found.sequences) == (2, 4)
-    assert found.mean == pytest.approx(-1.5) and found.gain == pytest.approx(50.0)
+    difference = compare(second, first, "ate", ALONE)
+    assert (difference.compared, difference.sequences) == (2, 4)
+    assert difference.mean == pytest.approx(-1.5) and difference.gain == pytest.approx(50.0)
     # −1 and −2: a standard error of 0.5, and one degree of freedom.
-    assert found.interval == pytest.approx((-1.5 - 6.3531, -1.5 + 6.3531), rel=1e-4)
-    found = compare(seeds_of([[1.0]], "h"), first, "ate", ALONE)
-    assert (found.mean, found.gain, found.interval, found.compared) == (None, None, None, 0)
+    assert difference.interval == pytest.approx((-1.5 - 6.3531, -1.5 + 6.3531), rel=1e-4)
+    difference = compare(seeds_of([[1.0]], "h"), first, "ate", ALONE)
+    assert (difference.mean, difference.gain, difference.interval, difference.compared) == (
+        None,
+        None,
+        None,
+        0,
+    )
 
 
 @pytest.mark.parametrize("seeds, metric", [(1, "ate"), (3, "ate"), (1, "waypoint_rms")])
 @pytest.mark.parametrize("share", [1.0, 0.5])
-def test_a_row_is_never_better_for_having_diverged(seeds, share, metric):
+def test_divergence_never_makes_a_row_better(seeds, share, metric):
     """Its hardest sequence diverges with one seed; its other errors are as small or smaller."""
     ates = np.array([1.0, 2.0, 3.0, 40.0])
     wrong = np.tile(share * ates, (seeds, 1))
     wrong[0, 3] = LOST
-    first, own = (
+    first, row = (
         [
-            {name: one._replace(values={metric: one.values["ate"]}) for name, one in each.items()}
-            for each in seeds_of(rows)
+            {name: one._replace(values={metric: one.values["ate"]}) for name, one in scores.items()}
+            for scores in seeds_of(rows)
         ]
         for rows in ([list(ates)] * seeds, wrong.tolist())
     )
-    found = compare(own, first, metric, ALONE)
-    assert found.compared == 3 and found.withheld == (share < 1)
-    assert (found.mean, found.interval) == ((0, (0, 0)) if share == 1 else (None, None))
-    back = compare(first, own, metric, ALONE)  # the other way about it may lose
+    difference = compare(row, first, metric, ALONE)
+    assert difference.compared == 3 and difference.withheld == (share < 1)
+    assert (difference.mean, difference.interval) == ((0, (0, 0)) if share == 1 else (None, None))
+    back = compare(first, row, metric, ALONE)  # the other row may lose
     assert back.gain == pytest.approx(100 * (1 - 1 / share))
     assert back.mean == pytest.approx((1 - share) * 2)
 
 
-def test_of_rows_with_different_numbers_of_seeds_the_shares_that_diverged_count():
-    """One of four against one of eight: the smaller number of divergences is the larger share."""
+def test_rows_with_different_numbers_of_seeds_are_compared_by_their_share_of_divergences():
+    """One of four estimates diverged, and one of eight: the same number is another share."""
     first = seeds_of([[1.0, 2.0, 3.0, LOST], [1.0, 2.0, 3.0, 4.0]])
     assert compare(seeds_of([[0.5, 1.0, 1.5, LOST]]), first, "ate", ALONE).withheld
     twice = seeds_of([[1.0, 2.0, 3.0, LOST]])
     assert not compare(seeds_of([[0.5, 1.0, 1.5, LOST]] * 2), twice, "ate", ALONE).withheld
 
 
-def test_better_is_nearer_to_the_best_value():
-    first, own = seeds_of([[0.7], [1.4]]), seeds_of([[0.9]])
-    assert compare(own, first, "ate", ALONE, best=1.0).better == 1
-    assert compare(first, own, "ate", ALONE, best=1.0).better == 0
+def test_a_better_row_is_nearer_to_the_best_value():
+    first, row = seeds_of([[0.7], [1.4]]), seeds_of([[0.9]])
+    assert compare(row, first, "ate", ALONE, best=1.0).better == 1
+    assert compare(first, row, "ate", ALONE, best=1.0).better == 0
 
 
-def test_other_metrics_of_a_lost_estimate_are_in_no_difference():
-    own = [{"a": measures(ate=LOST, rpe=0.1), "b": measures(ate=1.0, rpe=0.2)}]
+def test_no_difference_has_a_metric_of_a_diverged_estimate():
+    row = [{"a": measures(ate=LOST, rpe=0.1), "b": measures(ate=1.0, rpe=0.2)}]
     first = [{"a": measures(ate=1.0, rpe=0.5), "b": measures(ate=2.0, rpe=0.1)}]
-    found = compare(own, first, "rpe", ALONE)
-    back = compare(first, own, "rpe", ALONE)
-    assert found.compared == back.compared == 1 and found.mean == pytest.approx(0.1) == -back.mean
+    difference = compare(row, first, "rpe", ALONE)
+    back = compare(first, row, "rpe", ALONE)
+    assert (
+        difference.compared == back.compared == 1
+        and difference.mean == pytest.approx(0.1) == -back.mean
+    )

@@ -1,4 +1,4 @@
-"""The table on the screen names what matters, and fits into it."""
+"""The table on the screen: its content, and its width."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from rich.console import Console
 
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.metrics import OF_WAYPOINTS
-from gnio_jax.evaluation.statistics import Cell, Difference, Summary
+from gnio_jax.evaluation.statistics import Cell, Difference, MetricSummary
 
 
 def text(report, width=80):
@@ -20,14 +20,14 @@ def rows(report, width=80):
     return {line.split("  ")[1].strip(): line.split() for line in lines}
 
 
-def test_the_table_says_what_matters(made):
-    shown = " ".join(text(made).split())
+def test_the_table_has_figures_choices_and_notes(made_report):
+    shown = " ".join(text(made_report).split())
     assert "[" not in shown  # no heading is markup
     for words in ("made test: ekf", "room 1/walk", "never_moves", "window orientation: filter"):
         assert words in shown
     for words in ("IMU compensated: no", "blind: start: rough", "left out: short", "–"):
         assert words in shown
-    table, summary = rows(made), made.summary()
+    table, summary = rows(made_report), made_report.summary()
     assert f"{summary['ate'].mean:.2f}" in table["mean"]
     assert table["blind"][1:4] == ["–"] * 3
     assert table["groups"][1:] == [str(summary[name].groups) for name in tabulate.SCREEN]
@@ -36,12 +36,13 @@ def test_the_table_says_what_matters(made):
 
 
 @pytest.mark.parametrize("tapped", [False, True])
-def test_the_table_fits_into_80_columns_and_breaks_names_between_their_words(made, tapped):
-    name, measured = "2023-11-25T12-30_person-17_pocket_left_down", made.scores["room 1/walk"]
-    values = dict.fromkeys([*measured.values, *(OF_WAYPOINTS if tapped else ())], 123456.7)
-    scores = {name: measured._replace(values=values), "b": measured}
+def test_the_table_fits_into_80_columns_and_breaks_names_between_their_words(made_report, tapped):
+    name = "2023-11-25T12-30_person-17_pocket_left_down"
+    measures = made_report.scores["room 1/walk"]
+    values = dict.fromkeys([*measures.values, *(OF_WAYPOINTS if tapped else ())], 123456.7)
+    scores = {name: measures._replace(values=values), "b": measures}
     rows_below = {"never_moves": scores, "perfect_displacements": scores}
-    report = made._replace(
+    report = made_report._replace(
         scores=scores, reference_rows=rows_below, groups={name: "x", "b": "y"}, notes={}
     )
     lines = text(report).splitlines()
@@ -51,34 +52,36 @@ def test_the_table_fits_into_80_columns_and_breaks_names_between_their_words(mad
     assert all(words in heads for words in (("ATE", "leg", "waypoint") if tapped else whole))
     assert ("leg" in heads) == tapped
     names = [line[2:30].split("  ")[0].strip() for line in lines if line.startswith("  ")]
-    pieces = [each for each in names if len(each) > 1 and each in name]
-    assert name in "".join(pieces) and all(each[-1] in "-_" for each in pieces[:-1])
+    pieces = [piece for piece in names if len(piece) > 1 and piece in name]
+    assert name in "".join(pieces) and all(piece[-1] in "-_" for piece in pieces[:-1])
 
 
-def test_divergence_is_in_the_table(made, with_divergence):
+def test_divergence_is_in_the_table(made_report, with_divergence):
     table = rows(with_divergence[1], 120)
     assert "mean without 1 diverged" in table and "mean" not in table
     assert table["room 1:walk"].count("∞") == 5
     shown = " ".join(text(with_divergence[1]).split())
     assert "∞: the estimate diverged" in shown
     assert "room 1:walk: the estimate diverged, and is in no mean" in shown
-    assert "diverged" not in text(made)
+    assert "diverged" not in text(made_report)
 
 
-def test_a_difference_has_the_digits_of_its_interval_and_a_mean_its_seeds():
+def test_cells_have_the_digits_of_an_interval_and_the_spread_of_seeds():
     """A mean of 3.0 ° may differ by 0.0045 °."""
-    found = Difference(0.00452, (0.00213, 0.00709), None, 1, 2, 2, 2)
-    assert tabulate.difference(found, 1) == "+0.0045 (+0.0021 to +0.0071)"
-    assert tabulate.difference(found._replace(interval=None, sequences=3), 1) == "+0.0045 over 2"
-    assert tabulate.difference(found._replace(mean=None, withheld=True), 1) == "– ‡"
-    mean = Summary(2.25, [1.5, 3.0], 2.0, None, 3, 2, 0, 8)
+    difference = Difference(0.00452, (0.00213, 0.00709), None, 1, 2, 2, 2)
+    assert tabulate.difference(difference, 1) == "+0.0045 (+0.0021 to +0.0071)"
+    assert (
+        tabulate.difference(difference._replace(interval=None, sequences=3), 1) == "+0.0045 over 2"
+    )
+    assert tabulate.difference(difference._replace(mean=None, withheld=True), 1) == "– ‡"
+    mean = MetricSummary(2.25, [1.5, 3.0], 2.0, None, 3, 2, 0, 8)
     assert tabulate.mean(mean, 2) == "2.25 ± 1.06"
     assert tabulate.mean(mean._replace(seeds=[2.25], diverged=1), 2) == "2.25 † 1/8"
     assert tabulate.mean(mean._replace(mean=None, seeds=[]), 2) == "–"
 
 
 def test_marks_are_explained():
-    mean = Summary(1.0, [1.0], 1.0, None, 3, 2, 0, 3)
+    mean = MetricSummary(1.0, [1.0], 1.0, None, 3, 2, 0, 3)
     less = Difference(-1, (-2, 0), 50, 2, 3, 3, 2)
     withheld = Difference(None, None, None, 0, 3, 3, 1, True)
     for cell, beginnings in (
@@ -89,6 +92,6 @@ def test_marks_are_explained():
         (Cell(mean._replace(seeds=[np.inf]), None), ["∞"]),
         (Cell(mean._replace(mean=None, seeds=[]), None), ["–"]),
     ):
-        found = tabulate.marks([Cell(mean, None), cell])
-        assert len(found) == len(beginnings)
-        assert all(line.startswith(words) for line, words in zip(found, beginnings, strict=True))
+        lines = tabulate.marks([Cell(mean, None), cell])
+        assert len(lines) == len(beginnings)
+        assert all(line.startswith(words) for line, words in zip(lines, beginnings, strict=True))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering
+from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 
 
 @pytest.mark.parametrize("x", [[1.0, -2.0, 3.0], [-2.0]])
@@ -36,6 +37,29 @@ def test_on_one_device_also_of_what_is_no_array(monkeypatch, count):
     found = filtering.over_sequences(lambda w, x: {"x": w * x, "w": 1.0}, shared=1)(2.0, x)
     np.testing.assert_array_equal(found["x"], 2.0 * np.asarray(x))
     np.testing.assert_array_equal(found["w"], np.ones(count))
+
+
+def test_batches_are_of_similar_lengths_and_the_last_is_filled_up():
+    """With its shortest member."""
+    lengths = [30, 50, 10, 40, 20]
+    assert batches(lengths, 3, lambda longest: longest + 5) == [
+        Batch([1, 3, 0], 55),
+        Batch([4, 2, 2], 25),
+    ]
+
+
+def test_recordings_begin_together_and_are_filled_up_behind_their_ends():
+    """With rest and the last force, which no mask excludes; a longer one is cut."""
+    signals = [(np.full((m, 3), 1.0 * m), np.arange(3.0 * m).reshape(m, 3)) for m in (2, 5)]
+    gyro, accel = padded_signals(signals, 4)
+    np.testing.assert_array_equal(gyro[0, :, 0], [2, 2, 0, 0])
+    np.testing.assert_array_equal(accel[0, :, 0], [0, 3, 3, 3])
+    np.testing.assert_array_equal(gyro[1, :, 0], [5, 5, 5, 5])
+    np.testing.assert_array_equal(accel[1, :, 2], [2, 5, 8, 11])
+    masks = [None, np.array([False, True]), np.array([True, False, True, True, False])]
+    expected = [[1, 1, 1, 1], [0, 1, 1, 1], [1, 0, 1, 1]]
+    np.testing.assert_array_equal(padded_masks(masks, 4), np.array(expected, bool))
+    assert padded_masks([None, None], 4) is None
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
-"""Values that cannot be: refused by name at the door, and reported inside `jit`."""
+"""Impossible values are rejected by name, eagerly, and reported inside `jit`."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.filtering.checks import checked_inputs
+from gnio_jax.filtering.history import describe_failure
 from gnio_jax.filtering.state import CLONE, with_correlated_error
 from tests.support.checks import unchecked
 from tests.support.random_walk import random_walk
@@ -22,7 +24,7 @@ SAMPLES, NAN = len(GYRO), float("nan")
 
 
 def start():
-    return filtering.initial_state(CONFIG, *POSE)
+    return filtering.initial_state(filtering.Filter(CONFIG), *POSE)
 
 
 def put(array, at, value):
@@ -57,7 +59,7 @@ def wrong():
     yield "noise.gyro_density", {"noise": NOISE._replace(gyro_density=np.zeros(3))}
     yield "noise.measurement_scale", {"noise": NOISE._replace(measurement_scale=0.0)}
     yield "noise.std_factor", {"noise": NOISE._replace(std_factor=(1.0, 0.0, 1.0))}
-    other = filtering.initial_state(filtering.FilterConfig(DT, N, 3), *POSE)
+    other = filtering.initial_state(filtering.Filter(filtering.FilterConfig(DT, N, 3)), *POSE)
     yield r"state.clone_rotation: the shape must be \(5, 3, 3\)", {"state": other}
     less = state.core_covariance - jnp.eye(21)
     yield "state.core_covariance", {"state": state._replace(core_covariance=less)}
@@ -68,7 +70,9 @@ def wrong():
             {"state": state._replace(core_covariance=lopsided)},
         )
     clones = CLONE * CONFIG.clones
+    angles_and_offsets = np.tile(np.repeat([1e-4, 1e8], 3), CONFIG.clones)  # rad² and m²
     for problem, covariance in (
+        ("positive definite", np.diag(angles_and_offsets - 2e-4 * (np.arange(clones) == 6))),
         ("positive definite", -np.eye(clones)),
         ("positive definite", np.eye(clones) + 1.1 * (np.eye(clones, k=6) + np.eye(clones, k=-6))),
         ("symmetric", np.eye(clones) + 0.1 * np.eye(clones, k=1)),
@@ -90,7 +94,8 @@ def wrong():
         yield f"measurements{problem}", {"measurements": measurements}
     yield "state.rotation", {"state": state._replace(rotation=2 * jnp.eye(3))}
     lost = with_correlated_error(state)._replace(correlated=np.array([0.0, NAN, 0.0]))
-    yield "state.correlated", {"state": lost, "noise": correlated}
+    correlated = filtering.Filter(CONFIG, correlated)
+    yield "state.correlated", {"state": lost, "ekf": correlated}
     for field in (
         *("velocity", "offset", "gyro_bias", "accel_bias", "anchor", "move", "clone_rotation"),
         *("clone_offset", "cross_covariance", "clone_covariance"),
@@ -102,7 +107,7 @@ def wrong():
 def arguments(**others):
     names = ("gyro", "accel", "displacement", "covariance")
     given = dict(zip(names, WALK[1:], strict=True))
-    return {"state": start(), **given, "config": CONFIG, "noise": NOISE, **others}
+    return {"ekf": filtering.Filter(CONFIG, NOISE), "state": start(), **given, **others}
 
 
 def test_arguments_that_cannot_be_are_refused_by_name():
@@ -110,11 +115,12 @@ def test_arguments_that_cannot_be_are_refused_by_name():
         with unchecked(), pytest.raises(ValueError, match=f"^{words}"):
             filtering.run_filter(**arguments(**spoilt))
     missing = np.arange(SAMPLES) != 7
-    checked_inputs(start(), put(GYRO, (7, 1), -101.0), ACCEL, missing, (), CONFIG, NOISE)
+    ekf = filtering.Filter(CONFIG, NOISE)
+    checked_inputs(ekf, start(), put(GYRO, (7, 1), -101.0), ACCEL, missing, ())
     for beginning in (
         *(
             "covariance: 1 of",
-            "noise.accel_density",
+            "ekf.noise.accel_density",
             "imu_valid: must",
             "frame: must",
             "measurements",
@@ -133,17 +139,18 @@ def test_an_impossible_start_is_refused_by_name():
         ("position", np.zeros((1, 3))),
         ("gyro_bias", np.full(3, NAN)),
         ("accel_bias", np.zeros((3, 1))),
-        ("std.tilt", -1.0),
-        ("std.yaw", np.zeros(3)),
+        ("ekf.start.tilt", -1.0),
+        ("ekf.start.yaw", np.zeros(3)),
         ("level_gyro_bias", -0.05),
         ("level_gyro_bias", NAN),
         ("level_gyro_bias", np.full(3, 0.05)),
     ):
-        given = dict(zip(("rotation", "velocity", "position"), POSE, strict=True))
-        name, _, part = field.partition(".")
-        given[name] = filtering.InitialStd(**{part: value}) if part else value
+        pose = dict(zip(("rotation", "velocity", "position"), POSE, strict=True))
+        *part, name = field.split(".")
+        std = filtering.InitialStd(**{name: value} if part else {})
+        pose |= {} if part else {name: value}
         with pytest.raises(ValueError, match=f"^{field}:"):
-            filtering.initial_state(CONFIG, **given)
+            filtering.initial_state(filtering.Filter(CONFIG, start=std), **pose)
 
 
 def test_settings_that_make_no_sense_are_refused_by_name():
@@ -166,14 +173,13 @@ def test_settings_that_make_no_sense_are_refused_by_name():
 def test_the_precision_is_asked_for():
     single = [part.astype(np.float32) for part in POSE]
     with pytest.raises(ValueError, match=r"^rotation: .*float64, found float32.*allow_float32"):
-        filtering.initial_state(CONFIG, *single)
+        filtering.initial_state(filtering.Filter(CONFIG), *single)
     with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
-        filtering.initial_state(CONFIG, *POSE)
+        filtering.initial_state(filtering.Filter(CONFIG), *POSE)
     config = dataclasses.replace(CONFIG, allow_float32=True)
-    state = filtering.initial_state(config, *single)
-    given = arguments(state=state)
-    del given["config"]
-    found = jax.eval_shape(lambda given: filtering.run_filter(config=config, **given), given)
+    state = filtering.initial_state(filtering.Filter(config), *single)
+    given = arguments(state=state, ekf=filtering.Filter(config, NOISE))
+    found = jax.eval_shape(lambda given: filtering.run_filter(**given), given)
     floating = [x for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.floating)]
     assert all(leaf.dtype == jnp.float32 for leaf in floating)
 
@@ -183,20 +189,46 @@ def test_inside_jit_the_history_reports_it(correlation):
     """Also where the χ² gate tests the displacement: row 10 is its sixth."""
     config = dataclasses.replace(CONFIG, convergence_seconds=0.0)
     noise = NOISE._replace(correlation=correlation)
-    run = jax.jit(
-        lambda arguments: filtering.run_filter(config=config, noise=noise, **arguments)[1]
-    )
+    run = jax.jit(lambda arguments: filtering.run_filter(**arguments)[1])
     for name, bad in (("gyro", 1), ("covariance", 10)):
         spoilt = next(changes for words, changes in wrong() if words.startswith(f"{name}: 1 of"))
-        values = arguments(**spoilt)
-        history = run({k: v for k, v in values.items() if k not in ("config", "noise")})
+        history = run(arguments(**spoilt, ekf=filtering.Filter(config, noise)))
         np.testing.assert_array_equal(history.healthy, np.arange(INTERVALS) < bad)
+
+
+def test_the_cause_of_what_is_not_healthy_is_told():
+    """A force of 50 m/s² for a second, a value that is not finite, a hole, a start that was bad."""
+    limited = dataclasses.replace(CONFIG, speed_limit=20.0)
+    valid = np.ones(SAMPLES, bool)
+    valid[50:75] = False
+    run = jax.jit(lambda arguments: filtering.run_filter(**arguments)[1])
+
+    def cause(config, **changes):
+        ekf, missing = filtering.Filter(config, NOISE), np.full((INTERVALS, 3), NAN)
+        history = run(arguments(**{"ekf": ekf, "displacement": missing, **changes}))
+        return filtering.explain_failure(history, config)
+
+    pushed = put(ACCEL, np.s_[100:200, 0], 50.0)
+    too_fast = r"a speed of 2\d m/s, above the limit of 20 m/s"
+    assert cause(CONFIG) == ""
+    assert cause(CONFIG, gyro=put(GYRO, (7, 1), NAN)) == "a value is not finite"
+    assert re.fullmatch(too_fast, cause(limited, accel=pushed))
+    behind = rf"{too_fast}, behind a hole of 0\.5 s in the IMU's samples"
+    assert re.fullmatch(behind, cause(limited, accel=pushed, imu_valid=valid))
+    bad = start()._replace(healthy=jnp.bool_(False))
+    assert cause(CONFIG, state=bad) == "an earlier estimate was impossible"
+    mean, variances = start().mean, np.full(15, 1e-3)
+    variances[4] = -1e-9
+    assert describe_failure(mean, variances, CONFIG) == "a variance is below 0"
 
 
 def test_what_a_run_in_float32_leaves_is_a_state():
     """Its covariances are those of a start, up to rounding, and a later run takes it."""
     config = dataclasses.replace(CONFIG, allow_float32=True)
-    values = arguments(state=filtering.initial_state(config, *POSE), config=config)
+    values = arguments(
+        state=filtering.initial_state(filtering.Filter(config), *POSE),
+        ekf=filtering.Filter(config, NOISE),
+    )
     single = {
         name: np.asarray(values[name], np.float32)
         for name in ("gyro", "accel", "displacement", "covariance")

@@ -1,4 +1,4 @@
-"""Is the filter as certain as it may be? Monte Carlo with noises as it assumes them, correlated
+"""The filter is consistent (NEES, NIS): Monte Carlo with noises as it assumes them, correlated
 errors among them; and by autodiff the Jacobian of a measurement in its own frame."""
 
 import functools
@@ -43,10 +43,14 @@ def program():
     states and histories. A correlated error without size changes nothing (`test_scan`)."""
 
     def run(correlation, spread, rotation, velocity, position, gyro, accel, displacement):
-        start = filtering.initial_state(CONFIG, rotation, velocity, position, std=STD)
+        start = filtering.initial_state(
+            filtering.Filter(CONFIG, start=STD), rotation, velocity, position
+        )
         covariance = jnp.tile(spread[None], (len(displacement), 1, 1))
         noise = NOISE._replace(correlation=correlation)
-        return filtering.run_filter(start, gyro, accel, displacement, covariance, CONFIG, noise)
+        return filtering.run_filter(
+            filtering.Filter(CONFIG, noise), start, gyro, accel, displacement, covariance
+        )
 
     return optimised(jax.vmap(run, in_axes=(None, None, *6 * [0])))
 
@@ -117,7 +121,7 @@ def correlated():
     return with_correlated_errors(walks(), CLONES, CORRELATED_SIGMA, ERRORS, N * DT)
 
 
-def test_it_is_as_certain_as_it_may_be_with_correlated_errors():
+def test_the_filter_is_consistent_with_correlated_errors():
     runs, position = correlated(), PARTS["position"]
     error, spread, nis, _ = monte_carlo(runs, CORRELATED_SIGMA, ERRORS.share)
     assert 0.9 < nis[:, 100:].mean() / 3 < 1.1
@@ -138,8 +142,10 @@ def test_the_smoother_is_consistent_with_correlated_errors():
     @optimised
     @jax.vmap
     def run(rotation, velocity, position, *signals):
-        state = filtering.initial_state(CONFIG, rotation, velocity, position, std=STD)
-        return filtering.smooth(state, *signals, spread, CONFIG, noise)
+        state = filtering.initial_state(
+            filtering.Filter(CONFIG, start=STD), rotation, velocity, position
+        )
+        return filtering.smooth(filtering.Filter(CONFIG, noise), state, *signals, spread)
 
     smoothed = jax.device_get(run(*(part[:16] for part in runs[:6])))
     error = errors(jax.tree.map(lambda leaf: leaf[:16], runs), smoothed)
@@ -175,7 +181,7 @@ def told_by_a_network(R, gyro, accel, bias, weights, seen):
         return said(theta) - geometry.yaw_rotation(cut(theta)).T @ seen
 
     nothing, single = jnp.zeros(3), filtering.FilterConfig(0.01, 1, 1)
-    state = filtering.initial_state(single, jnp.eye(3), nothing, nothing)
+    state = filtering.initial_state(filtering.Filter(single), jnp.eye(3), nothing, nothing)
     clones = jnp.stack([R, jnp.eye(3)]), jnp.stack([-seen, nothing])
     state = state._replace(clone_rotation=clones[0], clone_offset=clones[1])
     step = Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), 1, 0, single, NOISE)

@@ -21,7 +21,6 @@ CONFIG = filtering.FilterConfig(
     N,
     CLONES,
     convergence_seconds=0.1,
-    zero_velocity_std=0.01,
     rest_seconds=0.1,
     gate_softness=2.0,
     gate_threshold=8.0,
@@ -80,7 +79,9 @@ def loss(x, around):
     moved = (
         part + change for part, change in zip(first[1:], jnp.split(x["state"], 4), strict=True)
     )
-    state = filtering.initial_state(CONFIG, first.rotation, *moved, std)
+    rest = filtering.ZeroVelocity(0.01)
+    ekf = filtering.Filter(CONFIG, noise, std, measurements=(rest,))
+    state = filtering.initial_state(ekf, first.rotation, *moved)
     shift, larger, later, spread_of_time = x["fix"]
     fix = filtering.Fix(
         jnp.asarray(FIX.position) + shift,
@@ -89,8 +90,8 @@ def loss(x, around):
         jnp.asarray(FIX.time_std) + spread_of_time,
         FIX.threshold,
     )
-    given = state, x["gyro"], x["accel"], CONFIG, noise, around.valid, (fix,)
-    _, history = filtering.run_odometry(network, *given)
+    given = state, x["gyro"], x["accel"], around.valid, (fix,)
+    _, history = filtering.run_odometry(network, ekf, *given)
     of_rows = (
         jnp.sum(WEIGHTS * history.position, axis=1)
         + jnp.sum(history.rotation[:, 0] + history.velocity, axis=1)
@@ -199,7 +200,7 @@ def test_gradients_are_finite_for_hostile_input():
     points = {"rest": x | still, "rejected": x | {"accel": knock}, "lost": x, "nose": x | turning}
     around = [WHOLE._replace(valid=lost) if kind == "lost" else WHOLE for kind in points]
     value, history, gradient = at(list(points.values()), around)
-    assert np.isfinite(value).all() and history.at_rest[0].any()
+    assert np.isfinite(value).all() and history.outcomes["zero_velocity"].accepted[0].any()
     assert np.nanmin(history.gate_passed[1]) < 1e-6 and np.isnan(history.nis[2, HALF:]).any()
     for name, leaf in gradient.items():
         for kind, each in zip(points, leaf, strict=True):

@@ -133,8 +133,8 @@ STD = filtering.InitialStd(position=0.5, velocity=0.3)
 
 @functools.partial(quick, static_argnames="config")
 def run(state, gyro, accel, displacement, covariance, config, fix):
-    arguments = state, gyro, accel, displacement, covariance, config, NOISE
-    return filtering.run_filter(*arguments, measurements=(fix,))
+    arguments = state, gyro, accel, displacement, covariance
+    return filtering.run_filter(filtering.Filter(config, NOISE), *arguments, measurements=(fix,))
 
 
 def drawn_fix(rows, seed=3):
@@ -153,7 +153,7 @@ def drawn_fix(rows, seed=3):
 def test_a_part_of_a_fix_is_the_textbooks_update():
     """By the whole covariance, for every set of components. One component that is 3 standard
     deviations off is refused, although with three components it would pass."""
-    state = filtering.initial_state(TEXTBOOK, *START, std=STD)
+    state = filtering.initial_state(filtering.Filter(TEXTBOOK, start=STD), *START)
     fixes, covariance = drawn_fix(ROWS), jax.jit(whole_covariance)
     parts = [[0], [1], [2], [0, 1], [0, 2], [1, 2], [0, 1, 2], [], [2], [2], [0, 2], [1]]
     for k, part in enumerate(parts):
@@ -178,7 +178,7 @@ def test_a_part_of_a_fix_is_the_textbooks_update():
         residual = (fix.position[0] - expected)[np.array(part, int)]
         nis = residual @ np.linalg.solve(spread, residual) if part else 0.0
         state, history = run(state, *signals, TEXTBOOK, fix)
-        (outcome,) = history.others
+        outcome = history.outcomes["fix"]
         accepted = bool(part) and nis < chi2.ppf(0.99, max(len(part), 1))
         assert outcome.present[0] == bool(part) and outcome.accepted[0] == accepted
         assert accepted != (k in (7, 9))
@@ -215,10 +215,20 @@ def spoilt_fix():
     return filtering.Fix(*(column[:ROWS] for column in fix)), fields
 
 
+class Second(filtering.Fix):
+    """Fixes of another source: two measurements of a run have two names."""
+
+    name = "second"
+
+
 def test_a_fix_that_cannot_be_is_refused_by_name():
-    state, (fix, fields) = filtering.initial_state(TEXTBOOK, *START, std=STD), spoilt_fix()
+    state, (fix, fields) = (
+        filtering.initial_state(filtering.Filter(TEXTBOOK, start=STD), *START),
+        spoilt_fix(),
+    )
     good = drawn_fix(ROWS)
-    arguments = state, GYRO, ACCEL, DISPLACEMENT, SPREAD, TEXTBOOK, NOISE
+    ekf = filtering.Filter(TEXTBOOK, NOISE)
+    arguments = ekf, state, GYRO, ACCEL, DISPLACEMENT, SPREAD
     for row, field in enumerate(fields):
         column = np.array(getattr(good, field))
         column[row] = getattr(fix, field)[row]
@@ -226,7 +236,7 @@ def test_a_fix_that_cannot_be_is_refused_by_name():
         text = rf"^measurements\[1\]\.{field}: 1 of {ROWS} rows are not .*, the first is row {row}$"
         for estimate in (filtering.run_filter, filtering.smooth):
             with pytest.raises(ValueError, match=text):
-                estimate(*arguments, measurements=(good, spoilt))
+                estimate(*arguments, measurements=(good, Second(*spoilt)))
     for field, shape in (("position", (ROWS, 4)), ("covariance", (ROWS, 2, 2))):
         spoilt = good._replace(**{field: np.ones(shape)})
         with pytest.raises(ValueError, match=rf"^measurements\[0\]\.{field}: the shape must be "):
@@ -234,17 +244,22 @@ def test_a_fix_that_cannot_be_is_refused_by_name():
 
 
 def test_inside_jit_it_is_none_and_no_derivative_is_spoilt():
-    state, (fix, fields) = filtering.initial_state(TEXTBOOK, *START, std=STD), spoilt_fix()
+    state, (fix, fields) = (
+        filtering.initial_state(filtering.Filter(TEXTBOOK, start=STD), *START),
+        spoilt_fix(),
+    )
 
     def distance(arguments, fix):
-        final, history = filtering.run_filter(*arguments, TEXTBOOK, NOISE, measurements=(fix,))
-        return jnp.sum(final.position**2) + jnp.sum(history.others[0].nis), (final, history)
+        final, history = filtering.run_filter(
+            filtering.Filter(TEXTBOOK, NOISE), *arguments, measurements=(fix,)
+        )
+        return jnp.sum(final.position**2) + jnp.sum(history.outcomes["fix"].nis), (final, history)
 
     gradient_of = quick(jax.value_and_grad(distance, (0, 1), has_aux=True, allow_int=True))
     arguments = state, GYRO, ACCEL, np.nan_to_num(DISPLACEMENT), np.tile(np.eye(3), (ROWS, 1, 1))
     (_, (final, history)), gradients = gradient_of(arguments, fix)
     present = np.arange(ROWS) >= len(fields)
-    np.testing.assert_array_equal(history.others[0].present, present)
+    np.testing.assert_array_equal(history.outcomes["fix"].present, present)
     for gradient in jax.tree.leaves(gradients):
         assert gradient.dtype == jax.dtypes.float0 or np.isfinite(gradient).all()
     assert (np.abs(gradients[1].position).max(axis=1) > 0).tolist() == present.tolist()

@@ -7,6 +7,9 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.filtering import gaps
+from gnio_jax.filtering.propagation import integrate
+from gnio_jax.filtering.state import Mean
+from tests.support import manifold
 from tests.support.random_walk import random_walk
 
 N, CLONES, DT, INTERVALS = 5, 4, 0.02, 60
@@ -16,15 +19,15 @@ WALK = random_walk(11, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, bias=Fals
 
 
 def start():
-    return filtering.initial_state(CONFIG, *WALK[0])
+    return filtering.initial_state(filtering.Filter(CONFIG), *WALK[0])
 
 
 THERE = np.ones(N * INTERVALS, bool)
 
 
 def run(valid=THERE, gyro=WALK[1], displacement=WALK[3]):
-    given = gyro, WALK[2], displacement, WALK[4], CONFIG, NOISE, valid
-    return filtering.run_filter(start(), *given)
+    given = gyro, WALK[2], displacement, WALK[4], valid
+    return filtering.run_filter(filtering.Filter(CONFIG, NOISE), start(), *given)
 
 
 bridge = jax.jit(gaps.bridge, static_argnums=4)
@@ -102,6 +105,33 @@ def test_a_short_hole_is_bridged_a_long_one_costs_certainty():
     # it
     off = np.abs(np.asarray(found.velocity) - np.asarray(whole.velocity))
     assert (off[39:] < 4 * np.sqrt(sigma[39:, 3:6] ** 2 + before[39:, 3:6] ** 2)).all()
+
+
+def test_the_error_coasts_with_the_mean():
+    """Φ by differences of a mean that neither turns nor accelerates at the samples that are not
+    used, whatever the biases are."""
+    rng, used = np.random.default_rng(4), np.array([1.0, 0.0, 1.0, 0.0, 0.0])
+    gyro, accel = 3 * rng.standard_normal((N, 3)), 10 * rng.standard_normal((N, 3))
+    pose = *WALK[0], np.array([0.02, -0.01, 0.03]), np.array([0.1, -0.2, 0.05])
+
+    def coasted(x):
+        for sample, use in enumerate(used):
+            rows = slice(sample, sample + 1)
+            moved = manifold.integrate(x, gyro[rows], accel[rows], DT)
+            x = moved if use else (*x[:2], x[2] + x[1] * DT, *x[3:])
+        return x
+
+    gap = gaps.Gap(np.zeros(N), np.zeros(N), used)
+    interval = jax.jit(integrate, static_argnames="dt")(
+        Mean(*pose), gaps.Imu(gyro, accel, gap), NOISE, dt=DT
+    )
+    end = coasted(pose)
+    estimate = interval.rotation, interval.velocity, interval.position, *pose[3:]
+    np.testing.assert_allclose(manifold.minus(estimate, end), 0, atol=1e-12)
+    transition = manifold.differences(
+        lambda change: manifold.minus(coasted(manifold.plus(pose, change)), end), 15, 1e-5
+    )
+    np.testing.assert_allclose(interval.transition, transition[:9], atol=2e-8)
 
 
 def test_the_filter_coasts_where_nothing_is_known():

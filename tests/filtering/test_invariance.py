@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.state import invariant_errors, unroll_clones
+from gnio_jax.filtering.state import arc_covariance, invariant_errors, unroll_clones
 from gnio_jax.filtering.update import Step
+from tests.support import manifold
 from tests.support.compiling import optimised, quick
 from tests.support.walks import errors, simulate
 from tests.support.whole_covariance import covariance
@@ -53,9 +55,10 @@ def monte_carlo(error, std, intervals=120, hole=0, fix_every=0, fix_std=1.0, smo
     )
 
     def run(rotation, velocity, position, gyro, accel, displacement, fix):
-        state = filtering.initial_state(config, rotation, velocity, position, std=std)
+        ekf = filtering.Filter(config, NOISE, std)
+        state = filtering.initial_state(ekf, rotation, velocity, position)
         spread = jnp.tile(SIGMA**2 * jnp.eye(3)[None], (intervals, 1, 1))
-        signals = state, gyro, accel, displacement, spread, config, NOISE, jnp.asarray(valid)
+        signals = ekf, state, gyro, accel, displacement, spread, jnp.asarray(valid)
         if smoothed:
             return filtering.smooth(*signals, measurements=(fix,))
         return filtering.run_filter(*signals, measurements=(fix,))[1]
@@ -123,6 +126,66 @@ def test_the_smoother_turns_back_through_displacements_and_fixes():
         assert 0.6 < nees(result, PLACE, row) < 1.4, row
 
 
+def test_the_arc_is_the_second_moment_of_what_a_turn_moves_beyond_the_first_order():
+    """By quadrature over a normal error of the yaw, with levers of velocity and position."""
+    sigma, levers = 0.02, np.array([[1.5, -0.4, 0.7], [-30.0, 12.0, 2.0]])
+    ahead = np.cross([0.0, 0.0, 1.0], levers)  # e_z × l
+    entries = np.zeros(15)
+    entries[2], entries[3:9] = 1.0, ahead.ravel()
+    arc = np.asarray(arc_covariance(jnp.asarray(sigma**2 * np.outer(entries, entries))))
+    nodes, weights = np.polynomial.hermite_e.hermegauss(20)
+    turns = Rotation.from_rotvec(np.outer(sigma * nodes, [0.0, 0.0, 1.0]))
+    remainder = np.concatenate(
+        [
+            turns.apply(lever) - lever - np.outer(sigma * nodes, step)
+            for lever, step in zip(levers, ahead, strict=True)
+        ],
+        axis=1,
+    )
+    expected = np.einsum("k,ki,kj->ij", weights / weights.sum(), remainder, remainder)
+    scale = np.sqrt(np.diag(expected)).max()
+    np.testing.assert_allclose(arc[3:9, 3:9], expected, atol=1e-2 * scale**2)
+    np.testing.assert_allclose(arc[3:5, 3:5], expected[:2, :2], rtol=1e-2)
+    np.testing.assert_allclose(arc[3:5, 6:8], expected[:2, 3:5], rtol=1e-2)
+    assert not np.delete(arc, np.s_[3:9], axis=0).any()
+
+
+def test_smoothed_states_before_a_large_turn_are_of_one_motion():
+    """Without noise of the IMU they are those that the IMU makes of the first, although a fix at
+    the end turns all of them by a large angle."""
+    intervals, tiny, rng = 12, 1e-9, np.random.default_rng(8)
+    gyro, accel = rng.normal(size=(intervals * N, 3)), np.empty((intervals * N, 3))
+    first = attitude = Rotation.from_euler("xyz", [0.2, -0.3, 0.5])
+    for k, rate in enumerate(gyro):
+        accel[k] = attitude.inv().apply([12.0, 3.0, 9.81])
+        attitude = attitude * Rotation.from_rotvec(rate * DT)
+    pose = first.as_matrix(), np.array([1.0, 0.0, 0.0]), np.zeros(3)
+    end = manifold.integrate((*pose, np.zeros(3), np.zeros(3)), gyro, accel, DT)
+    position = np.full((intervals, 3), np.nan)
+    position[-1] = Rotation.from_euler("z", 0.5).apply(end[2])
+    spread = np.tile(1e-6 * np.eye(3), (intervals, 1, 1))
+    open_gate = np.full(intervals, np.inf)
+    fix = filtering.Fix(position, spread, *np.zeros((2, intervals)), open_gate)
+
+    @quick
+    def smoothed(gyro, accel, fix):
+        std = filtering.InitialStd(tiny, 0.4, tiny, tiny, tiny, tiny)
+        noise = filtering.NoiseModel(tiny, tiny, tiny, tiny)
+        ekf = filtering.Filter(config_of("invariant"), noise, std)
+        state = filtering.initial_state(ekf, *pose)
+        signals = ekf, state, gyro, accel, np.full((intervals, 3), np.nan), spread
+        return filtering.smooth(*signals, measurements=(fix,))
+
+    poses = [np.asarray(part) for part in smoothed(gyro, accel, fix)[:5]]
+    turn = poses[0][-1] @ end[0].T
+    assert 0.3 < np.arctan2(turn[1, 0], turn[0, 0]) < 0.6
+    for k in range(intervals - 2):
+        rows = slice((k + 1) * N, (k + 2) * N)
+        moved = manifold.integrate([part[k] for part in poses], gyro[rows], accel[rows], DT)
+        error = manifold.minus(moved, [part[k + 1] for part in poses])
+        np.testing.assert_allclose(error, 0.0, atol=1e-8, err_msg=str(k))
+
+
 @functools.cache
 def one_walk():
     return simulate(3, 1, 40, N, CLONES, DT, NOISE, filtering.InitialStd(yaw=0.4), SIGMA)
@@ -135,7 +198,7 @@ def run_pieces(error, pieces, turn=0.0):
     world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     std = filtering.InitialStd(velocity=1.0, yaw=0.4, tilt=0.05)
     pose = world @ walk.rotation0[0], world @ walk.velocity0[0], world @ walk.position0[0]
-    state = filtering.initial_state(config, *pose, std=std)
+    state = filtering.initial_state(filtering.Filter(config, start=std), *pose)
     spread = np.tile(SIGMA**2 * np.eye(3), (40, 1, 1))
     begin = 0
     for end in pieces:
@@ -149,7 +212,9 @@ def run_pieces(error, pieces, turn=0.0):
 @functools.cache
 def program(config):
     return quick(
-        lambda state, *signals: filtering.run_filter(state, *signals, config, NOISE, frame="own")
+        lambda state, *signals: filtering.run_filter(
+            filtering.Filter(config, NOISE), state, *signals, frame="own"
+        )
     )
 
 

@@ -34,7 +34,7 @@ def test_interval_against_differences_of_the_mean():
     n, dt = CONFIG.samples_per_clone, 0.05
     gyro, accel = 8 * rng.standard_normal((n, 3)), 10 * rng.standard_normal((n, 3))
     noise = filtering.NoiseModel(0.03, 0.2, 0.04, 0.5)
-    state = filtering.initial_state(CONFIG, *POSE)
+    state = filtering.initial_state(filtering.Filter(CONFIG), *POSE)
     motion = jax.jit(integrate_samples, static_argnames="dt")(
         state.mean, Imu(jnp.asarray(gyro), jnp.asarray(accel), None), noise, dt=dt
     )
@@ -83,7 +83,9 @@ def update_gradient(state, displacement, covariance, frame):
 )
 def test_update_has_finite_derivatives_everywhere(frame, pitch, apart, accepted):
     rotation = Rotation.from_euler("y", pitch).as_matrix()
-    state = filtering.initial_state(CONFIG, rotation, np.zeros(3), np.zeros(3))._replace(
+    state = filtering.initial_state(
+        filtering.Filter(CONFIG), rotation, np.zeros(3), np.zeros(3)
+    )._replace(
         clone_rotation=np.tile(rotation, (3, 1, 1)),
         clone_offset=np.array([[-apart, 0, 0], [0, 0, 0], [0, 0, 0]]),
         clone_covariance=0.1 * np.eye(18),

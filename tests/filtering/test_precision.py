@@ -48,7 +48,9 @@ def test_float32_holds_for_an_hour():
     for dtype in (np.float64, np.float32):
         single = dtype == np.float32
         config = filtering.FilterConfig(DT, N, CLONES, history="core", allow_float32=single)
-        state = filtering.initial_state(config, *map(dtype, (rotation, velocity, np.zeros(3))))
+        state = filtering.initial_state(
+            filtering.Filter(config), *map(dtype, (rotation, velocity, np.zeros(3)))
+        )
         given = state, *map(dtype, (*signals, spread)), config, filtering.NoiseModel()
         state, history = jax.device_get(FILTER[dtype](*given))
         assert history.position.dtype == dtype and (history.healthy == 1).all()

@@ -19,7 +19,7 @@ def through(stamps, values, imu_rate, dt=DT, hole=None):
     samples = zip(stamps.tolist(), values.tolist(), strict=True)
     for time, row in checked_at_first(samples, 60):  # 400 Hz: a row from 46 on
         stream.push(time, tuple(row))
-        new = stream.known
+        new = stream.ready
         rows += list(stream.rows(new))
         stream.take(new)
         known += [time] * new

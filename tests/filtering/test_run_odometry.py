@@ -48,7 +48,7 @@ def program(config):
 
     def run(state, gyro, accel, base, slope):
         network = functools.partial(predict, base=base, slope=slope)
-        return filtering.run_odometry(network, state, gyro, accel, config, NOISE)
+        return filtering.run_odometry(network, filtering.Filter(config, NOISE), state, gyro, accel)
 
     return jax.jit(run)
 
@@ -95,8 +95,10 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
     config = dataclasses.replace(CONFIG, window_rotation=window_rotation, context_samples=context)
     assert config.first_measured == first
     state, history = program(config)(start(config), gyro, accel, BASE, SLOPE)
-    program(config)(state, gyro, accel, BASE, SLOPE)
-    assert program(config)._cache_size() == 1  # a state that a run leaves compiles nothing
+    later, _ = program(config)(state, gyro, accel, BASE, SLOPE)
+    assert program(config)._cache_size() == 2  # a state that a run leaves has a window …
+    program(config)(later, gyro, accel, BASE, SLOPE)
+    assert program(config)._cache_size() == 2  # … and all of these share a program
     wanted = by_hand(config, CUTS[window_rotation], gyro, accel)
     assert np.nansum(wanted["accepted"]) > 5
     for name in ("accepted", "gate_passed"):
@@ -116,13 +118,54 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
             assert np.nanmax(np.abs(other - wanted["displacement"])) > 1e-4
 
 
+@pytest.mark.parametrize("cut", [3, 11, 16])
+def test_a_run_in_two_calls_is_one_run(cut):
+    """The windows of the second call begin in the first, before and after there is a measurement;
+    with missing samples just before the cut, and with a gap that the filter coasts through."""
+    gyro, accel = recording(2)
+    valid = np.ones(len(gyro), bool)
+    valid[N * cut - 3 : N * cut - 1] = valid[N * 12 + 2 : N * 13 + 4] = False
+    ekf = filtering.Filter(CONFIG, NOISE, measurements=(filtering.ZeroVelocity(),))
+
+    @jax.jit
+    def run(state, gyro, accel, valid):
+        return filtering.run_odometry(predict, ekf, state, gyro, accel, valid)
+
+    final, history = run(start(CONFIG), gyro, accel, valid)
+    parts, state = [], start(CONFIG)
+    for rows in (slice(0, N * cut), slice(N * cut, None)):
+        state, part = run(state, gyro[rows], accel[rows], valid[rows])
+        parts.append(part)
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    assert np.isfinite(history.nis[max(cut, FIRST) :]).any()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), joined, history)
+    np.testing.assert_allclose(state.position, final.position, atol=1e-10)
+    np.testing.assert_array_equal(state.window, final.window)
+
+
+def test_where_it_coasted_no_window_is_a_measurement():
+    """Nor where it coasted in the context before the window."""
+    config = dataclasses.replace(CONFIG, bridge_seconds=2 * DT)
+    gyro, accel = recording(0)
+    valid = np.ones(len(gyro), bool)
+    valid[32:40] = False  # the first two of these are held
+    _, history = filtering.run_odometry(
+        predict, filtering.Filter(config, NOISE), start(config), gyro, accel, imu_valid=valid
+    )
+    measured = np.isfinite(np.asarray(history.displacement)).all(axis=1)
+    for k in range(INTERVALS):
+        first, stop = (k - CLONES + 1) * N - config.context_samples, (k + 1) * N
+        coasted = first < 40 and stop > 34
+        assert measured[k] == (k >= FIRST and not coasted), k
+
+
 def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     """With `history.given`, which takes the factors of the axes off again. The network's log
     standard deviation is raised to a floor."""
     gyro, accel = recording(1)
     final, history = program(CONFIG)(start(CONFIG), gyro, accel, BASE, SLOPE)
-    fixed = CONFIG, NOISE, None, CONFIG.displacement_frame
-    given = start(CONFIG), gyro, accel, *history.given(NOISE)
+    fixed = None, CONFIG.displacement_frame
+    given = filtering.Filter(CONFIG, NOISE), start(CONFIG), gyro, accel, *history.given(NOISE)
     again_final, again = filtering.run_filter(*given, *fixed)
     assert again.diagnostics == {}
     for wanted, found in [(history._replace(diagnostics={}), again), (final, again_final)]:
@@ -146,7 +189,9 @@ def test_under_a_vmap_the_network_is_asked_no_earlier_and_says_the_same():
         return predict(windows)
 
     def run(gyro, accel):
-        return filtering.run_odometry(counting, start(CONFIG), gyro, accel, CONFIG, NOISE)
+        return filtering.run_odometry(
+            counting, filtering.Filter(CONFIG, NOISE), start(CONFIG), gyro, accel
+        )
 
     many = jax.device_get(jax.jit(jax.vmap(run))(*signals))
     jax.effects_barrier()
@@ -167,5 +212,5 @@ def test_predict_is_asked_for_what_it_must_return():
     ):
         with pytest.raises(ValueError, match=r"^predict: "):
             filtering.run_odometry(
-                lambda _, bad=bad: bad, start(CONFIG), gyro, accel, CONFIG, NOISE
+                lambda _, bad=bad: bad, filtering.Filter(CONFIG, NOISE), start(CONFIG), gyro, accel
             )

@@ -32,14 +32,18 @@ def replay(name):
     names = ("dt", "samples_per_clone", "clones_per_window", "mahalanobis_fail_scale")
     settings = {name: run[name] for name in names}
     config = filtering.FilterConfig(**settings, history="core", error="additive")
-    state = filtering.initial_state(config, run["rotation0"], run["velocity0"], run["position0"])
+    state = filtering.initial_state(
+        filtering.Filter(config), run["rotation0"], run["velocity0"], run["position0"]
+    )
     covariance = run["displacement_std"][:, :, None] ** 2 * np.eye(3)
     given = run["gyro"], run["accel"], run["displacement"], covariance
     if name.startswith("nominal_200hz"):  # filled up, it has the program of "outliers_200hz"
         fill = zip(given, (7000, 7000, 700, 700), (0.0, 0.0, np.nan, np.nan), strict=True)
         given = [filled_up(*each) for each in fill]
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16227766e-2, config.dt)
-    final, history = jax.device_get(filtering.run_filter(state, *given, config, noise))
+    final, history = jax.device_get(
+        filtering.run_filter(filtering.Filter(config, noise), state, *given)
+    )
     rows = len(covariance)
     return run, rows == len(given[2]), final, jax.tree.map(lambda leaf: leaf[:rows], history)
 
@@ -104,19 +108,24 @@ def noise_of(config, correlation=None):
 def ours(config, noise, walk=WALK, measurements=(), every=None):
     """The filter over a walk, in pieces of `every` intervals."""
     pose, gyro, accel, *measured = walk
-    state, histories = filtering.initial_state(config, *pose, *BIASES, STD), []
+    state, histories = (
+        filtering.initial_state(filtering.Filter(config, start=STD), *pose, *BIASES),
+        [],
+    )
     every, n = every or len(measured[0]), config.samples_per_clone
     for begin in range(0, len(measured[0]), every):
         rows, samples = slice(begin, begin + every), slice(begin * n, (begin + every) * n)
         given = gyro[samples], accel[samples], *(each[rows] for each in measured)
         others = jax.tree.map(lambda leaf, rows=rows: leaf[rows], measurements)
-        state, history = filtering.run_filter(state, *given, config, noise, measurements=others)
+        state, history = filtering.run_filter(
+            filtering.Filter(config, noise), state, *given, measurements=others
+        )
         histories.append(history)
     return state, jax.tree.map(lambda *parts: np.concatenate(parts), *histories)
 
 
 def oracle(config, noise, walk=WALK, **others):
-    start = filtering.initial_state(config, *walk[0], *BIASES, STD)
+    start = filtering.initial_state(filtering.Filter(config, start=STD), *walk[0], *BIASES)
     return scekf_numpy.run_from(start, noise, config, *walk[1:], std=STD._asdict(), **others)
 
 
@@ -170,12 +179,13 @@ def laid(fixes):
 
 @pytest.mark.parametrize(
     "fail_scale, correlation, axes, every",
-    [(0.0, None, 0, None), (8.0, ERRORS, 2, None), (0.0, ERRORS, 3, 8)],
-    ids=["plain", "scaled, correlated, fixes", "correlated, whole fixes, in pieces"],
+    [(0.0, None, 0, None), (8.0, ERRORS, 2, 10), (0.0, ERRORS, 3, 8)],
+    ids=["plain", "scaled, correlated, fixes, in rounds", "correlated, whole fixes, in pieces"],
 )
 def test_random_walk(fail_scale, correlation, axes, every):
     """With missing and rejected rows. A run goes on from the state that another returned: ring,
-    gate and clock included; pieces of 8 intervals end at every slot of a ring of 5."""
+    gate and clock included. Pieces of 8 intervals end within a round of the ring of 5, and pieces
+    of 10 with a whole round."""
     config = GATED(DT, N, CLONES, mahalanobis_fail_scale=fail_scale)
     noise, fixes = noise_of(config, correlation), drawn_fixes(axes) if axes else {}
     measurements = (laid(fixes),) if axes else ()
@@ -193,7 +203,7 @@ def test_random_walk(fail_scale, correlation, axes, every):
         spread = final.core_covariance[CORRELATED, CORRELATED]
         assert_close(spread, wanted["correlated_covariance"][-1], 1e-12, 1e-7)
     if axes:
-        (outcome,) = history.others
+        outcome = history.outcomes["fix"]
         there = np.isfinite(wanted["fix_nis"])
         np.testing.assert_array_equal(outcome.present, there)
         refused = np.flatnonzero(there & ~np.asarray(outcome.accepted))
@@ -221,7 +231,7 @@ def test_without_size_and_without_fixes_nothing_changes():
     nothing = noise_of(config, ERRORS._replace(share=0.0))
     final, found = ours(config, nothing, measurements=(none,), every=8)
     for name in found._fields:
-        if name not in ("others", "diagnostics"):
+        if name not in ("outcomes", "diagnostics"):
             assert_close(getattr(found, name), getattr(wanted, name), 1e-12, 1e-9)
     assert_close(final.core_covariance[CORRELATED, CORRELATED], np.eye(3), 1e-12)
     # Another noise, as arrays, and a state that a run left compile nothing.

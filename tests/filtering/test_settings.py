@@ -11,7 +11,9 @@ from gnio_jax.filtering.settings import (
     FIXED,
     filter_config,
     free_parameters,
+    is_below,
     with_free_parameters,
+    with_written_parameters,
 )
 from tests.support.filter_settings import changed
 
@@ -33,6 +35,31 @@ def test_free_parameters_and_back():
     np.testing.assert_allclose(slope(np.log(1 / 3)), 0.25 * 0.75)
 
 
+def test_a_section_is_named_whole():
+    """And not by the beginning of a name."""
+    settings = FilterSettings()
+    assert free_parameters(settings, ["noise.gyro"]) == {}
+    assert free_parameters(settings, ["start.gyro_bias"]).keys() == {"start.gyro_bias"}
+    assert is_below("noise.std_factor.0", "noise.std_factor")
+    assert is_below("noise.gyro_density", "noise.gyro_density")
+    assert not is_below("noise.gyro_density", "noise.gyro")
+
+
+def test_written_numbers_are_rounded_and_a_share_stays_below_1():
+    correlation = filtering.CorrelatedError(share=0.5, seconds=2.0)
+    settings = changed(noise={"correlation": correlation})
+    free = {
+        "noise.correlation.share": 12.0,  # its logit: the share is 0.999994
+        "noise.correlation.seconds": np.log(1.23456),
+        "noise.gyro_density": np.log(7.6543e-4),
+    }
+    noise = with_written_parameters(settings, free, 3).noise
+    assert noise.correlation == (0.9999, 1.23) and noise.gyro_density == 7.65e-4
+    assert noise.accel_density == settings.noise.accel_density
+    share = with_written_parameters(settings, {"noise.correlation.share": 0.1234}, 3)
+    assert share.noise.correlation == (0.531, 2.0)
+
+
 def test_every_setting_of_the_filter_is_reachable_from_a_file_or_fixed_by_name():
     """And a value that a file gives is the value that the filter has."""
     options = {field.name for field in dataclasses.fields(FilterSettings)}
@@ -41,7 +68,7 @@ def test_every_setting_of_the_filter_is_reachable_from_a_file_or_fixed_by_name()
     others = {
         **{name: 0.5 for name in ("success_seconds", "pause_seconds", "rest_seconds")},
         **{name: 0.25 for name in ("rest_gyro", "rest_accel", "bridge_seconds")},
-        **{name: 0.75 for name in ("gap_gyro_std", "gap_accel_std", "zero_velocity_std")},
+        **{name: 0.75 for name in ("gap_gyro_std", "gap_accel_std")},
         **{"gate_threshold": 7.0, "convergence_seconds": 3.0},
         **{"log_std_min": -5.0, "speed_limit": 9.0},
         **{"error": "additive", "window_rotation": "single"},

@@ -145,7 +145,6 @@ WEIGHTED = filtering.FilterConfig(
     success_seconds=5.0,
     gate_softness=3.0,
     gate_threshold=4.0,
-    zero_velocity_std=5 * SMALL,
     rest_seconds=0.5,
 )
 NOISE = filtering.NoiseModel.per_sample(*WHITE, DT, *WALK)._replace(measurement_scale=2.0)
@@ -196,8 +195,12 @@ def test_equals_least_squares_over_all_states():
     truth, start, gyro, accel, displacement, covariance = walk(3)
     displacement[list(MISSING), 1] = np.nan
     displacement[REJECTED] += 12 * SMALL
-    state, fixes = filtering.initial_state(GATED, *start, STD), drawn_fixes(truth)
-    arguments, others = (state, gyro, accel, displacement, covariance, GATED, NOISE), laid(fixes)
+    state, fixes = (
+        filtering.initial_state(filtering.Filter(GATED, start=STD), *start),
+        drawn_fixes(truth),
+    )
+    ekf, others = filtering.Filter(GATED, NOISE), laid(fixes)
+    arguments = ekf, state, gyro, accel, displacement, covariance
     _, filtered = filtering.run_filter(*arguments, measurements=others)
     smoothed = filtering.smooth(*arguments, measurements=others)
 
@@ -206,7 +209,7 @@ def test_equals_least_squares_over_all_states():
     assert [k for k in range(CLONES, INTERVALS) if k not in present] == list(MISSING)
     assert [k for k in present if not weight[k]] == [REJECTED]
     factor = np.where(weight > 0, 1.0, 7.0)
-    (outcome,) = filtered.others
+    outcome = filtered.outcomes["fix"]
     applied = np.flatnonzero(outcome.accepted)
     assert [k for k, *_ in fixes if k not in applied] == [FAR]
     measurements = {k: (displacement[k], 2.0 * factor[k] * covariance[k]) for k in present}
@@ -221,15 +224,19 @@ def test_goes_on_from_a_state_with_clones():
     _, start, *signals = walk(5)
     measurements = laid([(0, np.full(2, np.nan), np.eye(2), 0.0)])  # the programs of the test above
     half = INTERVALS // 2
-    state = filtering.initial_state(GATED, *start, STD)
-    wanted = filtering.smooth(state, *signals, GATED, NOISE, measurements=measurements)
+    state = filtering.initial_state(filtering.Filter(GATED, start=STD), *start)
+    wanted = filtering.smooth(
+        filtering.Filter(GATED, NOISE), state, *signals, measurements=measurements
+    )
     counts = N * half, N * half, half, half
     early = [x[:count] for x, count in zip(signals, counts, strict=True)]
-    state, _ = filtering.run_filter(state, *early, GATED, NOISE)
+    state, _ = filtering.run_filter(filtering.Filter(GATED, NOISE), state, *early)
     # Filled up to the length of the first run.
     late = [np.roll(x, -count, axis=0) for x, count in zip(signals, counts, strict=True)]
     late[2][half:] = np.nan
-    found = filtering.smooth(state, *late, GATED, NOISE, measurements=measurements)
+    found = filtering.smooth(
+        filtering.Filter(GATED, NOISE), state, *late, measurements=measurements
+    )
     sigma = np.sqrt(np.asarray(wanted.covariance_diagonal)[half:])
     for name in wanted._fields[:5]:
         np.testing.assert_allclose(
@@ -250,10 +257,12 @@ def test_a_gate_with_a_slope_and_rest_and_the_gradient_through_them():
     @quick
     @functools.partial(jax.value_and_grad, has_aux=True)
     def loss(x):
-        state = filtering.initial_state(WEIGHTED, *start, STD)
-        moved = jnp.asarray(displacement).at[8, 0].add(x[0] * SMALL)
         noise = NOISE._replace(accel_density=NOISE.accel_density * (1 + x[1]))
-        arguments = state, gyro, accel, moved, covariance, WEIGHTED, noise
+        rest = filtering.ZeroVelocity(5 * SMALL)
+        ekf = filtering.Filter(WEIGHTED, noise, STD, measurements=(rest,))
+        state = filtering.initial_state(ekf, *start)
+        moved = jnp.asarray(displacement).at[8, 0].add(x[0] * SMALL)
+        arguments = ekf, state, gyro, accel, moved, covariance
         _, filtered = filtering.run_filter(*arguments)
         smoothed = filtering.smooth(*arguments)
         found = (smoothed.position[5, 0] - start[2][0]) / SMALL
@@ -262,10 +271,11 @@ def test_a_gate_with_a_slope_and_rest_and_the_gradient_through_them():
     (_, both), _ = loss(np.zeros(2))
     filtered, smoothed = jax.device_get(both)
     weight = filtered.gate_passed
-    present, stops = np.flatnonzero(np.isfinite(weight)), np.flatnonzero(filtered.at_rest)
+    present = np.flatnonzero(np.isfinite(weight))
+    stops = np.flatnonzero(filtered.outcomes["zero_velocity"].accepted)
     assert len(stops) >= 2 and weight[present].min() < 0.9 and smoothed.covariance is None
     measurements = {k: (displacement[k], 2.0 / weight[k] * covariance[k]) for k in present}
-    stops = {k: WEIGHTED.zero_velocity_std for k in stops}
+    stops = {k: 5 * SMALL for k in stops}
     wanted = most_probable(start, gyro, accel, measurements, stops)
     assert_most_probable(filtered, smoothed, *wanted)
 

@@ -19,7 +19,7 @@ def test_the_bias_of_a_raw_gyro_is_uncertain_where_it_is_level():
     """Also for a matrix that is a rotation up to the rounding of text files."""
     rotation = (1 + 4e-4) * Rotation.from_euler("ZYX", [0.3, 0.7, 0.4]).as_matrix()
     state = filtering.initial_state(
-        CONFIG, rotation, np.zeros(3), np.zeros(3), level_gyro_bias=0.05
+        filtering.Filter(CONFIG), rotation, np.zeros(3), np.zeros(3), level_gyro_bias=0.05
     )
     covariance = state.core_covariance[9:12, 9:12]
     found = np.sqrt(np.linalg.eigvalsh(covariance))
@@ -35,7 +35,9 @@ def test_level_state(pitch):
     rng = np.random.default_rng(1)
     R = Rotation.from_euler("ZYX", [0.0, pitch, 0.4]).as_matrix()
     accel = R.T @ [0, 0, 9.81] + 0.01 * rng.standard_normal((50, 3))
-    state = filtering.level_state(CONFIG, 0.01 * rng.standard_normal((50, 3)), accel)
+    state = filtering.level_state(
+        filtering.Filter(CONFIG), 0.01 * rng.standard_normal((50, 3)), accel
+    )
     up = accel.mean(0) / np.linalg.norm(accel.mean(0))
     np.testing.assert_allclose(state.rotation @ up, [0, 0, 1], atol=1e-12)
     if abs(pitch) < 1:
@@ -48,7 +50,11 @@ def test_level_state(pitch):
     np.testing.assert_allclose(sigma[3:6], 0.05)
     shaken = accel + np.sin(np.arange(50))[:, None]
     less = np.sqrt(
-        np.diag(filtering.level_state(CONFIG, np.zeros((50, 3)), shaken).core_covariance)
+        np.diag(
+            filtering.level_state(
+                filtering.Filter(CONFIG), np.zeros((50, 3)), shaken
+            ).core_covariance
+        )
     )
     assert less[3] == 1.0 and less[0] > sigma[0]
 
@@ -59,9 +65,39 @@ def test_level_state_of_a_phone_that_a_hand_turns(rate):
     first = Rotation.from_euler("ZYX", [0.0, 0.4, -1.1])
     turned = first * Rotation.from_rotvec(np.outer(np.arange(50) * CONFIG.dt, rate))
     accel = turned.inv().apply([0, 0, 9.81])
-    state = filtering.level_state(CONFIG, np.tile(rate, (50, 1)), accel)
+    state = filtering.level_state(filtering.Filter(CONFIG), np.tile(rate, (50, 1)), accel)
     np.testing.assert_allclose(state.rotation, first.as_matrix(), atol=1e-9)
     np.testing.assert_allclose(np.sqrt(state.core_covariance[0, 0]), 0.02 / 9.81, rtol=1e-6)
+
+
+def test_small_turns_about_every_axis_are_no_rest():
+    """Each rate is below the bound of rest, but not their sum in quadrature. The rates differ from
+    sample to sample, and the attitude of a sample follows from those before it."""
+    time = np.arange(50) * DT
+    phases = 2 * np.pi * (time[:, None] + [0.0, 0.3, 0.6])
+    gyro = 0.8 * CONFIG.rest_gyro * np.sqrt(2.0) * np.sin(phases)
+    first = Rotation.from_euler("ZYX", [0.0, 0.4, -1.1])
+    attitudes = [first]
+    for rate in gyro[:-1]:
+        attitudes.append(attitudes[-1] * Rotation.from_rotvec(rate * DT))
+    accel = np.stack([attitude.inv().apply([0, 0, 9.81]) for attitude in attitudes])
+    assert accel.var(axis=0).sum() < CONFIG.rest_accel**2
+    assert (gyro.std(axis=0) < CONFIG.rest_gyro).all()
+    state = filtering.level_state(filtering.Filter(CONFIG), gyro, accel)
+    np.testing.assert_allclose(state.rotation, first.as_matrix(), atol=1e-9)
+    # The mean alone would be off by:
+    assert np.linalg.norm(first.apply(accel.mean(axis=0))[:2]) / 9.81 > 1e-3
+
+
+def test_a_second_of_which_most_is_missing_is_no_rest():
+    """Half of it is enough."""
+    gyro, accel = np.tile([0.01, -0.02, 0.03], (100, 1)), np.tile([0, 0, 9.81], (100, 1))
+    for present, seconds in ((24, 1.0), (25, 2.0)):
+        broken = gyro.copy()
+        broken[50 + present :] = np.nan
+        rest = rest_at_start(broken, accel, DT)
+        assert rest.seconds == seconds
+        np.testing.assert_allclose(rest.gyro_bias, gyro[0], rtol=1e-12)
 
 
 def test_level_state_says_how_far_the_velocity_can_be_from_zero():
@@ -71,7 +107,7 @@ def test_level_state_says_how_far_the_velocity_can_be_from_zero():
 
     def velocity_std(amplitude):
         shaken = np.tile([0, 0, 9.81], (50, 1)) + amplitude * shake
-        state = filtering.level_state(CONFIG, np.zeros((50, 3)), shaken)
+        state = filtering.level_state(filtering.Filter(CONFIG), np.zeros((50, 3)), shaken)
         return jnp.sqrt(state.core_covariance[3, 3])
 
     spread = np.sin(np.arange(50)).std()
@@ -86,20 +122,26 @@ def test_level_state_takes_the_bias_of_a_second_on_a_table(samples, gyro_std, ac
     rng, bias = np.random.default_rng(3), np.array([0.02, -0.01, 0.03])
     noise = rng.standard_normal((2, 50, 3))
     gyro, accel = bias + 0.002 * noise[0], [0, 0, 9.81] + 0.02 * noise[1]
-    found = filtering.level_state(CONFIG, gyro, accel).gyro_bias
+    found = filtering.level_state(filtering.Filter(CONFIG), gyro, accel).gyro_bias
     np.testing.assert_allclose(found, gyro.mean(0), rtol=1e-12)
     np.testing.assert_allclose(found, rest_at_start(gyro, accel, CONFIG.dt).gyro_bias, rtol=1e-12)
     # What does not turn is not turned.
-    still, biased = (filtering.level_state(CONFIG, x * gyro, accel).rotation for x in (0, 1))
+    still, biased = (
+        filtering.level_state(filtering.Filter(CONFIG), x * gyro, accel).rotation for x in (0, 1)
+    )
     np.testing.assert_array_equal(biased, still)
     shaken = gyro + gyro_std * noise[0], accel + accel_std * noise[1]
-    found = filtering.level_state(CONFIG, *(each[:samples] for each in shaken)).gyro_bias
+    found = filtering.level_state(
+        filtering.Filter(CONFIG), *(each[:samples] for each in shaken)
+    ).gyro_bias
     np.testing.assert_array_equal(found, 0)
 
 
 def test_level_state_refuses_accelerations_without_gravity():
     with pytest.raises(ValueError, match=r"^accel: shows no gravity, its mean is 1 m/s²"):
-        filtering.level_state(CONFIG, np.zeros((50, 3)), np.tile([0, 0, 1.0], (50, 1)))
+        filtering.level_state(
+            filtering.Filter(CONFIG), np.zeros((50, 3)), np.tile([0, 0, 1.0], (50, 1))
+        )
 
 
 def test_level_is_a_rotation_with_derivatives():

@@ -33,18 +33,21 @@ CONFIG = filtering.FilterConfig(
     context_samples=6,
     convergence_seconds=0.6,
     bridge_seconds=0.05,
-    zero_velocity_std=0.02,
     rest_seconds=0.3,
 )
-AS_TLIO = dataclasses.replace(
-    CONFIG, window_rotation="tlio", context_samples=0, zero_velocity_std=0.0
-)
+AS_TLIO = dataclasses.replace(CONFIG, window_rotation="tlio", context_samples=0)
 NOISE = filtering.NoiseModel(
     2e-3, 2e-2, measurement_scale=2.0, correlation=filtering.CorrelatedError(0.5, 0.3)
 )
 WEIGHTS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
 HIT = slice(180, 184)
 """Samples of a knock that the network takes for a leap: its measurement is rejected."""
+
+
+def filter_of(config=CONFIG, **parts):
+    """As TLIO it has no velocity at rest."""
+    measurements = () if config.window_rotation == "tlio" else (filtering.ZeroVelocity(0.02),)
+    return filtering.Filter(config, NOISE, measurements=measurements, **parts)
 
 
 def predict(windows):
@@ -71,22 +74,20 @@ def start(config=CONFIG):
         [[0.5, 0.0, 0.0], [3.0, -2.0, 1.0], [0.02, -0.01, 0.03]]
     )
     given = rotation, velocity, position, gyro_bias, 0.1
-    return with_correlated_error(filtering.initial_state(config, *given))
+    return with_correlated_error(filtering.initial_state(filtering.Filter(config), *given))
 
 
 @functools.cache
 def compiled(config=CONFIG):
     """One tracker a configuration, for its programs: compiling takes most of the time of these
     tests."""
-    return Tracker(predict, config, NOISE, start(config))
+    return Tracker(predict, filter_of(config), start(config))
 
 
 @functools.cache
 def program(config):
     config = dataclasses.replace(config, history="core")
-    return jax.jit(
-        lambda *given: filtering.run_odometry(predict, *given[:3], config, NOISE, given[3])
-    )
+    return jax.jit(lambda *given: filtering.run_odometry(predict, filter_of(config), *given))
 
 
 def scan(state, gyro, accel, valid, config=CONFIG):
@@ -107,7 +108,7 @@ def built(monkeypatch):
 
 @pytest.fixture
 def tracker(built):
-    return Tracker(predict, CONFIG, NOISE, start())
+    return Tracker(predict, filter_of(), start())
 
 
 def feed(tracker, gyro, accel, time):
@@ -140,7 +141,8 @@ def test_equals_the_scan(config, missing):
         np.testing.assert_allclose(rows, getattr(wanted, name), rtol=1e-9, atol=1e-9, err_msg=name)
     assert all(pose.healthy for pose in found)
     assert (wanted.gate_passed == 0).any() and (wanted.gate_passed == 1).sum() > 20
-    assert (np.asarray(wanted.at_rest) == 1).any() == (config is CONFIG)
+    assert (config is CONFIG) == ("zero_velocity" in wanted.outcomes)
+    assert config is not CONFIG or wanted.outcomes["zero_velocity"].accepted.any()
     assert np.isnan(np.asarray(wanted.nis)[config.first_measured :]).any()
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9),
@@ -263,7 +265,7 @@ def test_between_clones_it_coasts_through_a_gap(tracker):
 def test_mistakes_change_nothing(tracker):
     """Neither now nor for the samples that come after them."""
     time, (gyro, accel), zeros = 0.9 + np.arange(20) * DT, recording(), np.zeros(3)
-    other = Tracker(predict, CONFIG, NOISE, start())
+    other = Tracker(predict, filter_of(), start())
     for each in (tracker, other):
         feed(each, gyro[:6], accel[:6], time[:6])
     for arguments, words in (
@@ -294,7 +296,7 @@ def test_a_stamp_that_leaps_is_believed_once_a_second_one_agrees(tracker):
     assert len(found) == INTERVALS
     np.testing.assert_allclose([p.position for p in found], wanted.position, atol=1e-9)
 
-    stopped = Tracker(predict, CONFIG, NOISE, start())
+    stopped = Tracker(predict, filter_of(), start())
     feed(stopped, gyro[:keep], accel[:keep], time[:keep])
     for apart in (20.0, 40.0, 5.0, 30.0):
         assert stopped.push(apart, gyro[keep], accel[keep]) is None
@@ -307,16 +309,21 @@ def test_a_stamp_that_leaps_is_believed_once_a_second_one_agrees(tracker):
 
 
 def test_mistakes_at_the_start():
-    given = {"predict": predict, "config": CONFIG, "noise": NOISE, "state": start()}
+    given = {"predict": predict, "ekf": filter_of(), "state": start()}
+    spoilt = filtering.Filter(CONFIG, NOISE._replace(gyro_density=-1.0))
+    longer = filtering.Filter(dataclasses.replace(CONFIG, clones_per_window=5), NOISE)
     for change, words in (
         (dict(hole=0.001), r"hole: must be a number of at least"),
         (dict(imu_rate=0.0), r"imu_rate: must be a number"),
         (dict(imu_rate=float("nan")), r"imu_rate: must be a number"),
-        (dict(noise=NOISE._replace(gyro_density=-1.0)), r"noise\.gyro_density"),
+        (dict(ekf=spoilt), r"ekf\.noise\.gyro_density"),
         (dict(predict=lambda windows: windows), r"predict: "),
-        (dict(config=dataclasses.replace(CONFIG, clones_per_window=5)), r"state"),
+        (dict(ekf=longer), r"state"),
         (dict(state=None, rest_seconds=0.01), r"rest_seconds: "),
-        (dict(state=None, std=filtering.InitialStd(tilt=-1.0)), r"std\.tilt"),
+        (
+            dict(state=None, ekf=filter_of(start=filtering.InitialStd(tilt=-1.0))),
+            r"ekf\.start\.tilt",
+        ),
     ):
         with pytest.raises(ValueError, match=f"^{words}"):
             Tracker(**given | change)
@@ -334,7 +341,7 @@ def test_from_rest(built, lost):
     gyro, accel = resting()
     time = 7.0 + np.arange(len(gyro)) * DT
     # 45 samples: no whole number of intervals
-    tracker = Tracker(predict, CONFIG, NOISE, rest_seconds=0.9)
+    tracker = Tracker(predict, filter_of(), rest_seconds=0.9)
     assert tracker.pose() is None and tracker.filter_state() is None
     first, given = 10, (gyro[:40].copy(), accel[:40].copy())
     if lost == "missing":
@@ -343,7 +350,9 @@ def test_from_rest(built, lost):
         given[1][:first] = 0.0
     assert feed(tracker, *given, time[:40]) == [] and tracker.pose() is None
     rest = slice(first, first + 45)
-    state = with_correlated_error(filtering.level_state(CONFIG, gyro[rest], accel[rest]))
+    state = with_correlated_error(
+        filtering.level_state(filtering.Filter(CONFIG), gyro[rest], accel[rest])
+    )
     intervals = (len(gyro) - first) // N
     used = slice(first, first + intervals * N)
     _, wanted = scan(state, gyro[used], accel[used], np.ones(intervals * N, bool))
@@ -359,7 +368,7 @@ def test_a_rest_without_gravity_is_told_once_and_another_starts(built):
     """Such as in units of gravity, until somebody mends it."""
     gyro, accel = resting()
     time = np.arange(len(gyro)) * DT
-    tracker = Tracker(predict, CONFIG, NOISE)
+    tracker = Tracker(predict, filter_of())
     assert feed(tracker, gyro[:49], accel[:49] / 9.81, time[:49]) == []
     with pytest.raises(ValueError, match=r"^accel: shows no gravity, its mean is 1 m/s²"):
         tracker.push(time[49], gyro[49], accel[49] / 9.81)
@@ -377,7 +386,9 @@ def walk(rate):
     made = simulated.pedestrian(4, 4, seconds=8.0, rate=float(rate))
     shake = np.sin(2 * np.pi * made.time[:, None] * [44.0, 49.0, 40.0] + [1.0, 2.0, 0.5])
     rotation = geometry.matrix_from_quaternion(jnp.asarray(made.orientation[0]))
-    state = filtering.initial_state(CONFIG, rotation, made.velocity[0], made.position[0])
+    state = filtering.initial_state(
+        filtering.Filter(CONFIG), rotation, made.velocity[0], made.position[0]
+    )
     walked = made._replace(gyro=made.gyro + 2.0 * shake, accel=made.accel + 15.0 * shake[:, ::-1])
     return with_correlated_error(state), walked
 
@@ -388,7 +399,10 @@ def test_a_faster_imu_gives_the_trajectory_of_the_batch_path(built, rate):
     (state, walked), n, there = walk(rate), N * INTERVALS, np.ones(N * INTERVALS, bool)
     even = resample(walked, 1 / DT)
     wanted = np.asarray(scan(state, even.gyro[:n], even.accel[:n], there)[1].position)
-    tracker, found = Tracker(predict, CONFIG, NOISE, state, imu_rate=float(rate)), []
+    tracker, found = (
+        Tracker(predict, filter_of(), state, imu_rate=float(rate)),
+        [],
+    )
     for row in checked_at_first(zip(walked.time, walked.gyro, walked.accel, strict=True)):
         pose = tracker.push(*row)
         found += [] if pose is None else [(row[0], pose)]

@@ -13,9 +13,7 @@ from gnio_jax.filtering.state import additive_errors
 from gnio_jax.filtering.zero_velocity import ZeroVelocity, detect_rest
 
 N, CLONES, DT, INTERVALS = 5, 4, 0.02, 60
-CONFIG = filtering.FilterConfig(
-    DT, N, CLONES, zero_velocity_std=0.02, rest_seconds=0.3, convergence_seconds=1.0
-)
+CONFIG = filtering.FilterConfig(DT, N, CLONES, rest_seconds=0.3, convergence_seconds=1.0)
 NOISE = filtering.NoiseModel(measurement_scale=2.0)
 
 
@@ -25,23 +23,23 @@ STILL = Imu(jnp.zeros((N, 3)), jnp.tile(jnp.array([[0.0, 0.0, 9.81]]), (N, 1)), 
 @jax.jit
 def at_rest(state, tried):
     """The state after an interval at rest, and what became of that measurement."""
-    other = {"zero_velocity_std": 0.05, "rest_seconds": 0.0, "convergence_seconds": 10.0}
-    config = dataclasses.replace(CONFIG, **other)
+    config = dataclasses.replace(CONFIG, rest_seconds=0.0, convergence_seconds=10.0)
     scalar, no = jnp.zeros(()), jnp.bool_(False)
     displacement = filtering.Outcome(tried, tried, jnp.zeros(3), scalar, scalar, scalar, no)
-    step = filtering.Step(STILL, 0, 1, config, filtering.NoiseModel(), (displacement,))
-    new, outcome, _ = ZeroVelocity().update(state, step)
+    step = filtering.Step(
+        STILL, 0, 1, config, filtering.NoiseModel(), {"displacement": displacement}
+    )
+    new, outcome, _ = ZeroVelocity(0.05).update(state, step)
     return new, outcome
 
 
 def run(rotation, velocity, gyro, accel, displacement):
     """With no more certainty of the start than a twentieth of a metre a second."""
-    std, spread = (
-        filtering.InitialStd(velocity=0.05),
-        np.tile(0.02**2 * np.eye(3), (INTERVALS, 1, 1)),
-    )
-    state = filtering.initial_state(CONFIG, rotation, velocity, np.zeros(3), std=std)
-    return filtering.run_filter(state, gyro, accel, displacement, spread, CONFIG, NOISE)[1]
+    std, rest = filtering.InitialStd(velocity=0.05), filtering.ZeroVelocity(0.02)
+    ekf = filtering.Filter(CONFIG, NOISE, std, measurements=(rest,))
+    spread = np.tile(0.02**2 * np.eye(3), (INTERVALS, 1, 1))
+    state = filtering.initial_state(ekf, rotation, velocity, np.zeros(3))
+    return filtering.run_filter(ekf, state, gyro, accel, displacement, spread)[1]
 
 
 @pytest.mark.parametrize("seconds, intervals", [(0.0, 1), (0.1, 1), (0.11, 2), (0.3, 3), (0.35, 4)])
@@ -52,7 +50,7 @@ def test_rest_counts_only_after_its_time(seconds, intervals):
     turning = STILL._replace(gyro=STILL.gyro.at[2, 1].set(1.01 * config.rest_gyro))
     shaken = STILL._replace(accel=STILL.accel.at[3, 2].add(-1.01 * config.rest_accel))
     held = STILL._replace(gap=Gap(jnp.zeros(N).at[-1].set(1e-6), jnp.zeros(N), jnp.ones(N)))
-    state = filtering.initial_state(config, np.eye(3), np.zeros(3), np.zeros(3))
+    state = filtering.initial_state(filtering.Filter(config), np.eye(3), np.zeros(3), np.zeros(3))
     found, expected, count = [], [], 0
     for imu in [*5 * [STILL], turning, *5 * [STILL], shaken, *5 * [STILL], held, *5 * [STILL]]:
         state, quiet = detect_rest(state, imu, config)
@@ -62,11 +60,31 @@ def test_rest_counts_only_after_its_time(seconds, intervals):
     assert found == expected and sum(found) == 4 * (6 - intervals)
 
 
+def test_rest_is_seen_without_the_biases():
+    """Which are larger than the bounds of rest; and not with them."""
+    gyro_bias, accel_bias = 2 * CONFIG.rest_gyro, 2 * CONFIG.rest_accel
+    biases = np.array([gyro_bias, 0.0, 0.0]), np.array([0.0, 0.0, accel_bias])
+    config = dataclasses.replace(CONFIG, rest_seconds=0.0)
+    biased = STILL._replace(gyro=STILL.gyro + biases[0][None], accel=STILL.accel + biases[1][None])
+    for gyro, accel, imu, quiet in (
+        (*biases, biased, True),
+        (0.0, biases[1], biased, False),
+        (biases[0], 0.0, biased, False),
+        (0.0, biases[1], STILL, False),
+    ):
+        state = filtering.initial_state(
+            filtering.Filter(config), np.eye(3), np.zeros(3), np.zeros(3), gyro, accel
+        )
+        assert bool(detect_rest(state, imu, config)[1]) == quiet
+
+
 def resting(now, converged=True, last_success=100, pause_end=0, tried=True, speed=1.0):
     """The state before and after the IMU is quiet at sample `now`, with a velocity of `speed` known
     to 0.1 m/s per axis, and what the filter made of it. `tried`: there was a displacement, too."""
     std, velocity = filtering.InitialStd(velocity=0.1), speed * np.array([0.6, 0.0, -0.8])
-    state = filtering.initial_state(CONFIG, np.eye(3), velocity, np.zeros(3), std=std)
+    state = filtering.initial_state(
+        filtering.Filter(CONFIG, start=std), np.eye(3), velocity, np.zeros(3)
+    )
     gate = filtering.GateState(jnp.bool_(converged), jnp.int32(last_success), jnp.int32(pause_end))
     state = state._replace(gate=gate, step=jnp.int32(now // N))
     new, found = at_rest(state, np.bool_(tried))
@@ -114,13 +132,14 @@ def test_a_quiet_ride_is_no_rest_and_a_wrong_start_is_corrected_by_rest():
     moved = np.tile([CLONES * N * DT, 0.0, 0.0], (INTERVALS, 1))
     history = run(np.eye(3), np.array([1.0, 0.0, 0.0]), gyro, rattling, moved)
     quiet = np.arange(INTERVALS) >= gliding + 2
-    (outcome,) = history.others
+    outcome = history.outcomes["zero_velocity"]
     np.testing.assert_array_equal(outcome.present, quiet)
     np.testing.assert_array_equal(outcome.residual[~quiet], 0)
-    assert (np.asarray(outcome.nis)[quiet] > 100).all() and not np.any(history.at_rest)
+    assert (np.asarray(outcome.nis)[quiet] > 100).all() and not np.any(outcome.accepted)
     np.testing.assert_allclose(history.velocity[:, 0], 1.0, atol=0.02)
 
     wrong = np.array([3.0, 0.0, 0.0])
     history = run(np.eye(3), wrong, gyro, still, np.full((INTERVALS, 3), np.nan))
-    assert history.others[0].nis[2] > 1000 and (np.asarray(history.at_rest)[2:] == 1).all()
+    outcome = history.outcomes["zero_velocity"]
+    assert outcome.nis[2] > 1000 and np.asarray(outcome.accepted)[2:].all()
     assert np.abs(history.velocity[2:, 0]).max() < 0.5 and abs(history.velocity[-1, 0]) < 0.02

@@ -12,7 +12,7 @@ from gnio_jax import interop, models
 from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.errors import InputError
-from gnio_jax.filtering import filter_setup
+from gnio_jax.filtering import make_filter
 from gnio_jax.training import checkpoint
 from tests.support import tlio_weights
 
@@ -165,8 +165,8 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     of_data = run.config.data
     assert (of_data.rate, of_data.window, of_data.stride) == (200.0, 200, 20)
     assert run.model == models.create("tlio")
-    assert filter_setup(run.config.data, run.config.filter).config.window_rotation == "tlio"
-    assert filter_setup(run.config.data, FilterSettings()).config.window_rotation == "per_sample"
+    assert make_filter(run.config.data, run.config.filter).config.window_rotation == "tlio"
+    assert make_filter(run.config.data, FilterSettings()).config.window_rotation == "per_sample"
     equal(run.variables, loaded)
     for name, options, problem in (
         ("run", (), f"{tmp_path / 'run'}: is there already; name another folder"),

@@ -8,7 +8,7 @@ import numpy as np
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.training import checkpoint
-from gnio_jax.training.checkpoint import Position
+from gnio_jax.training.checkpoint import RunPosition
 from gnio_jax.training.task import TrainState
 
 
@@ -27,5 +27,5 @@ def save(folder, config, draw):
         for kind, tree in shapes.items()
     }
     state = TrainState(jnp.int32(0), drawn, opt_state={})
-    checkpoint.save(folder, "best", state, Position(epoch=1, best=1.0))
+    checkpoint.save(folder, "best", state, RunPosition(epoch=1, best=1.0))
     return folder

@@ -5,9 +5,9 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.evaluation import (
     Displacements,
-    Estimate,
     Filtered,
     Report,
+    SequenceEstimate,
     States,
     Trajectory,
     never_moves,
@@ -23,7 +23,7 @@ SETTINGS = reports.SETTINGS | {
 
 def reported(estimates, groups=None, notes=None, left_out=None, settings=SETTINGS):
     """The report about estimates, each a group of its own."""
-    groups = groups or {each.name: each.name for each in estimates}
+    groups = groups or {estimate.name: estimate.name for estimate in estimates}
     still = {"never_moves": score(never_moves(estimates))}
     return Report(settings, score(estimates), still, groups, notes or {}, left_out or {})
 
@@ -47,7 +47,7 @@ def estimate(name, seed, n=400, truth=True):
     covariance = np.tile(0.3**2 * np.eye(3), (n, 1, 1))
     spread = 0.03 * np.sqrt(np.arange(n) + 1)
     accepted = np.where(np.arange(n) < 11, np.nan, (np.arange(n) % 10 > 0).astype(float))
-    return Estimate(
+    return SequenceEstimate(
         name,
         Trajectory(time, moved, orientation),
         reference,

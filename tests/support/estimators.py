@@ -7,16 +7,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import evaluation
-from gnio_jax.config import DataConfig, FilterSettings
-from gnio_jax.evaluation import given_displacements, infer, no_displacements, perfect, prepare
+from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, TrainConfig
+from gnio_jax.evaluation import infer, no_displacements, perfect, prepare, reference_displacements
 from gnio_jax.evaluation.estimate import PERFECT_STD
-from gnio_jax.filtering import filter_setup
+from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
 from gnio_jax.types import Prediction, Waypoints
+from tests.support.filter_settings import changed
 
 RATE = 50.0
 CONFIG = DataConfig(rate=RATE, context_seconds=0.2)
 OPTIONS = FilterSettings()
+TRAINED = TrainConfig(
+    data=CONFIG, model=ModelConfig(name="tiny"), filter=changed(start={"velocity": 0.7})
+)
+"""The configuration of a run of the smallest network."""
 
 
 def sensed(variables, windows):
@@ -60,14 +65,14 @@ def ready(walks, config=CONFIG, **how):
 
 def tight(recordings, network=NETWORK, config=CONFIG, options=OPTIONS, **how):
     """The filter with the network in it; how: options of `estimate`."""
-    return evaluation.estimate(recordings, network, config, filter_setup(config, options), **how)
+    return evaluation.estimate(recordings, network, config, make_filter(config, options), **how)
 
 
 def loose(recordings, network=NETWORK, config=CONFIG, options=OPTIONS, **how):
     """The filter with displacements that were inferred before."""
-    ekf = filter_setup(config, options)
-    found = infer(network, recordings, config, least_std=math.exp(ekf.config.log_std_min))
-    return evaluation.estimate(recordings, found, config, ekf, **how)
+    ekf = make_filter(config, options)
+    displacements = infer(network, recordings, config, least_std=math.exp(ekf.config.log_std_min))
+    return evaluation.estimate(recordings, displacements, config, ekf, **how)
 
 
 def summed(recordings, network=NETWORK, config=CONFIG):
@@ -77,14 +82,14 @@ def summed(recordings, network=NETWORK, config=CONFIG):
 
 def imu_only(recordings, config=CONFIG, options=OPTIONS):
     """The filter without displacements."""
-    nothing = [no_displacements(each) for each in recordings]
-    return evaluation.estimate(recordings, nothing, config, filter_setup(config, options))
+    nothing = [no_displacements(recording) for recording in recordings]
+    return evaluation.estimate(recordings, nothing, config, make_filter(config, options))
 
 
 def with_truth(recordings, config=CONFIG, options=OPTIONS, filtered=True, **how):
     """The filter, or the sum of displacements, with those of the reference."""
-    truth = [given_displacements(each, PERFECT_STD) for each in recordings]
-    ekf = perfect(filter_setup(config, options)) if filtered else None
+    truth = [reference_displacements(recording, PERFECT_STD) for recording in recordings]
+    ekf = perfect(make_filter(config, options)) if filtered else None
     return evaluation.estimate(recordings, truth, config, ekf, **how)
 
 

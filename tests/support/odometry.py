@@ -23,5 +23,10 @@ def recording(seed):
 def start(config):
     rotation = Rotation.from_euler("xyz", [0.3, -0.2, 1.0]).as_matrix()
     return filtering.initial_state(
-        config, rotation, np.array([0.5, 0.0, 0.0]), np.zeros(3), np.array([0.02, -0.01, 0.03]), 0.1
+        filtering.Filter(config),
+        rotation,
+        np.array([0.5, 0.0, 0.0]),
+        np.zeros(3),
+        np.array([0.02, -0.01, 0.03]),
+        0.1,
     )

@@ -46,10 +46,10 @@ def report_of(ates, groups, more=None, drop=(), **settings):
     return Report(settings, scores, {}, {name: groups[name] for name in ates}, {}, {})
 
 
-def write_report(folder, made):
+def write_report(folder, report_made):
     """Its metrics.json."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "metrics.json").write_text(json.dumps(report.as_json(made)), encoding="utf-8")
+    (folder / "metrics.json").write_text(json.dumps(report.as_json(report_made)), encoding="utf-8")
     return folder
 
 

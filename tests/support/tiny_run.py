@@ -12,9 +12,8 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.data import windows
 from gnio_jax.models import registry
-from gnio_jax.training import checkpoint, loop
+from gnio_jax.training import checkpoint, loop, windows
 from tests.support import drawn_run
 from tests.support.numpy_layers import batch_norm, float64, linear
 from tests.support.tiny_network import Tiny
@@ -106,20 +105,12 @@ def assert_same_runs(workdir, other):
         assert ours == pytest.approx(theirs, rel=1e-6)
 
 
-def age(run):
-    """Make the checkpoints of a run those of an earlier version."""
-    for file in Path(run).glob("checkpoints/*/*/meta/metadata"):
-        meta = json.loads(file.read_text())
-        assert meta.pop("version") == checkpoint.VERSION
-        file.write_text(json.dumps(meta))
-
-
 @contextlib.contextmanager
 def stopped_at(step, act=lambda: signal.raise_signal(signal.SIGTERM)):
     """One step a dispatch, and `act` once a run has reached this one."""
-    real = loop.after_steps
+    real = loop.add_steps
 
-    def after_steps(*given):
+    def add_steps(*given):
         at = real(*given)
         if at.step == step:
             act()
@@ -127,5 +118,5 @@ def stopped_at(step, act=lambda: signal.raise_signal(signal.SIGTERM)):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "DISPATCH_SECONDS", 0)
-        patch.setattr(loop, "after_steps", after_steps)
+        patch.setattr(loop, "add_steps", add_steps)
         yield

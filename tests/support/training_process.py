@@ -17,19 +17,19 @@ from tests.support.tiny_network import Tiny
 
 
 def main(name, step, every, *arguments):
-    after_steps = loop.after_steps
+    add_steps = loop.add_steps
     loop.DISPATCH_SECONDS = 0  # one step at a time
     if every == "1":
         loop.CHECKPOINT_SECONDS = 0
     registry._MODELS["tiny"] = Tiny
 
     def interrupted(*given):
-        at = after_steps(*given)
+        at = add_steps(*given)
         if name != "never" and at.step >= int(step):
             os.kill(os.getpid(), signal.Signals[name])
         return at
 
-    loop.after_steps = interrupted
+    loop.add_steps = interrupted
     app.main(["train", *arguments])
 
 

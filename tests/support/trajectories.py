@@ -60,5 +60,5 @@ def pitched(pitch, n=900):
 
 def lost(trajectory, row):
     """The trajectory, not finite from a row on."""
-    there = np.arange(len(trajectory.time))[:, None] < row
-    return Trajectory(trajectory.time, *(np.where(there, part, np.nan) for part in trajectory[1:]))
+    finite = np.arange(len(trajectory.time))[:, None] < row
+    return Trajectory(trajectory.time, *(np.where(finite, part, np.nan) for part in trajectory[1:]))

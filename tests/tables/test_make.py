@@ -13,7 +13,7 @@ from gnio_jax import config as configuration
 from gnio_jax.calibration import run as calibration_run
 from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept
+from gnio_jax.evaluation import reuse
 from gnio_jax.tables import activities
 from gnio_jax.training import loop
 from tests.support.command_lines import run as gnio
@@ -59,7 +59,7 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
         raise AssertionError("done already")
 
     monkeypatch.setattr(loop, "train_all", never)
-    monkeypatch.setattr(kept, "evaluate", never)
+    monkeypatch.setattr(reuse, "evaluate", never)
     (root / "out" / "comparison_test_integrate.md").unlink()
     gnio("tables", "comparison", *arguments)
     assert (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8") == text
@@ -117,7 +117,7 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
 
 def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys):
     root, arguments = made
-    monkeypatch.setattr(loop, "train_all", lambda *_, **__: [loop.Outcome(root, None, 15)])
+    monkeypatch.setattr(loop, "train_all", lambda *_, **__: [loop.TrainingResult(root, None, 15)])
     with pytest.raises(SystemExit) as left:
         gnio("tables", "gates", *arguments, "--out", str(root / "elsewhere"))
     assert left.value.code == 128 + 15 and "continues from here" in capsys.readouterr().err

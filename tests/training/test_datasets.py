@@ -11,13 +11,12 @@ import yaml
 
 from gnio_jax import config as configuration
 from gnio_jax import data
-from gnio_jax.calibration import evidence
+from gnio_jax.calibration import predictions
 from gnio_jax.config import CalibrateConfig, DataConfig, EvaluateConfig, TrainConfig
-from gnio_jax.data import windows
 from gnio_jax.data.readers import DATASETS
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import resolve
-from gnio_jax.training import checkpoint, loop, segments
+from gnio_jax.training import checkpoint, loop, segments, windows
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.task import TrainState
 from gnio_jax.training.window_task import WindowTask
@@ -76,7 +75,9 @@ def test_a_run_keeps_the_figures_of_each_dataset_and_chooses_by_their_mean(run):
     assert checkpoint.load_run(run, "best").step == best["step"]
     each = len(range(0, 600 - 50, 5))  # windows of a walk of 12 s at 50 Hz, every 0.1 s
     assert rows[0]["step"] == (0.5 * each + 1.5 * each) // 16
-    (line,) = loop.lines(row | {"windows_per_second": 9.0}, True, WindowTask(Tiny(), both(""), 1))
+    (line,) = loop.describe_epoch(
+        row | {"windows_per_second": 9.0}, True, WindowTask(Tiny(), both(""), 1)
+    )
     assert f"(tlio {row['val_rmse/tlio']:.4f}, other {row['val_rmse/other']:.4f})" in line
 
 
@@ -116,7 +117,7 @@ def test_an_epoch_visits_each_dataset_by_its_weight():
 def test_segments_are_visited_by_weight_too_each_in_its_share():
     walks = [data.resample(data.load(name, split="train")[0], 50.0) for name in BOTH]
     parts = [segments.segment_source([walk], 100) for walk in walks]
-    source = segments.joined(parts)
+    source = segments.join_segments(parts)
     counts = tuple(len(part.earliest) for part in parts)
     config = TrainConfig(dataset=BOTH, data=DataConfig(weights=(1.0, 2.0)))
     order = np.asarray(FilterTask(Tiny(), config, 1, counts).order(jax.random.key(0), 0, source))
@@ -132,7 +133,7 @@ def test_the_mean_is_over_the_datasets_that_have_a_figure(run):
         def figures_of(self, state, held_out, key):
             return {**dict.fromkeys(("val_loss", "val_mse", "val_rmse"), 1.0), **held_out}
 
-        def calibrated(self, state, held_out):
+        def calibrate_uncertainty(self, state, held_out):
             return state
 
     task = Figures(Tiny(), both(run), 1)
@@ -151,12 +152,12 @@ def test_an_evaluation_says_of_which_dataset(run):
 def test_a_calibration_takes_a_folder_for_each_dataset(run, monkeypatch):
     read = []
     monkeypatch.setattr(data, "load", lambda name, root, *_: read.append((name, root)) or [])
-    asked = [evidence.Source(checkpoint.load_run(run), None)]
+    asked = [predictions.FoldNetwork(checkpoint.load_run(run), None)]
 
     def gather(*roots):
         config = CalibrateConfig(data_root=roots)
         with pytest.raises(InputError) as refused:  # also where there is nothing to be fitted
-            evidence.gather("val", asked, config, TrainConfig().filter, lambda *_: None, 1)
+            predictions.predict("val", asked, config, TrainConfig().filter, lambda *_: None, 1)
         return str(refused.value)
 
     assert "has no recording with a reference" in gather() + gather("one", "two")

@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from gnio_jax.config import ThroughFilter
 from gnio_jax.filtering import FilterConfig, FilterHistory
 from gnio_jax.training import filter_losses
-from gnio_jax.training.segments import Path, Segment
+from gnio_jax.training.segments import MotionPath, Segment
 from tests.support.compiling import quick
 
 K, W = 40, 5
@@ -31,8 +31,8 @@ def paths(seed=0):
     true = Rotation.from_euler("z", turns[:, None]) * upright
     error = Rotation.from_rotvec(0.2 * rng.standard_normal((K + 1, 3)))
     position = np.cumsum(0.3 * rng.standard_normal((K + 1, 3)), 0)
-    truth = Path(true.as_matrix(), rng.standard_normal((K + 1, 3)), position)
-    estimate = Path(
+    truth = MotionPath(true.as_matrix(), rng.standard_normal((K + 1, 3)), position)
+    estimate = MotionPath(
         (error * true).as_matrix(),
         truth.velocity + 0.1 * rng.standard_normal((K + 1, 3)),
         position + 0.1 * rng.standard_normal((K + 1, 3)),
@@ -68,7 +68,7 @@ def test_a_turned_and_shifted_estimate_has_no_relative_error():
     _, truth = paths()
     turn = Rotation.from_euler("z", 2.0)
     moved = turn.apply(truth.position) + np.array([3.0, 2.0, 1.0])
-    estimate = Path(turn.as_matrix() @ truth.rotation, truth.velocity, moved)
+    estimate = MotionPath(turn.as_matrix() @ truth.rotation, truth.velocity, moved)
     for loss in (relative_displacement, relative_yaw):
         assert abs(loss(estimate, truth, 7)) < 1e-25
     # Where the path stands still, too, with a gradient.

@@ -13,7 +13,7 @@ import pytest
 
 from gnio_jax.errors import InputError
 from gnio_jax.training import checkpoint, run_folder
-from gnio_jax.training.checkpoint import Position
+from gnio_jax.training.checkpoint import RunPosition
 from gnio_jax.training.run_folder import Log
 from gnio_jax.training.task import TrainState
 
@@ -36,7 +36,7 @@ def files_of_at_most(size):
 
 
 def save(run, step):
-    checkpoint.save(run, "latest", state(step), Position(step=step))
+    checkpoint.save(run, "latest", state(step), RunPosition(step=step))
 
 
 @pytest.fixture

@@ -17,13 +17,12 @@ from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.training import checkpoint, loop, optimizer, run_folder, task, window_task
 from gnio_jax.training.losses import Losses
-from gnio_jax.training.recordings import Recordings
+from gnio_jax.training.recordings import TrainingData
 from gnio_jax.training.window_task import WindowTask
 from tests.support.drawn_state import fresh_state
 from tests.support.tiny_network import Tiny
 from tests.support.tiny_run import (
     STEPS,
-    age,
     arrays,
     assert_same_runs,
     config,
@@ -164,14 +163,14 @@ def test_two_trainings_in_one_folder(recording, tmp_path):
     """The second one is refused when both have passed the door before either has written, also
     where both resume."""
     first = config(recording, tmp_path / "run")
-    recordings = Recordings(None, {}, {"train": ["a", "b"], "val": ["c"]})
+    recordings = TrainingData(None, {}, {"train": ["a", "b"], "val": ["c"]})
 
     def begin(seed):
         given = dataclasses.replace(first, seed=seed), recordings, {}, False
-        with run_folder.opened(*given):
+        with run_folder.open_run(*given):
             pass
 
-    with run_folder.opened(first, recordings, {}, resume=False):
+    with run_folder.open_run(first, recordings, {}, resume=False):
         written = (tmp_path / "run" / "config.yaml").read_bytes()
         with pytest.raises(InputError, match="run: another process is training in it"):
             begin(1)
@@ -205,19 +204,12 @@ def test_runs_that_cannot_be_loaded(recording, finished, tmp_path):
     refused("best: holds parameters that are not finite", tmp_path / "lost")
 
 
-def test_a_run_of_an_earlier_version_is_evaluated_and_not_resumed(recording, finished, tmp_path):
-    age(shutil.copytree(finished[0], tmp_path / "run"))
-    assert same(arrays(tmp_path / "run", "best"), arrays(finished[0], "best"))
-    with pytest.raises(InputError, match=r"is of an earlier version of .*; begin .* --init-from"):
-        loop.train(config(recording, tmp_path / "run"), resume=True)
-
-
 def test_a_head_that_no_gradient_reaches_is_told_of(recording, finished):
     row = rows(finished[0])[-1]
     assert not loop.stuck_layers(row)
     row |= {"gradient_norm/head/kernel": 0.0, "gradient_norm/head/bias": 0.0}
     training = WindowTask(Tiny(), config(recording, ""), STEPS)
-    _, warned = loop.lines(row | {"windows_per_second": 9.0}, False, training)
+    _, warned = loop.describe_epoch(row | {"windows_per_second": 9.0}, False, training)
     assert "no gradient reached head/bias, head/kernel in this epoch" in warned
     # Steps that Adam's ε swallows are none, and a loss that has not begun is no mistake.
     swallowed = rows(finished[0])[-1] | {"gradient_norm/head/kernel": 1e-12}
@@ -287,7 +279,7 @@ def counted(recording, tmp_path, monkeypatch):
         def train_steps(state, source, order, first, count, factor, *_, **__):
             factors.append(float(factor))
             sums = dict.fromkeys(("loss", "mse", "nll"), jnp.float32(0))
-            return state._replace(step=state.step + count), task.Progress(sums, jnp.int32(-1))
+            return state._replace(step=state.step + count), task.DispatchSums(sums, jnp.int32(-1))
 
         def validate(*_, **__):
             seen.append(1)
@@ -345,7 +337,7 @@ def test_nan_on_validation_is_never_the_best(counted, tmp_path):
         checkpoint.load_run(tmp_path / "none")
     config, plateau = OptimConfig(schedule="plateau"), optimizer.Plateau()
     for error in (infinite, 1.0, nan, 0.5):
-        plateau = optimizer.watch(plateau, error, config)
+        plateau = optimizer.update_plateau(plateau, error, config)
     assert plateau == optimizer.Plateau(1.0, 0.5, 0)
 
 

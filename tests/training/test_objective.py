@@ -196,10 +196,10 @@ def test_plateau_waits_for_its_epochs_and_starts_counting_anew(monkeypatch):
     errors = [np.nan, 1.0, 0.9, 0.9, 0.89999, 0.95, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8]
     factors, plateau = [], optimizer.Plateau()
     for error in errors:
-        plateau = optimizer.watch(plateau, error, config)
+        plateau = optimizer.update_plateau(plateau, error, config)
         factors.append(plateau.factor)
     assert factors == [1, 1, 1, 1, 1, 0.5, 0.5, 0.5, 0.5, 0.25, 0.25, 0.25, 0.125]
-    assert optimizer.watch(optimizer.Plateau(), 1.0, OptimConfig()) == optimizer.Plateau()
+    assert optimizer.update_plateau(optimizer.Plateau(), 1.0, OptimConfig()) == optimizer.Plateau()
 
 
 def test_no_decay_after_the_warm_up_and_no_rise_below_the_end_of_the_cosine():

@@ -16,11 +16,11 @@ from gnio_jax.data import loading
 from gnio_jax.errors import InputError
 from gnio_jax.models import Network
 from gnio_jax.reporting import Lines, Silence
-from gnio_jax.training import recordings, run_folder
+from gnio_jax.training import recordings, run_folder, waypoint_poses
 from gnio_jax.training.checkpoint import load_run
 from gnio_jax.training.window_task import WindowTask
 from gnio_jax.types import Waypoints
-from tests.support import tiny_run
+from tests.support import drawn_run, tiny_run
 from tests.support.filter_settings import changed
 from tests.support.surveyor import survey
 
@@ -45,7 +45,7 @@ def experiment(run, workdir="", **changes):
 def read(monkeypatch, walks, run, workers=1):
     monkeypatch.setattr(loading, "read_split", lambda *_: iter(walks))
     config, samples = experiment(run), {}
-    poses = recordings._poses_by(config, Lines(), load_run)
+    poses = waypoint_poses.load_pose_network(config, Lines(), load_run)
     given = config, "synthetic", "train", Lines(), workers, samples, poses
     found = list(recordings.read_split(*given))
     assert samples == {each.name: len(each.time) for each in found}
@@ -58,16 +58,16 @@ def smoothed(earlier, monkeypatch):
     of the last three seconds. The walks that it was asked for."""
     asked, run = [], load_run(earlier)
     network = Network.of(run.model, run.variables)
-    wanted = filtering.filter_setup(run.config.data, run.config.filter)
+    wanted = filtering.make_filter(run.config.data, run.config.filter)
 
-    def waypoint_poses(walk, predict, setup):
+    def smooth(walk, predict, ekf):
         asked.append(walk.name)
         assert jnp.ones(()).dtype == np.float64
         if len(asked) == 1:
             expected = network.apply(network.variables, jnp.float32(WINDOW))
             found = predict(jnp.float32(WINDOW))
             np.testing.assert_array_equal(found.displacement, expected.displacement)
-            assert setup == wanted and setup.raw_gyro_bias == 0.03
+            assert ekf == wanted and ekf.raw_gyro_bias == 0.03
         if walk.name == "survey 1":
             raise InputError(walk.name, "the filter fails on it")
         poses = data.with_poses(walk)
@@ -80,7 +80,7 @@ def smoothed(earlier, monkeypatch):
         )
         return filtering.WaypointPoses(poses, None, None)
 
-    monkeypatch.setattr(filtering, "waypoint_poses", waypoint_poses)
+    monkeypatch.setattr(filtering, "waypoint_poses", smooth)
     return asked
 
 
@@ -90,7 +90,7 @@ def tapped(seed):
     return walk._replace(waypoints=Waypoints(*(part[1:] for part in walk.waypoints)))
 
 
-def test_smoothed_poses_come_from_the_run_and_then_from_the_cache(
+def test_smooth_poses_come_from_the_run_and_then_from_the_cache(
     earlier, smoothed, monkeypatch, capsys
 ):
     walks = tapped(0), tapped(1), survey(3).truth, tapped(2)
@@ -124,11 +124,11 @@ def test_smoothed_poses_come_from_the_run_and_then_from_the_cache(
 def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypatch):
     sources = []
     monkeypatch.setattr(
-        recordings, "cache_entry", lambda name, files: sources.append(files) or Path(name)
+        waypoint_poses, "cache_entry", lambda name, files: sources.append(files) or Path(name)
     )
     walk, run = tapped(0), load_run(earlier)
-    digest = recordings._digest_of_run(run)
-    by = recordings.PosesBy(str(earlier), load_run, digest)
+    digest = waypoint_poses.digest_network(run)
+    by = waypoint_poses.PoseNetwork(str(earlier), load_run, digest)
     assert walk.waypoints is not None
     time, place = walk.waypoints
     others = [
@@ -139,8 +139,8 @@ def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypat
         walk._replace(imu_valid=np.arange(len(walk.time)) > 5),
         walk._replace(waypoints=Waypoints(time, place + 1e-9)),
     ]
-    entries = {recordings._cache_entry(each, by) for each in [walk, *others]}
-    entries.add(recordings._cache_entry(walk, by._replace(digest="other")))
+    entries = {waypoint_poses._cache_entry(each, by) for each in [walk, *others]}
+    entries.add(waypoint_poses._cache_entry(walk, by._replace(digest="other")))
     assert len(entries) == len(others) + 2
     names = {"/".join(path.parts[-2:]) for path in sources[0]}
     assert {"filtering/waypoints.py", "models/gnio.py", "gnio_jax/geometry.py"} <= names
@@ -149,21 +149,23 @@ def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypat
     other = run._replace(config=dataclasses.replace(run.config, filter=settings))
     changed_weights = jax.tree.map(lambda leaf: leaf + 1e-6, run.variables)
     moved = run._replace(config=dataclasses.replace(run.config, workdir="elsewhere"))
-    assert recordings._digest_of_run(moved) == digest
+    assert waypoint_poses.digest_network(moved) == digest
     for each in (other, run._replace(variables=changed_weights)):
-        assert recordings._digest_of_run(each) != digest
+        assert waypoint_poses.digest_network(each) != digest
 
 
 def test_a_run_that_changes_at_its_place_makes_its_own_poses(earlier, smoothed, monkeypatch):
     config = load_run(earlier).config
     read(monkeypatch, [tapped(0)], earlier)
-    old = recordings.PosesBy(str(earlier), load_run, recordings._digest_of_run(load_run(earlier)))
+    old = waypoint_poses.PoseNetwork(
+        str(earlier), load_run, waypoint_poses.digest_network(load_run(earlier))
+    )
     tiny_run.save(earlier, dataclasses.replace(config, filter=changed(SETTINGS)), size=0.3)
     read(monkeypatch, [tapped(0)], earlier)
     assert smoothed == ["survey 0"] * 2
-    recordings._labeller.cache_clear()
+    waypoint_poses._load_smoother.cache_clear()
     with pytest.raises(InputError, match="has changed while it made poses"):
-        recordings.smoothed_poses(tapped(0), old)
+        waypoint_poses.smooth_poses(tapped(0), old)
 
 
 def unread():
@@ -182,7 +184,7 @@ def test_a_run_that_cannot_make_poses_is_told_before_anything_is_read(tmp_path, 
 
 def test_a_run_that_is_not_calibrated_is_warned_of(tmp_path, capsys):
     run = tiny_run.save(tmp_path / "plain", tiny_run.config(None, "", data=DataConfig(rate=50.0)))
-    assert recordings._poses_by(experiment(run), Lines(), load_run) is not None
+    assert waypoint_poses.load_pose_network(experiment(run), Lines(), load_run) is not None
     assert f"warning: {run}: its filter is not calibrated" in capsys.readouterr().err
 
 
@@ -198,11 +200,11 @@ def test_a_resumed_run_takes_the_same_poses_from_another_place(
         config = experiment(run, tmp_path / "run")
         task, found = recordings.set_up(WindowTask, config, Silence())
         assert task.config.data.poses_by is None
-        with run_folder.opened(config, found, {}, resume):
+        with run_folder.open_run(config, found, {}, resume):
             return yaml.safe_load((tmp_path / "run" / "splits.yaml").read_text())
 
     kept = opened(earlier, resume=False)
-    assert kept["data.poses_by"] == [recordings._digest_of_run(load_run(earlier))]
+    assert kept["data.poses_by"] == [waypoint_poses.digest_network(load_run(earlier))]
     assert opened(shutil.copytree(earlier, tmp_path / "moved")) == kept
     other = tiny_run.save(tmp_path / "other", load_run(earlier).config, size=0.3)
     with pytest.raises(InputError, match=r"begun with other recordings in split 'data\.poses_by'"):
@@ -214,11 +216,17 @@ def test_a_resumed_run_takes_the_same_poses_from_another_place(
 
 @pytest.mark.slow
 def test_processes_make_the_poses_that_one_makes(earlier, monkeypatch):
+    """By a network that has learnt only that people walk at 1.1 m/s where the phone points."""
     config = load_run(earlier).config
-    width = dataclasses.replace(config.model, name="gnio", width=2, uncertainty=None)
-    config = dataclasses.replace(config, model=width, data=DataConfig(rate=50.0))
-    run = tiny_run.save(earlier.with_name("gnio"), config)
-    monkeypatch.setattr(recordings, "FEW", 1)
+    model = dataclasses.replace(config.model, name="tlio", width=2, uncertainty=None)
+    config = dataclasses.replace(config, model=model, data=DataConfig(rate=50.0))
+    outputs = iter(([0.0, 1.1, 0.0], [-1.5, -1.5, -1.5]))  # m, and logarithms of m
+
+    def draw(random, kind, shape):
+        return next(outputs) if shape == (3,) else np.full(shape, float(kind == "batch_stats"))
+
+    run = drawn_run.save(earlier.with_name("ahead"), config, draw)
+    monkeypatch.setattr(waypoint_poses, "FEW", 1)
     walks = [survey(seed, legs=3).tapped(np.zeros(4)) for seed in (1, 2)]
     shared = read(monkeypatch, walks, run, workers=2)
     monkeypatch.setenv("GNIO_CACHE", str(earlier / "empty"))

@@ -67,10 +67,10 @@ def test_a_segment_holds_its_samples_and_the_truth_at_its_clones():
     np.testing.assert_allclose(segment.truth.rotation, rotation, atol=1e-12)
 
 
-def test_a_turned_segment_is_the_same_walk_in_a_turned_world():
+def test_a_turn_segment_is_the_same_walk_in_a_turned_world():
     source = segments.segment_source([sequence(150, seed=2)], SAMPLES)
     segment = segments.cut_segment(source, jnp.int32(7), 5, 4)
-    found = jax.jit(segments.turned_segment)(segment, jnp.float64(0.7))
+    found = jax.jit(segments.turn_segment)(segment, jnp.float64(0.7))
     turn = Rotation.from_euler("z", 0.7).as_matrix()
     np.testing.assert_array_equal(found.gyro, segment.gyro)
     np.testing.assert_array_equal(found.accel, segment.accel)
@@ -90,7 +90,7 @@ def test_a_low_passed_segment_has_smaller_high_frequencies_and_the_same_truth():
     one = segments.cut_segment(source, jnp.int32(0), 10, samples // 10)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 60), one)
     half = AugmentConfig(low_pass_share=0.5, low_pass_hertz=(4.0, 4.0))
-    found = segments.low_passed(jax.random.key(2), batch, half, rate)
+    found = segments.low_pass_segments(jax.random.key(2), batch, half, rate)
     assert found.gyro.dtype == found.accel.dtype == np.float64
     others = (each._replace(gyro=0, accel=0) for each in (batch, found))
     jax.tree.map(np.testing.assert_array_equal, *others)
@@ -106,11 +106,11 @@ def test_a_low_passed_segment_has_smaller_high_frequencies_and_the_same_truth():
     for signal, whole in ((found.gyro, one.gyro), (found.accel - 9.81, one.accel - 9.81)):
         wanted = sizes[:, None, None] * whole[None, inner]
         np.testing.assert_allclose(signal[:, inner], wanted, atol=0.03)
-    assert segments.low_passed(jax.random.key(2), batch, AugmentConfig(), rate) is batch
+    assert segments.low_pass_segments(jax.random.key(2), batch, AugmentConfig(), rate) is batch
 
     ramp = np.linspace(-1.0, 1.0, samples)[:, None] * np.ones(3)  # the ends are no neighbours
     batch = batch._replace(gyro=batch.gyro * 0 + ramp[None], accel=batch.accel * 0 + 9.81)
-    found = segments.low_passed(jax.random.key(2), batch, half, rate)
+    found = segments.low_pass_segments(jax.random.key(2), batch, half, rate)
     np.testing.assert_allclose(found.accel, 9.81, atol=1e-9)
     np.testing.assert_allclose(found.gyro, np.tile(ramp, (60, 1, 1)), atol=0.1)
 

@@ -1,7 +1,6 @@
 """Training through the filter, with a network of one layer on walks of a few seconds."""
 
 import dataclasses
-import shutil
 import signal
 from contextlib import nullcontext
 
@@ -120,7 +119,7 @@ def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
         assert same(parameters, after.variables["params"][module]) == (module != "head"), module
     statistics = after.variables["batch_stats"]
     assert same(before.variables["batch_stats"]["norm"], statistics["norm"])
-    given, found = configuration.flat(OPTIONS), configuration.flat(after.config.filter)
+    given, found = configuration.flatten(OPTIONS), configuration.flatten(after.config.filter)
     moved = {name for name in given if given[name] != found[name]}
     numbers = {name for name in given if name.startswith(("noise.", "start."))}
     assert moved == numbers - {"start.tilt"}  # which is 0
@@ -152,13 +151,6 @@ def test_a_copy_with_other_options_has_them(finished, tmp_path):
     found = checkpoint.load_run(tmp_path)
     assert found.config.filter == options and same(found.variables, run.variables)
     assert (found.step, found.epoch) == (run.step, run.epoch)
-
-
-def test_what_an_earlier_version_has_trained_is_told(finished, tmp_path):
-    run = shutil.copytree(finished, tmp_path / "run")
-    tiny_run.age(run)
-    with pytest.raises(InputError, match=r"is of an earlier version of .*; train it again from"):
-        checkpoint.load_run(run)
 
 
 @pytest.fixture(scope="module")
@@ -251,7 +243,7 @@ def test_a_skipped_step_does_not_shift_the_schedule(training, start):
     """The rate that the log gives for a step is the one that is in force, whatever was skipped
     before: the same step is taken after a skip."""
     training, source = training
-    rates = [loop.learning_rate(checkpoint.Position(step=step), training) for step in range(4)]
+    rates = [loop.learning_rate(checkpoint.RunPosition(step=step), training) for step in range(4)]
     assert len(set(rates)) == 4
     state, other = (begun(training, start) for _ in range(2))
     lost = source._replace(accel=source.accel.at[:].set(np.nan))
@@ -307,7 +299,7 @@ def test_the_low_pass_of_segments_is_at_the_rate_of_the_data(training, monkeypat
         told.append((augment, rate))
         return segments
 
-    monkeypatch.setattr(filter_task, "low_passed", noted)
+    monkeypatch.setattr(filter_task, "low_pass_segments", noted)
     jax.eval_shape(training.draw, jax.random.key(0), source, source.earliest[:1])
     assert told == [(training.config.augment, 50.0)]
 
@@ -340,7 +332,7 @@ def test_the_filter_in_training_has_a_slope_at_its_gate_is_cut_and_does_not_call
 ):
     """Where each core is a device, batched calls of LAPACK in the step deadlock."""
     training, source = training
-    found = training.softened()
+    found = training.training_filter()
     assert (found.gate_softness, found.checkpoint_every, found.truncate_every) == (2.0, 20, 100)
     state, order = training.initial_state(KEY, start), jnp.resize(source.earliest, 10)
     numbers = jnp.int32(0), jnp.int32(1), jnp.float32(1)
@@ -404,11 +396,11 @@ def test_parts_are_modules_and_options_by_name():
         ("measurement", set(), ("noise.measurement_scale", "noise.std_factor.0")),
         ("start", set(), ("start.yaw", "start.velocity")),
     ):
-        found = optimizer.trainable(given | {"batch_stats": {}}, (learn,))
+        found = optimizer.select_trained(given | {"batch_stats": {}}, (learn,))
         assert found.get("params", {}).keys() == params
         assert set(some) <= found.get("filter", {}).keys() and all(found.values())
-    assert optimizer.trainable(given, ("all", "head")) == given
-    assert optimizer.trainable(given, ()) == {"params": given["params"]}
+    assert optimizer.select_trained(given, ("all", "head")) == given
+    assert optimizer.select_trained(given, ()) == {"params": given["params"]}
 
 
 def test_options_survive_their_unconstrained_numbers():
@@ -426,7 +418,7 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
     """The command makes the filter of that run the default; what it asks for wins."""
     words = ["--init-from", str(finished), "--through-filter.learn", *THROUGH.learn]
     asked_for = tiny(recording, "unused", init_from=str(finished))
-    run = checkpoint.initial_run(asked_for, checkpoint.load_run)
+    run = checkpoint.load_initial_network(asked_for, checkpoint.load_run)
     call = Call("gnio train", words)
     begins = experiment(read(train, call), call).filter
     assert begins == run.config.filter != OPTIONS
@@ -447,9 +439,9 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
         model = dataclasses.replace(config.model, equivariance=equivariance)
         other = dataclasses.replace(config, model=model)
         with nullcontext() if fits else pytest.raises(InputError, match="canonical_frame"):
-            assert checkpoint.initial_run(other, checkpoint.load_run) is not None
+            assert checkpoint.load_initial_network(other, checkpoint.load_run) is not None
     with jax.enable_x64(False):
-        start = checkpoint.initial_run(config, checkpoint.load_run)
+        start = checkpoint.load_initial_network(config, checkpoint.load_run)
         training, _ = set_up(WindowTask, config, Silence())
         state = training.initial_state(KEY, start.variables)
     theirs = checkpoint.load_run(recording / "initial").variables

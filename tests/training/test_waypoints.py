@@ -9,7 +9,7 @@ from gnio_jax.config import ThroughFilter
 from gnio_jax.data import with_poses
 from gnio_jax.filtering import FilterConfig, FilterHistory
 from gnio_jax.training import filter_losses, segments
-from gnio_jax.training.segments import Path
+from gnio_jax.training.segments import MotionPath
 from tests.support.compiling import literal, quick
 from tests.support.surveyor import survey
 
@@ -103,7 +103,9 @@ def test_few_waypoints_and_those_in_a_line_or_in_one_place_have_a_gradient():
 def test_segments_have_the_waypoints_of_their_walk_and_turn_with_it():
     walk = with_poses(survey(0).tapped(np.zeros(9)))
     posed = survey(1).truth
-    source = segments.joined([segments.segment_source([each], 100) for each in (walk, posed)])
+    source = segments.join_segments(
+        [segments.segment_source([each], 100) for each in (walk, posed)]
+    )
     assert source.tapped.sum() == len(walk.time) and source.tapped[0] and not source.tapped[-1]
     rows = np.flatnonzero(np.isfinite(source.waypoint).all(axis=1))
     np.testing.assert_allclose(rows / 50, walk.waypoints.time, atol=0.011)
@@ -112,7 +114,7 @@ def test_segments_have_the_waypoints_of_their_walk_and_turn_with_it():
     start = int(rows[1]) - 40
     segment = segments.cut_segment(source, jnp.int32(start), 20, 5)
     assert segment.tapped and np.flatnonzero(np.isfinite(segment.waypoint[:, 0])).tolist() == [40]
-    turned = segments.turned_segment(segment, jnp.float64(np.pi / 2))
+    turned = segments.turn_segment(segment, jnp.float64(np.pi / 2))
     x, y = walk.waypoints.position[1]
     np.testing.assert_allclose(turned.waypoint[40], [-y, x], atol=1e-12)
 
@@ -121,7 +123,7 @@ def test_of_a_walk_with_waypoints_the_sum_has_these_in_the_place_of_poses():
     rng = np.random.default_rng(3)
     position, waypoint, _ = tapped_path()
     rotation = np.tile(np.eye(3), (K + 1, 1, 1))
-    path = Path(rotation, np.zeros((K + 1, 3)), position)
+    path = MotionPath(rotation, np.zeros((K + 1, 3)), position)
     nothing = {name: None for name in FilterHistory._fields}
     history = FilterHistory(**nothing)._replace(
         covariance=np.tile(np.eye(15), (K, 1, 1)),

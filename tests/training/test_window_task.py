@@ -10,14 +10,13 @@ import pytest
 
 from gnio_jax import parallel
 from gnio_jax.config import ModelConfig, TrainConfig
-from gnio_jax.data import windows
 from gnio_jax.models.heads import CalibratedUncertainty
 from gnio_jax.reporting import Silence
-from gnio_jax.training import task, window_task
+from gnio_jax.training import task, window_task, windows
 from gnio_jax.training.losses import Losses, loss_stage
 from gnio_jax.training.recordings import set_up
 from gnio_jax.training.task import TrainState
-from gnio_jax.training.window_task import Validation, WindowTask, calibrated
+from gnio_jax.training.window_task import Validation, WindowTask, calibrate_uncertainty
 from tests.support.drawn_state import drawn_state, fresh_state
 from tests.support.tiny_network import Tiny
 from tests.support.tiny_run import config, same
@@ -160,12 +159,14 @@ def of_uncertainty(state, name):
 def test_the_uncertainty_takes_the_errors_of_the_validation():
     """A constant those of the axes. A head's factor follows errors twice and half as large as it
     announced, from whatever it was, and nothing becomes infinite; training does not see it."""
-    found = calibrated(with_uncertainty(log_std=np.zeros(3)), validation([0.04, 1.0, 4.0], [1] * 3))
+    found = calibrate_uncertainty(
+        with_uncertainty(log_std=np.zeros(3)), validation([0.04, 1.0, 4.0], [1] * 3)
+    )
     np.testing.assert_allclose(of_uncertainty(found, "log_std"), [0.2, 1, 2], rtol=1e-6)
     start = with_uncertainty(log_factor=np.log([3.0, 1.0, 1.0]))
-    found = calibrated(start, validation([1] * 3, [4.0, 0.25, 1.0]))
+    found = calibrate_uncertainty(start, validation([1] * 3, [4.0, 0.25, 1.0]))
     np.testing.assert_allclose(of_uncertainty(found, "log_factor"), [6.0, 0.5, 1.0], rtol=1e-6)
-    lost = calibrated(start, validation([1] * 3, [np.inf, 0, 1]))
+    lost = calibrate_uncertainty(start, validation([1] * 3, [np.inf, 0, 1]))
     assert np.isfinite(of_uncertainty(lost, "log_factor")).all()
     head, h = CalibratedUncertainty(), jnp.ones((4, 5), jnp.float32)
     variables = head.init(jax.random.key(0), h, False)

@@ -3,31 +3,22 @@ units and signs, the uniform clock of all recordings (`data.assembly`), the refe
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool
 
 from gnio_jax.apps.importing import units
+from gnio_jax.apps.importing.clocks import Clocked, Sensor, clocked
+from gnio_jax.config import ImportOptions
+from gnio_jax.data import physics
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
-from gnio_jax.data.parsing.stamps import (
-    PER_SECOND,
-    RATES,
-    first_stamp,
-    in_order,
-    is_rate,
-    rounded_rate,
-    seconds,
-    time_unit,
-)
-from gnio_jax.data.parsing.tables import Table, open_text, read_text
+from gnio_jax.data.parsing.stamps import RATES, is_rate, rounded_rate
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.self_check import self_check
-from gnio_jax.data.validation import WINDOW_SECONDS, check_finite, from_one
+from gnio_jax.data.validation import WINDOW_SECONDS
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
 from gnio_jax.types import Sequence
@@ -37,45 +28,6 @@ GAPS = "lacks samples"
 SLOW = 50.0
 """Rate below which the impacts of steps are lost, Hz; networks are trained on 100 Hz and more
 (ours)."""
-DECIMAL_ROWS = 20
-"""Number of rows in which a decimal comma is searched, because some rows may have only whole
-numbers."""
-
-
-class Units(NamedTuple):
-    """Units that a format or the user states. None: not stated, so it is detected from the data."""
-
-    time: str | None = None
-    """s, ms, us or ns."""
-    gyro: str | None = None
-    """rad/s or deg/s."""
-    accel: str | None = None
-    """m/s2, g or mg."""
-    sign: str | None = None
-    """Sign of the accelerometer: android, ios or detect (see `units.signed`)."""
-    sign_is_assumed: bool = False
-    """Whether the sign is only assumed."""
-
-
-class Sensor(NamedTuple):
-    """A sensor's samples as in its file: rows in any order, in the file's units."""
-
-    name: str
-    """gyro or accel, for messages."""
-    file: Path
-    stamps: Num[np.ndarray, " n"]
-    values: Float[np.ndarray, "n 3"]
-    row: Callable[[int], int] = from_one
-    """A function from a sample to its row in the file, for messages."""
-
-    def where(self, kept: Bool[np.ndarray, " n"]) -> Sensor:
-        """The samples in these rows."""
-        own, stamps, values = np.flatnonzero(kept), self.stamps[kept], self.values[kept]
-
-        def row(index: int) -> int:
-            return self.row(int(own[index]))
-
-        return self._replace(stamps=stamps, values=values, row=row)
 
 
 class Track(NamedTuple):
@@ -91,246 +43,133 @@ class Track(NamedTuple):
     """Whether the user asked for it. A problem is then an error, and otherwise a note."""
 
 
-class Recording(NamedTuple):
+class RawRecording(NamedTuple):
     """A recording from a reader, before the conversion of units, clocks and rates."""
 
     path: Path
     """Path, as the user named it."""
     gyro: Sensor
     accel: Sensor
-    units: Units = Units()
-    track: Track | None = None
-    notes: tuple[str, ...] = ()
+    notes: list[str]
     """Notes about what was recognised, chosen or left out, one sentence each."""
+    warnings: list[str]
+    """Warnings about problems that may make all results wrong, one sentence each."""
+    sign: str | None = None
+    """Sign of the accelerometer: android, ios or detect (see `units.signed`), if it is known."""
+    sign_is_assumed: bool = False
+    track: Track | None = None
     raw_gyro: bool = False
     """Whether it is known that the phone subtracts no bias from the gyro."""
 
 
 class Imported(NamedTuple):
-    """A recording on a uniform clock."""
+    """A recording on a uniform clock, with a reference if it has one, and its notes and warnings
+    for the user."""
 
     sequence: Sequence
-    """The sequence, with a reference if the recording has one."""
     notes: tuple[str, ...]
-    """Notes for the user about what was detected, assumed or repaired, one sentence each."""
     warnings: tuple[str, ...] = ()
-    """Warnings about problems that may make all results wrong, one sentence each."""
 
 
-# --- from a table to the samples of a sensor
-
-
-class Layout(NamedTuple):
-    """The format of the rows of a text table."""
-
-    separator: str
-    """Separator of cells; " " means any run of blanks."""
-    decimal: str
-    """Decimal mark: a point, or a comma, depending on the logger's settings."""
-    labels: tuple[str, ...]
-    """The cells of the first row, without quotes."""
-
-
-def table_layout(path: Path, content: bytes | None = None) -> Layout:
-    """The layout of a table, from its first rows. The separator is the most frequent of comma,
-    semicolon and tab, or blanks if there is none of them. `content` is the content of a file that
-    is part of an archive. Raises `InputError` if it is no text."""
-    try:
-        with open_text(path, content) as file:
-            rows = (line for line in file if line.strip() and not line.startswith("#"))
-            first, *others = [next(rows, "") for _ in range(1 + DECIMAL_ROWS)]
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"is no text ({error})", "export the recording as CSV") from None
-    separator = max((",", ";", "\t"), key=first.count)
-    separator = separator if separator in first else " "
-    comma = separator != "," and any(re.search(r"\d,\d", row) for row in others)
-    labels = first.split(None if separator == " " else separator)
-    return Layout(separator, "," if comma else ".", tuple(_label(label) for label in labels))
-
-
-def read_table(path: Path, columns: tuple[str, ...] = (), content: bytes | None = None) -> Table:
-    """A logger's table; without a header if all wanted `columns` are numbers."""
-    layout = table_layout(path, content)
-    parts = [part.strip() for name in columns for part in name.split("+")]
-    header = not (parts and all(part.isdigit() for part in parts))
-    table = read_text(path, layout.separator, header, content, layout.decimal)
-    return table.renamed(_label(label) for label in table.columns)
-
-
-def _label(text: object) -> str:
-    """The name of a column, without a byte order mark or quotes."""
-    return str(text).strip("\ufeff \"'\n\r")
-
-
-def sensor_of(name: str, table: Table, time: str, *axes: str) -> Sensor:
-    """The samples in the columns `time` and `axes` (x, y, z) of a table; each may be "a+b", the sum
-    of two columns."""
-    whole = time in table.columns and table.columns[time].dtype.kind in "iu"
-    # Columns that are shorter than others end with NaN, which is no sample.
-    stamps = table.stamps(time) if whole else _column(table, time)
-    values = np.stack([_column(table, axis) for axis in axes], axis=1)
-    return Sensor(name, table.path, stamps, values, table.row)
-
-
-def _column(table: Table, name: str) -> Float[np.ndarray, " n"]:
-    if name not in table.columns and "+" in name:
-        return np.sum([_column(table, part.strip()) for part in name.split("+")], axis=0)
-    return table.take(name, gaps=True)
-
-
-# --- from the samples of both sensors to a sequence
-
-
-def as_sequence(source: Recording, stated: Units, rate: float | None, name: str) -> Imported:
-    """The sequence of a recording in any format; units in `stated` override those of the format.
+def as_sequence(
+    raw: RawRecording, options: ImportOptions, rate: float | None, name: str
+) -> Imported:
+    """The sequence of a recording in any format; units in `options` override those of the format.
     Raises `InputError`."""
-    notes, warnings = list(source.notes), []
-    unit = stated.time or source.units.time
-    gyro, accel = (_clocked(sensor, unit, notes) for sensor in (source.gyro, source.accel))
+    notes, sensors = raw.notes, (raw.gyro, raw.accel)
+    gyro, accel = (clocked(one, options.time_unit, notes, raw.warnings) for one in sensors)
     accel = accel._replace(time=accel.time + float(accel.start - gyro.start))
-    first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
-    if last - first < WINDOW_SECONDS:
-        raise InputError(
-            source.path,
-            f"both sensors were recorded for {max(last - first, 0.0):.2f} s, less than the "
-            f"network's window of {WINDOW_SECONDS:g} s",
-            "record for longer, both by one clock",
-        )
+    gyro, accel = _in_si(raw, options, gyro, accel)
     if not np.array_equal(gyro.time, accel.time):
-        both = max(gyro.time[-1], accel.time[-1]) - min(gyro.time[0], accel.time[0])
-        notes.append(
-            "gyro and accel have different stamps: both are interpolated to one clock, and "
-            f"{both - (last - first):.2f} s that only one of them covers are cut off"
-        )
-    rates, forces = _in_si(source, stated, gyro, accel, notes, warnings)
-    own = max(rounded_rate(gyro.time), rounded_rate(accel.time))
-    notes.append(f"put on a uniform clock of {rate or own:g} Hz")
-    if own < SLOW:
-        notes.append(
-            f"it was recorded at {own:g} Hz, which is slow: steps need {SLOW:g} Hz, and the "
-            "networks were trained on 100 Hz and more"
-        )
-    streams = Streams(
-        name,
-        str(source.path),
-        Samples(gyro.time, rates, str(source.gyro.file)),
-        Samples(accel.time, forces, str(source.accel.file)),
-        {"dataset": "csv", "group": name, "truth": "none"}
-        | ({"imu_compensated": "no"} if source.raw_gyro else {}),
-        float(gyro.start),
-    )
-    sequence = None
-    if source.track is not None:
-        sequence = _with_track(streams, rate, source.track, gyro.start, notes)
+        lost = sum(abs(gyro.time[row] - accel.time[row]) for row in (0, -1))
+        problem = "gyro and accel have different stamps: both are interpolated to one clock, and"
+        notes.append(f"{problem} {lost:.2f} s that only one of them covers are cut off")
+    recorded = max(rounded_rate(gyro.time), rounded_rate(accel.time))
+    notes.append(f"put on a uniform clock of {rate or recorded:g} Hz")
+    if recorded < SLOW:
+        problem = f"it was recorded at {recorded:g} Hz, which is slow: steps need {SLOW:g} Hz, and"
+        notes.append(f"{problem} the networks were trained on 100 Hz and more")
+    attributes = {"dataset": "csv", "group": name, "truth": "none"}
+    attributes |= {"imu_compensated": "no"} if raw.raw_gyro else {}
+    samples = [Samples(one.time, one.values, str(one.file)) for one in (gyro, accel)]
+    streams = Streams(name, str(raw.path), samples[0], samples[1], attributes, float(gyro.start))
+    sequence = raw.track and _with_track(streams, rate, raw.track, gyro.start, notes)
     if sequence is None:
         (sequence,) = assemble(streams, rate, whole=True)
-    return Imported(sequence, tuple(notes), tuple(warnings))
-
-
-class _Clocked(NamedTuple):
-    """One sensor's samples in order."""
-
-    time: Float[np.ndarray, " n"]
-    """s since `start`."""
-    values: Float[np.ndarray, "n 3"]
-    start: Fraction
-    """The exact first stamp, s, because unix time in a float has an accuracy of a quarter of a
-    microsecond."""
-
-
-def _clocked(sensor: Sensor, unit: str | None, notes: list[str]) -> _Clocked:
-    """The samples in order. `unit` is that of the stamps; None: it is detected. Notes about
-    detection and repairs are added to `notes`."""
-    name, file = sensor.name, sensor.file
-    empty = np.isnan(sensor.values).all(axis=1)
-    if empty.any() and not empty.all():
-        # Loggers that write all sensors into one table leave the columns of the other sensors
-        # empty.
-        notes.append(
-            f"{file.name}: {empty.sum()} of {len(empty)} rows have no value of {name} and "
-            "are left out for it"
-        )
-        sensor = sensor.where(~empty)
-    stamps, values = sensor.stamps, sensor.values
-    if (count := len(np.unique(stamps))) < 2:
-        problem = f"holds {count} stamps of field '{name}'"
-        raise InputError(file, problem, "record for longer")
-    check_finite(stamps.astype(np.float64), "time", file, sensor.row)
-    check_finite(values, name, file, sensor.row)
-    detected, rate = time_unit(stamps - stamps.min())
-    if unit is None and detected is None:
-        raise InputError(
-            file,
-            f"the unit of field 'time' is ambiguous (in seconds {name} would run at {rate:.3g} Hz)",
-            "state it: s, ms, us or ns",
-        )
-    if unit is None:
-        unit = detected
-        notes.append(
-            f"{file.name}: time of {name} taken as {unit}, "
-            f"by which it runs at {rate * PER_SECOND[unit]:.4g} Hz"
-        )
-    rate *= PER_SECOND[unit]
-    if not is_rate(rate):
-        raise InputError(
-            file,
-            f"field 'time' makes {name} run at {rate:.3g} Hz with the unit {unit}",
-            f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz",
-        )
-    first = first_stamp(stamps, unit, file)
-    time = seconds(stamps, first, unit)
-    rows, repairs = in_order(time, values, f"{file}: {name}")
-    time, values = time[rows], values[rows]
-    if backward := repairs.get("rows_sorted"):
-        notes.append(
-            f"{file.name}: {name} had {backward:.0f} steps back in time; its rows were sorted"
-        )
-    if repeated := repairs.get("rows_repeated"):
-        notes.append(f"{file.name}: {repeated:.0f} rows of {name} repeat a stamp and were dropped")
-    holes = np.diff(time)[np.diff(time) > longest_bridge(rate)]
-    if holes.size:
-        notes.append(
-            f"{file.name}: {name} {GAPS} {holes.size} times, "
-            f"for up to {holes.max():.2f} s; bridged linearly"
-        )
-    return _Clocked(time, values, Fraction(first) / int(PER_SECOND[unit]))
+    return Imported(sequence, tuple(notes), tuple(dict.fromkeys(raw.warnings)))
 
 
 def _in_si(
-    source: Recording,
-    stated: Units,
-    gyro: _Clocked,
-    accel: _Clocked,
-    notes: list[str],
-    warnings: list[str],
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
-    """(gyro rad/s, accel m/s² with Android's sign), each on its own stamps."""
-    known, gyro_file, accel_file = source.units, source.gyro.file, source.accel.file
-    unit = stated.accel or known.accel
-    force = accel.values * units.accel_scale(accel.values, unit, accel_file, notes)
-    inside = (gyro.time >= accel.time[0]) & (gyro.time <= accel.time[-1])
-    time = gyro.time[inside]
-    motion = units.Motion(time, gyro.values[inside], interpolate(time, accel.time, force))
-    scale = units.gyro_scale(motion, stated.gyro or known.gyro, gyro_file, notes)
-    if stated.gyro is None and known.gyro is not None:
-        units.check_rad_per_second(motion._replace(gyro=motion.gyro * scale), gyro_file)
-    sign = stated.sign or known.sign
+    raw: RawRecording, options: ImportOptions, gyro: Clocked, accel: Clocked
+) -> tuple[Clocked, Clocked]:
+    """Gyro in rad/s and accel in m/s² with Android's sign, each on its own stamps, without repeated
+    rows. Raises `InputError` if a sensor is dead, or if both contradict each other."""
+    notes, warnings = raw.notes, raw.warnings
+    warnings += physics.check_alive(gyro.values, "gyro", gyro.file)
+    warnings += physics.check_alive(accel.values, "accel", accel.file)
+    unit = options.accel_unit or raw.accel.unit
+    scale, doubts = units.accel_scale(accel.values, unit, accel.file, notes)
+    accel = accel._replace(values=accel.values * scale)
+    rows, is_slower = physics.repeats(gyro.time, gyro.values)
+    force = interpolate(gyro.time, accel.time, accel.values)
+    rows &= ~physics.resting(physics.ImuSamples(gyro.time, gyro.values, force), rows)
+    gyro = _without_repeats(gyro, rows, is_slower, raw)
+    accel = _without_repeats(accel, *physics.repeats(accel.time, accel.values), raw)
+    first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
+    if last - first < WINDOW_SECONDS:
+        problem = f"both sensors were recorded for {max(last - first, 0.0):.2f} s, less than the"
+        problem += f" network's window of {WINDOW_SECONDS:g} s"
+        raise InputError(raw.path, problem, "record for longer, both by one clock")
+    inside = (gyro.time >= first) & (gyro.time <= last)
+    force = interpolate(gyro.time[inside], accel.time, accel.values)
+    imu = physics.ImuSamples(gyro.time[inside], gyro.values[inside], force)
+    unit = options.gyro_unit or raw.gyro.unit
+    scale, slowness = units.gyro_scale(imu, unit, gyro.file, notes)
+    imu = imu._replace(gyro=imu.gyro * scale)
+    warnings += doubts + slowness + physics.check_turning(imu, gyro.file)
+    is_doubtful = gyro.is_doubtful or accel.is_doubtful
+    if is_doubtful and not physics.is_supported(*physics.agreement(imu)):
+        problem = f"field 'time' makes it run at {rounded_rate(imu.time):g} Hz, which may be wrong"
+        remedy = "if that is right, state its unit by --time-unit, or give --sample-rate (Hz)"
+        raise InputError(gyro.file, problem, remedy)
+    sign = options.accel_sign or raw.sign
     if sign is None:
-        raise InputError(
-            accel_file,
-            "the sign of field 'accel' depends on the phone's system, which is not known here",
-            "state it: android, ios or detect",
-        )
-    force = units.signed(force, sign, accel_file, notes)
-    upward = units.note_gravity(accel.time, force, accel_file, notes)
-    if upward == "-z" and stated.sign is None and known.sign_is_assumed:
-        warnings.append(
-            f"sign: gravity reads on -z in {accel_file.name}: the screen points down, or this "
-            "is iOS's sign and the track is wrong: compare with --accel-sign ios"
-        )
-    return gyro.values * scale, force
+        problem = "the sign of field 'accel' depends on the phone's system, which is not known here"
+        raise InputError(accel.file, problem, "state it: android, ios or detect")
+    force = units.signed(accel.values, sign, accel.file, notes)
+    upward = units.note_gravity(accel.time, force, accel.file, notes)
+    if upward == "-z" and options.accel_sign is None and raw.sign_is_assumed:
+        problem = f"gravity reads on -z in {accel.file.name}: the screen points down, or this is"
+        remedy = "compare with --accel-sign ios"
+        warnings.append(f"sign: {problem} iOS's sign and the track is wrong: {remedy}")
+    return gyro._replace(values=gyro.values * scale), accel._replace(values=force)
+
+
+def _without_repeats(
+    samples: Clocked, rows: Bool[np.ndarray, " n"], is_slower: bool, raw: RawRecording
+) -> Clocked:
+    """The samples without `rows` that repeat the one before: the sensor is slower than its rows, or
+    it hung. Holes are noted. Raises `InputError` if it hung for longer than a window."""
+    name, file = samples.name, samples.file
+    samples = samples._replace(time=samples.time[~rows], values=samples.values[~rows])
+    rate, gaps = rounded_rate(samples.time), np.diff(samples.time)
+    problem = f"{file.name}: {name} repeats the same values in {rows.sum()} of {len(rows)} rows"
+    if is_slower and is_rate(rate):
+        raw.notes.append(f"{problem}: they are no samples, and it runs at {rate:g} Hz")
+    elif is_slower:
+        remedy = f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz"
+        raise InputError(file, f"{name} runs at {rate:.3g} Hz without repeated values", remedy)
+    elif rows.any() and gaps.max() > WINDOW_SECONDS:
+        problem = f"{name} repeats the same values for {gaps.max():.2f} s after"
+        problem += f" {samples.time[np.argmax(gaps)]:.2f} s: it was stuck"
+        raise InputError(file, problem, "cut the recording there")
+    elif rows.any():
+        raw.warnings.append(f"sensors: {problem}: it was stuck, and they are left out")
+    gaps = gaps[gaps > longest_bridge(rate)]
+    if gaps.size:
+        problem = f"{name} {GAPS} {gaps.size} times, for up to {gaps.max():.2f} s"
+        raw.notes.append(f"{file.name}: {problem}; bridged linearly")
+    return samples
 
 
 def _with_track(
@@ -339,20 +178,19 @@ def _with_track(
     """The recording with the reference; None if that is no valid reference, or does not describe
     the motion of the IMU."""
     poses = track.poses._replace(time=track.poses.time + float(track.start - start))
-    about = streams.attributes | {"truth": track.name}
+    attributes = streams.attributes | {"truth": track.name}
+    streams = streams._replace(poses=poses, attributes=attributes)
     try:
-        (result,) = assemble(streams._replace(poses=poses, attributes=about), rate, whole=True)
+        (sequence,) = assemble(streams, rate, whole=True)
         # A reference that fails the self-check is not used.
-        if failures := self_check(result, pedestrian=False).failures:
-            raise InputError(
-                poses.source,
-                f"the reference {track.name} does not fit the IMU ({'; '.join(failures)})",
-                "its frame must be the IMU's, its world z-up, its clock the same",
-            )
+        if failures := self_check(sequence, pedestrian=False).failures:
+            problem = f"the reference {track.name} does not fit the IMU ({'; '.join(failures)})"
+            remedy = "its frame must be the IMU's, its world z-up, its clock the same"
+            raise InputError(poses.source, problem, remedy)
     except InputError as error:
         if track.named:
             raise
         notes.append(f"no reference is taken: {error}")
         return None
-    notes.append(f"reference from {track.name}, {result.valid.mean():.0%} of the time")
-    return result
+    notes.append(f"reference from {track.name}, {sequence.valid.mean():.0%} of the time")
+    return sequence

@@ -15,6 +15,7 @@ bag.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
@@ -22,10 +23,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from jaxtyping import Float, Int
 
-from gnio_jax.apps.importing.recording import Recording, Sensor, Track, Units
+from gnio_jax.apps.importing.clocks import Sensor
+from gnio_jax.apps.importing.recording import RawRecording, Track
+from gnio_jax.config import ImportOptions
 from gnio_jax.data.parsing.stamps import seconds
 from gnio_jax.data.parsing.tables import parsed_as, shortened
 from gnio_jax.data.readers.euroc import SensorPose, moved_to
@@ -39,69 +41,50 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a whole MCAP (mcap.dev/spec)."""
 LARGEST_CHUNK = 1 << 30
 """Largest unpacked size of a chunk of an MCAP, bytes; recorders limit chunks to some MiB (ours)."""
-FAST_TRACKER = 20.0
-"""Rate from which a tracker's poses are smoothed and its attitude is carried by the gyro, Hz; below
-it poses are not changed (ours)."""
-SLOWEST = 4.0
-"""Rate below which a reference describes a walk too coarsely, Hz (ours)."""
+SLOWEST, FAST_TRACKER = 4.0, 20.0
+"""Rates of a reference, Hz: below the first it describes a walk too coarsely; from the second on it
+is a tracker, whose poses are smoothed and whose attitude is carried by the gyro (ours)."""
+SAME_PACE, DELAY = 0.01, 0.1
+"""Differences of two clocks that run alike: a share, and s, by which a bag may log late (ours)."""
 IMU = "sensor_msgs/msg/Imu"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-POSES = (
-    "geometry_msgs/msg/Pose",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/TransformStamped",
-    "nav_msgs/msg/Odometry",
-)
+_GEOMETRY = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
+POSES = (*(f"geometry_msgs/msg/{name}" for name in _GEOMETRY), "nav_msgs/msg/Odometry")
 
 
-class Topics(NamedTuple):
-    """Topics that the user names; None takes the only one."""
-
-    imu: str | None = None
-    """Topic of sensor_msgs/Imu."""
-    accel: str | None = None
-    """Topic of the accelerometer, if it is another one."""
-    reference: str | None = None
-    """Topic of poses; "/tf:CHILD_FRAME" for transforms."""
-
-
-def read_bag(path: Path, kind: str, topics: Topics) -> Recording:
-    """The IMU of a bag of one of `KINDS`, and its reference if there is one.
-
-    A single topic of `sensor_msgs/Imu` need not be named, and neither need a single topic of poses.
-    If there are several, the IMU must be named, and no poses are taken. Raises `InputError` that
-    names the existing topics.
-    """
-    notes: list[str] = []
+def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
+    """The IMU of a bag of one of `KINDS`, and its reference if there is one. Of several topics of
+    `sensor_msgs/Imu` one must be named, and of several topics of poses none is taken that is not;
+    "/tf:CHILD_FRAME" names transforms. Raises `InputError` that names the existing topics."""
+    notes, warnings = list[str](), list[str]()
     with _opened(path, kind) as bag:
-        imu = _imu_topic(bag, topics.imu)
-        other = imu if topics.accel is None else _imu_topic(bag, topics.accel)
-        reference, child = _reference_topic(bag, topics.reference, notes)
-        samples, poses, mounted = _collected(bag, {imu.name, other.name}, reference)
+        imu = _imu_topic(bag, options.imu_topic)
+        other = _imu_topic(bag, options.accel_topic) if options.accel_topic else imu
+        reference = _reference_topic(bag, options.reference_topic, notes)
+        samples, poses, mounts = _collected(bag, {imu.name, other.name}, reference)
     of_gyro, of_accel = samples[imu.name], samples[other.name]
     gyro, accel = of_gyro.sensor("gyro", imu.name, path), of_accel.sensor("accel", other.name, path)
     if of_gyro.by_headers != of_accel.by_headers:
-        raise InputError(
-            path,
-            f"topics {imu.name} and {other.name} are stamped by different clocks",
-            "name other topics",
-        )
+        problem = f"topics {imu.name} and {other.name} are stamped by different clocks"
+        raise InputError(path, problem, "name other topics")
     clock = "headers" if of_gyro.by_headers else "bag: its headers have no time"
-    named = f"{imu.name} ({imu.count} messages)"
-    named += f", accel {other.name} ({other.count} messages)" if other != imu else ""
-    notes.insert(0, f"{path.name}: IMU {named}, stamped by its {clock}")
+    if not of_gyro.by_headers and of_gyro.headers.all():
+        clock, problem = "bag", f"the headers of {imu.name} run {of_gyro.pace:.3g} times as fast as"
+        warnings.append(f"clock: {path.name}: {problem} the bag's clock, whose stamps are taken")
+    topic = f"{imu.name} ({imu.count} messages)"
+    topic += f", accel {other.name} ({other.count} messages)" if other != imu else ""
+    notes.insert(0, f"{path.name}: IMU {topic}, stamped by its {clock}")
     track = None
     if reference is not None:
         try:
-            track = _track(poses, mounted, reference.name, child, of_gyro, path, notes)
-            track = track._replace(named=topics.reference is not None)
+            name = options.reference_topic or reference.name
+            track = _track(name, poses, mounts, of_gyro, path, notes)
+            track = track._replace(named=options.reference_topic is not None)
         except InputError as error:
-            if topics.reference is not None:
+            if options.reference_topic is not None:
                 raise
             notes.append(f"{path.name}: no reference is taken: {error}")
-    known = Units("ns", "rad/s", None, "android")
-    return Recording(path, gyro, accel, known, track, tuple(notes))
+    return RawRecording(path, gyro, accel, notes, warnings, "android", track=track)
 
 
 # --- the libraries
@@ -109,10 +92,8 @@ def read_bag(path: Path, kind: str, topics: Topics) -> Recording:
 
 class _Topic(NamedTuple):
     name: str
-    type: str
-    """Type, as in ROS 2: sensor_msgs/msg/Imu."""
+    type: str  # as in ROS 2: sensor_msgs/msg/Imu
     count: int
-    """Messages."""
 
 
 class _Bag(NamedTuple):
@@ -121,8 +102,8 @@ class _Bag(NamedTuple):
     path: Path
     topics: dict[str, _Topic]
     messages: Callable[[Collection[str]], Iterator[tuple[str, int, Any]]]
-    """A function that gives (topic, time of recording ns, decoded message) of each message of some
-    topics. A failure inside a library is an `InputError`."""
+    """A function from names to (topic, time of recording ns, decoded message) of each message. A
+    failure inside a library is an `InputError`."""
 
 
 @contextmanager
@@ -136,20 +117,32 @@ def _opened(path: Path, kind: str) -> Iterator[_Bag]:
 
 @contextmanager
 def _reading(path: Path, kind: str) -> Iterator[None]:
-    """Report errors of the libraries as damage of the file: rosbags also uses assertions for
-    this."""
+    """Report errors of the libraries as damage of the file, for which rosbags uses assertions
+    too."""
     with parsed_as(path, KINDS[kind]):
         try:
             yield
         except AssertionError as error:
             raise ValueError(f"unexpected content {error}".strip()) from error
+        except Exception as error:
+            if "not indexed" in str(error):
+                problem = "has no index, because its recorder was killed"
+                raise InputError(path, problem, f"make one: rosbag reindex {path.name}") from None
+            raise
 
 
 def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
     from rosbags import rosbag1, rosbag2
 
     if kind == "rosbag2" and path.is_dir():
-        _check_compression(path)
+        text = (path / "metadata.yaml").read_text(encoding="utf-8")
+        if re.search(r"\bcompression_mode:\s*['\"]?file\b", text, re.IGNORECASE):
+            # The library would unpack its files to the disk, at any size. (It unpacks single
+            # messages in memory, one by one.)
+            remedy = "unpack its file (zstd -d FILE.zstd) and import that"
+            raise InputError(path, "is compressed as a whole (compression_mode FILE)", remedy)
+    elif kind == "rosbag2" and set("%?#") & set(path.name):  # SQLite would open another file
+        raise InputError(path, "has %, ? or # in its name", "rename it")
     reader = stack.enter_context((rosbag1 if kind == "rosbag1" else rosbag2).Reader(path))
     decode = _decoder("ros1" if kind == "rosbag1" else "cdr")
 
@@ -159,20 +152,8 @@ def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
             for connection, time, data in reader.messages(connections=chosen):
                 yield connection.topic, time, decode(data, connection.msgtype)
 
-    found = ((one.topic, one.msgtype, one.msgcount) for one in reader.connections)
-    return _Bag(path, _joined(found), messages)
-
-
-def _check_compression(path: Path) -> None:
-    """Raise `InputError` for a bag whose files are compressed as a whole: the library would unpack
-    them to the disk, at any size. (It unpacks single messages in memory, one by one.)"""
-    with (path / "metadata.yaml").open(encoding="utf-8") as file:
-        content = yaml.safe_load(file)
-    about = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
-    mode = about.get("compression_mode") if isinstance(about, dict) else None
-    if isinstance(mode, str) and mode.lower() == "file":
-        remedy = "unpack its file (zstd -d FILE.zstd) and import that"
-        raise InputError(path, "is compressed as a whole (compression_mode FILE)", remedy)
+    connections = ((one.topic, one.msgtype, one.msgcount) for one in reader.connections)
+    return _Bag(path, _joined(connections), messages)
 
 
 def _mcap(path: Path, stack: ExitStack) -> _Bag:
@@ -200,11 +181,8 @@ def _mcap(path: Path, stack: ExitStack) -> _Bag:
     def messages(names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         for name in names:
             if encodings[name] not in ("cdr", "ros1"):
-                raise InputError(
-                    path,
-                    f"topic {name} is encoded as {encodings[name] or 'nothing known'}",
-                    "record it as ROS 2 (cdr) or ROS 1 messages",
-                )
+                problem = f"topic {name} is encoded as {encodings[name] or 'nothing known'}"
+                raise InputError(path, problem, "record it as ROS 2 (cdr) or ROS 1 messages")
         decoders = {name: _decoder(encodings[name]) for name in names}
         with _reading(path, "mcap"):
             for _, channel, message in reader.iter_messages(names):
@@ -215,13 +193,12 @@ def _mcap(path: Path, stack: ExitStack) -> _Bag:
     return _Bag(path, topics, messages)
 
 
-def _joined(found: Iterable[tuple[str, str, int]]) -> dict[str, _Topic]:
+def _joined(connections: Iterable[tuple[str, str, int]]) -> dict[str, _Topic]:
     """The topics of connections or channels, each (topic, type, messages). A topic may have
     several."""
     topics: dict[str, _Topic] = {}
-    for topic, kind, count in found:
-        package, _, rest = kind.partition("/")
-        kind = f"{package}/msg/{rest}" if rest and "/" not in rest else kind
+    for topic, kind, count in connections:
+        kind = re.sub("^([^/]+)/([^/]+)$", r"\1/msg/\2", kind)
         count += topics[topic].count if topic in topics else 0
         topics[topic] = _Topic(topic, kind, count)
     return topics
@@ -239,47 +216,39 @@ def _decoder(encoding: str) -> Callable[[bytes, str], Any]:
 
 
 def _imu_topic(bag: _Bag, name: str | None) -> _Topic:
-    if name is not None:
-        return _named(bag, name, (IMU,), "IMU")
-    found = _of_types(bag, (IMU,))
-    if not found:
+    topics = _topics(bag, name, (IMU,), "IMU")
+    if not topics:
         remedy = f"its topics: {_listed(bag.topics.values())}"
         raise InputError(bag.path, "has no topic of sensor_msgs/Imu", remedy)
-    if len(found) > 1:
-        remedy = f"choose one by --imu-topic: {_listed(found)}"
-        raise InputError(bag.path, f"has {len(found)} IMU topics", remedy)
-    return found[0]
+    if len(topics) > 1:
+        remedy = f"choose one by --imu-topic: {_listed(topics)}"
+        raise InputError(bag.path, f"has {len(topics)} IMU topics", remedy)
+    return topics[0]
 
 
-def _reference_topic(bag: _Bag, name: str | None, notes: list[str]) -> tuple[_Topic | None, str]:
-    """The topic, and the requested child frame ("" for any)."""
-    if name is not None:
-        topic, _, child = name.partition(":")
-        return _named(bag, topic, (*POSES, *TRANSFORMS), "pose"), child
-    poses, found = _of_types(bag, POSES), _of_types(bag, (*POSES, *TRANSFORMS))
-    if len(poses) == 1:
-        return poses[0], ""
-    if found:
-        notes.append(
-            f"{bag.path.name}: no reference is taken; --reference-topic may be {_listed(found)}"
-        )
-    return None, ""
+def _reference_topic(bag: _Bag, name: str | None, notes: list[str]) -> _Topic | None:
+    """The topic of a reference, or of "topic:frame"; None if there is none, or none is chosen."""
+    topic = name.partition(":")[0] if name else None
+    topics = _topics(bag, topic, (*POSES, *TRANSFORMS), "pose")
+    poses = topics if topic else [topic for topic in topics if topic.type in POSES]
+    if topics and len(poses) != 1:
+        remedy = f"--reference-topic may be {_listed(topics)}"
+        notes.append(f"{bag.path.name}: no reference is taken; {remedy}")
+    return poses[0] if len(poses) == 1 else None
 
 
-def _of_types(bag: _Bag, types: tuple[str, ...]) -> list[_Topic]:
-    return [topic for topic in bag.topics.values() if topic.type in types and topic.count]
-
-
-def _named(bag: _Bag, name: str, types: tuple[str, ...], what: str) -> _Topic:
-    """The topic of this name, which must be of one of the types."""
+def _topics(bag: _Bag, name: str | None, types: tuple[str, ...], what: str) -> list[_Topic]:
+    """The topics of these types that have messages, or the one of this name."""
+    topics = [topic for topic in bag.topics.values() if topic.type in types and topic.count]
+    if name is None:
+        return topics
     if name not in bag.topics:
         remedy = f"its topics: {_listed(bag.topics.values())}"
         raise InputError(bag.path, f"has no topic '{name}'", remedy)
-    chosen = bag.topics[name]
-    if chosen.type not in types:
-        remedy = f"{what} topics: {_listed(_of_types(bag, types))}"
-        raise InputError(bag.path, f"topic {name} is {chosen.type}, no {what}", remedy)
-    return chosen
+    if bag.topics[name].type not in types:
+        problem = f"topic {name} is {bag.topics[name].type}, no {what}"
+        raise InputError(bag.path, problem, f"{what} topics: {_listed(topics)}")
+    return [bag.topics[name]]
 
 
 def _listed(topics: Iterable[_Topic]) -> str:
@@ -291,35 +260,35 @@ def _listed(topics: Iterable[_Topic]) -> str:
 
 
 class _Pose(NamedTuple):
-    """One pose of a message."""
+    """One pose of a message, whose frame of the body is "" if the message does not name it."""
 
-    stamp: int
-    """Stamp of the message, ns; 0 if it has none."""
-    logged: int
-    """Stamp of the bag, ns."""
+    stamp: int  # of the message, ns; 0 if it has none
+    logged: int  # the bag's, ns
     parent: str
     child: str
-    """Frame of the body; "" if the message does not name it."""
-    values: tuple[float, ...]
-    """Position m, quaternion wxyz."""
+    values: tuple[float, ...]  # position m, quaternion wxyz
 
 
 class _Imu(NamedTuple):
     """An IMU topic as arrays of numbers, because a decoded message takes a kilobyte."""
 
-    first: Any
-    """Its first message."""
-    headers: Int[np.ndarray, " n"]
-    """Stamps of the headers, ns."""
-    logged: Int[np.ndarray, " n"]
-    """Stamps of the bag, ns."""
+    first: Any  # its first message
+    headers: Int[np.ndarray, " n"]  # stamps of the headers, ns
+    logged: Int[np.ndarray, " n"]  # stamps of the bag, ns
     values: Float[np.ndarray, "n 6"]
-    """Gyro rad/s, accel."""
+
+    @property
+    def pace(self) -> float:
+        """Time that passes by the headers in a second of the bag, without the outermost stamps."""
+        spans = [np.ptp(np.percentile(stamps, [5, 95])) for stamps in (self.headers, self.logged)]
+        return float(spans[0] / max(spans[1], 1.0))
 
     @property
     def by_headers(self) -> bool:
-        """Whether the headers have stamps; otherwise the bag's stamps are used."""
-        return bool(self.headers.all())
+        """Whether the headers have stamps that run as the bag's; otherwise these are used."""
+        drift = abs(self.pace - 1.0)
+        is_same = drift < SAME_PACE or drift * np.ptp(self.logged) / 1e9 < DELAY
+        return bool(self.headers.all() and is_same)
 
     def sensor(self, name: str, topic: str, path: Path) -> Sensor:
         """The gyro or accel, which the topic must have."""
@@ -329,24 +298,24 @@ class _Imu(NamedTuple):
             problem = f"topic {topic} says that it has no {name}"
             raise InputError(path, problem, "name another topic")
         stamps = self.headers if self.by_headers else self.logged
-        axes = slice(0, 3) if name == "gyro" else slice(3, 6)
-        return Sensor(name, path, stamps, self.values[:, axes])
+        axes, unit = (slice(0, 3), "rad/s") if name == "gyro" else (slice(3, 6), None)
+        return Sensor(name, path, stamps, self.values[:, axes], second="ns", unit=unit)
 
 
-_Mounted = dict[tuple[str, str], SensorPose]
+_Mounts = dict[tuple[str, str], SensorPose]
 """(parent, child) -> pose of the child in the parent, from static transforms."""
 
 
 def _collected(
     bag: _Bag, imus: set[str], reference: _Topic | None
-) -> tuple[dict[str, _Imu], list[_Pose], _Mounted]:
+) -> tuple[dict[str, _Imu], list[_Pose], _Mounts]:
     """The IMU topics, the poses of the reference, and the static transforms."""
     static = {name for name in bag.topics if name.endswith("tf_static")}
     of_poses = set() if reference is None else {reference.name}
     first: dict[str, Any] = {}
     rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in imus}
     poses: list[_Pose] = []
-    mounted: _Mounted = {}
+    mounts: _Mounts = {}
     for topic, logged, message in bag.messages(imus | static | of_poses):
         if topic in imus:
             first.setdefault(topic, message)
@@ -355,19 +324,18 @@ def _collected(
             rows[topic].append((_stamp(message), logged, *values))
         if topic in of_poses:
             poses.extend(_poses(message, logged))
-        if topic in static:
-            for pose in _poses(message, logged):
-                place, turn = np.array(pose.values[:3]), np.array(pose.values[3:])
-                if abs(np.linalg.norm(turn) - 1.0) < UNIT_NORM_TOLERANCE:  # otherwise it is ignored
-                    frames = _frame(pose.parent), _frame(pose.child)
-                    mounted[frames] = SensorPose(rotations(turn), place)
-    found = {}
+        for pose in _poses(message, logged) if topic in static else ():
+            lever, turn = np.array(pose.values[:3]), np.array(pose.values[3:])
+            if abs(np.linalg.norm(turn) - 1.0) < UNIT_NORM_TOLERANCE:  # otherwise it is ignored
+                frames = pose.parent.lstrip("/"), pose.child.lstrip("/")  # ROS 1 allows a slash
+                mounts[frames] = SensorPose(rotations(turn), lever)
+    samples = {}
     for topic in imus:
         if not rows[topic]:
             raise InputError(bag.path, f"topic {topic} has no messages", "record it anew")
         headers, logged, *values = (np.array(column) for column in zip(*rows[topic], strict=True))
-        found[topic] = _Imu(first[topic], headers, logged, np.stack(values, axis=1).astype(float))
-    return found, poses, mounted
+        samples[topic] = _Imu(first[topic], headers, logged, np.stack(values, axis=1).astype(float))
+    return samples, poses, mounts
 
 
 def _stamp(message: Any) -> int:
@@ -387,11 +355,10 @@ def _poses(message: Any, logged: int) -> Iterator[_Pose]:
     pose = message
     while hasattr(pose, "pose"):  # stamped, with covariance, or both
         pose = pose.pose
-    if hasattr(pose, "transform"):
-        place, turn = pose.transform.translation, pose.transform.rotation
-    else:
-        place, turn = pose.position, pose.orientation
-    values = place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z
+    pose = getattr(pose, "transform", pose)
+    point = pose.translation if hasattr(pose, "translation") else pose.position
+    turn = pose.rotation if hasattr(pose, "rotation") else pose.orientation
+    values = point.x, point.y, point.z, turn.w, turn.x, turn.y, turn.z
     yield _Pose(_stamp(message), logged, parent, child, values)
 
 
@@ -399,35 +366,27 @@ def _poses(message: Any, logged: int) -> Iterator[_Pose]:
 
 
 def _track(
-    poses: list[_Pose],
-    mounted: _Mounted,
-    topic: str,
-    child: str,
-    imu: _Imu,
-    path: Path,
-    notes: list[str],
+    name: str, poses: list[_Pose], mounts: _Mounts, imu: _Imu, path: Path, notes: list[str]
 ) -> Track:
-    """The poses of a topic, or of its frame `child`, converted to those of the IMU's frame."""
+    """The poses of a "topic", or of a "topic:frame", converted to those of the IMU's frame."""
+    topic, _, child = name.partition(":")
     rows = [pose for pose in poses if child in ("", pose.child)]
     children = sorted({pose.child for pose in poses})
     if not rows or (len(children) > 1 and not child):
-        raise InputError(
-            path,
-            f"topic {topic} moves the frames {', '.join(children) or 'none'}",
-            f"name one: --reference-topic {topic}:FRAME",
+        problem = f"topic {topic} moves the frames {', '.join(children) or 'none'}"
+        raise InputError(path, problem, f"name one: --reference-topic {topic}:FRAME")
+    is_stamped = imu.by_headers and all(pose.stamp for pose in rows)
+    stamps = np.array([pose.stamp if is_stamped else pose.logged for pose in rows], dtype=np.int64)
+    if imu.by_headers and not is_stamped:
+        problem = (
+            f"{path.name}: {topic} has no stamps in its headers, so those of the bag are taken"
         )
-    stamped = imu.by_headers and all(pose.stamp for pose in rows)
-    stamps = np.array([pose.stamp if stamped else pose.logged for pose in rows], dtype=np.int64)
-    if imu.by_headers and not stamped:
-        notes.append(
-            f"{path.name}: {topic} has no stamps in its headers, so those of the bag are taken. "
-            "The IMU has its own. The reference is off by the delay between both clocks"
-        )
-    name = f"{topic}:{child}" if child else topic
+        delay = "The reference is off by the delay between both clocks"
+        notes.append(f"{problem}. The IMU has its own. {delay}")
     source, start = f"{path}: topic {name}", int(stamps.min())
     values = np.array([pose.values for pose in rows], dtype=np.float64)
-    seen = finite_rows(values)
-    time, values = seconds(stamps[seen], start), values[seen]
+    valid = finite_rows(values)
+    time, values = seconds(stamps[valid], start), values[valid]
     if len(time) < SHORTEST_RUN:
         raise InputError(source, f"holds {len(time)} poses", "name another reference")
     rate = 1.0 / max(float(np.median(np.diff(np.sort(time)))), 1e-9)
@@ -435,37 +394,30 @@ def _track(
         remedy = f"a reference needs {SLOWEST:g} Hz"
         raise InputError(source, f"its poses come at {rate:.3g} Hz", remedy)
     wxyz = check_unit_norm(values[:, 3:], True, "orientation", source)
-    noisy = rate >= FAST_TRACKER
-    given = Poses(time, rotations(wxyz), values[:, :3], noisy=noisy, source=source)
+    is_noisy = rate >= FAST_TRACKER
+    track = Poses(time, rotations(wxyz), values[:, :3], noisy=is_noisy, source=source)
     body, frame = rows[0].child, imu.first.header.frame_id
-    place = _place(body, frame, mounted)
-    if place is None:
-        notes.append(
-            f"{path.name}: {name} gives the poses of '{body or 'an unnamed frame'}', the IMU is in "
-            f"'{frame}', and no static transform joins them: taken as one"
-        )
+    mount = _mount(body.lstrip("/"), frame.lstrip("/"), mounts)
+    if mount is None:
+        problem = f"{path.name}: {name} gives the poses of '{body or 'an unnamed frame'}', the IMU"
+        notes.append(f"{problem} is in '{frame}', and no static transform joins them: taken as one")
     elif body != frame:
         notes.append(f"{path.name}: {name} moved from '{body}' to '{frame}' by /tf_static")
-    return Track(name, moved_to(place or SensorPose(), given), Fraction(start, 10**9))
+    return Track(name, moved_to(mount or SensorPose(), track), Fraction(start, 10**9))
 
 
-def _frame(name: str) -> str:
-    """A frame's name without the slash that ROS 1 allows before it."""
-    return name.lstrip("/")
-
-
-def _place(body: str, imu: str, mounted: _Mounted) -> SensorPose | None:
+def _mount(body: str, imu: str, mounts: _Mounts) -> SensorPose | None:
     """The pose of the frame `imu` in the frame `body`, along the static transforms; None if these
     do not connect the frames."""
-    reached, todo = {_frame(body): SensorPose()}, [_frame(body)]
-    while todo:
-        here = todo.pop()
-        for (parent, child), pose in mounted.items():
+    poses, frames = {body: SensorPose()}, [body]
+    while frames:
+        frame = frames.pop()
+        for (parent, child), pose in mounts.items():
             inverse = SensorPose().seen_from(pose)
             for near, far, step in ((parent, child, pose), (child, parent, inverse)):
-                if near == here and far not in reached:
-                    known = reached[here]
-                    lever = known.translation + known.rotation.apply(step.translation)
-                    reached[far] = SensorPose(known.rotation * step.rotation, lever)
-                    todo.append(far)
-    return reached.get(_frame(imu))
+                if near == frame and far not in poses:
+                    base = poses[frame]
+                    lever = base.translation + base.rotation.apply(step.translation)
+                    poses[far] = SensorPose(base.rotation * step.rotation, lever)
+                    frames.append(far)
+    return poses.get(imu)

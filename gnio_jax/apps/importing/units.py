@@ -1,169 +1,144 @@
-"""Detection of units and signs from a header or from the data; ambiguous ones are refused."""
+"""Units and signs of the sensors: from an option or a header, or detected from the data. What is
+ambiguous is refused."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter1d
 
+from gnio_jax.data.labels import unit_of
+from gnio_jax.data.physics import DEGREE, ImuSamples, agreement, is_supported
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import interpolate
 from gnio_jax.types import GRAVITY, STANDARD_G
 
-TO_RAD_PER_SECOND = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
+TO_RAD_PER_SECOND = {"rad/s": 1.0, "deg/s": DEGREE}
 TO_METRES_PER_SECOND_SQUARED = {"m/s2": 1.0, "g": STANDARD_G, "mg": STANDARD_G * 1e-3}
-SIGNS = ("android", "ios", "detect")
-
-_SPELLINGS = {
-    "rad/s": ("rad/s", "rads^-1", "rads-1", "radian/s", "radians/s"),
-    "deg/s": ("deg/s", "degs^-1", "degree/s", "degrees/s", "°/s", "dps"),
-    "m/s2": ("m/s2", "m/s^2", "m/s²", "m/s/s", "ms^-2", "ms-2"),
-    "g": ("g",),
-    "mg": ("mg",),
-    "s": ("s", "sec", "seconds"),
-    "ms": ("ms",),
-    "us": ("us", "µs", "μs"),
-    "ns": ("ns",),
+"""Units that `gnio live` takes too."""
+UNITS = {
+    "gyro": TO_RAD_PER_SECOND | {"mdps": DEGREE * 1e-3, "mrad/s": 1e-3},
+    "accel": TO_METRES_PER_SECOND_SQUARED | {"cm/s2": 1e-2, "mm/s2": 1e-3},
 }
-"""Our names of units, and their names in headers, without blanks and in small letters."""
-_NAMED = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
-
+COUNTS = {"gyro": "131/deg/s", "accel": "16384/g"}
+"""Units of raw counts, as examples."""
+SIGNS = ("android", "ios", "detect")
 GRAVITY_RANGES = {"m/s2": (7.0, 13.0), "g": (0.7, 1.3), "mg": (700.0, 1300.0)}
 """Ranges of the accelerometer's median magnitude, by which its unit is recognised."""
-GYRO_RANGE = 35.0
-"""Largest rate of a phone's gyro, rad/s: none measures more than 2000 deg/s."""
-CARRIED_TURN = 10.0
-"""A phone that somebody carries sometimes turns faster than this, deg/s."""
-STEPS = 1.0
-"""Standard deviation of the magnitude of the specific force, m/s², which steps exceed."""
+COUNTS_OF_G = {16384: 2, 8192: 4, 4096: 8, 2048: 16, 256: 16}
+"""Counts of usual 16-bit accelerometers in 1 g, and their range, g."""
+PHONE_RANGE, WIDEST_RANGE = 35.0, 4000.0
+"""Largest rates of a phone's gyro, rad/s (2000 deg/s), and of any gyro, deg/s."""
+CARRIED_TURN, STEPS = 10.0, 1.0
+"""A phone that somebody carries sometimes turns faster, deg/s; steps exceed this standard deviation
+of the magnitude of the specific force, m/s²."""
 
 
-class Motion(NamedTuple):
-    """What both sensors of an IMU measured at the same stamps."""
-
-    time: Float[np.ndarray, " n"]
-    """s, increasing."""
-    gyro: Float[np.ndarray, "n 3"]
-    accel: Float[np.ndarray, "n 3"]
-
-
-def named_unit(label: str) -> str | None:
-    """The unit at the end of a column's header, in round or square brackets, such as "rad/s" in
-    "Gyroscope x (rad/s)"; None if it names no known unit."""
-    inside = re.search(r"[(\[]([^()\[\]]*)[)\]]\s*$", label)
-    return _NAMED.get(re.sub(r"[\s*·]", "", inside[1]).lower()) if inside else None
+def common_unit(texts: Mapping[str, str | None], sensor: str, path: Path) -> str | None:
+    """The unit of a sensor that its columns name, whose `texts` are; None if none names one. Raises
+    `InputError` for a unit that is not known, or several."""
+    names = {c: t for c, t in texts.items() if t and not re.fullmatch(r"[xyz]|\d+", t.lower())}
+    common = {unit_of(text) for text in names.values()}
+    for column, text in names.items():
+        if unit_of(text) not in UNITS[sensor] or len(common) > 1:
+            problem = f"column '{column}' is in '{text}', unlike others or no known unit"
+            remedy = f"state one of {', '.join(UNITS[sensor])}, or raw counts: --{sensor}-unit"
+            raise InputError(path, problem, f"{remedy} {COUNTS[sensor]}")
+    return common.pop() if common else None
 
 
-def common_unit(labels: Iterable[str], known: Iterable[str]) -> str | None:
-    """The unit, one of `known`, that all `labels` name."""
-    found = {named_unit(label) for label in labels}
-    return found.pop() if len(found) == 1 and found <= set(known) else None
+def scale_of(stated: str, sensor: str) -> float:
+    """Value of 1 in SI units of a unit: a name of `UNITS`, "131/deg/s" (counts in one deg/s) or
+    "0.061*mg" (the unit of one count). Raises `InputError`."""
+    match = re.fullmatch(r"(?:(\d[0-9.e+-]*|\.\d+)([/*]))?(.+)", stated.strip())
+    number, mark, name = match.groups() if match else ("0", "", "")
+    sizes, unit = UNITS[sensor], name if name in UNITS[sensor] else unit_of(name)
+    try:
+        size = sizes[unit or ""] * float(number or 1) ** (-1 if mark == "/" else 1)
+    except (KeyError, ValueError, ZeroDivisionError):
+        size = 0.0
+    if not 0.0 < size < np.inf:
+        remedy = f"known: {', '.join(sizes)}, counts in one as {COUNTS[sensor]}, or their size as"
+        raise InputError(f"{sensor}_unit", f"unknown value '{stated}'", f"{remedy} 0.061*mg")
+    return size
 
 
 def accel_scale(
-    accel: Float[np.ndarray, "n 3"], unit: str | None, path: Path, notes: list[str]
-) -> float:
-    """Value of one unit in m/s²; the unit None is detected. Raises `InputError` if it is
-    ambiguous."""
-    if unit is not None:
-        return TO_METRES_PER_SECOND_SQUARED[unit]
+    accel: Float[np.ndarray, "n 3"], stated: str | None, path: Path, notes: list[str]
+) -> tuple[float, list[str]]:
+    """Value of one unit in m/s², and warnings; without a unit it is detected. Raises `InputError`
+    if it is ambiguous."""
+    if stated is not None:
+        return scale_of(stated, "accel"), []
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     fitting = [name for name, (low, high) in GRAVITY_RANGES.items() if low <= size <= high]
     if not fitting:
         problem = f"the unit of field 'accel' is ambiguous (median magnitude {size:.3g})"
         remedy = "state it, and give the specific force, gravity included"
+        for count, reach in COUNTS_OF_G.items():
+            if 0.8 < size / count < 1.25:
+                remedy = f"raw counts? {count} per g is the scale of ±{reach} g: --accel-unit"
+                remedy += f" {count}/g"
         raise InputError(path, problem, remedy)
     notes.append(f"{path.name}: accel taken as {fitting[0]} (median magnitude {size:.3g})")
-    return TO_METRES_PER_SECOND_SQUARED[fitting[0]]
+    problem = f"unit: {size:.0f} is gravity in mg (1000) as well as in cm/s² (981), which is"
+    warnings = [f"{problem} ambiguous: state --accel-unit mg or cm/s2"] * (fitting == ["mg"])
+    return UNITS["accel"][fitting[0]], warnings
 
 
-def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> float:
-    """Value of one unit in rad/s; the unit None is detected. `imu.accel` is in m/s².
+def gyro_scale(
+    imu: ImuSamples, stated: str | None, path: Path, notes: list[str]
+) -> tuple[float, list[str]]:
+    """Value of one unit in rad/s, and warnings; without a unit it is detected. `imu.accel` is in
+    m/s².
 
-    Beyond `GYRO_RANGE` it is deg/s. Otherwise the rotation of gravity in the accelerometer decides,
-    if it is large enough. Otherwise, if the recording has steps and never exceeds `CARRIED_TURN`,
-    it is rad/s. Raises `InputError` if it is ambiguous.
+    Beyond `PHONE_RANGE` it is deg/s. Otherwise the turning of gravity decides, if it supports a
+    unit. Otherwise, if the recording has steps and never exceeds `CARRIED_TURN`, it is rad/s.
+    Raises `InputError` if it is ambiguous.
     """
-    if unit is not None:
-        return TO_RAD_PER_SECOND[unit]
     peak = float(np.percentile(np.linalg.norm(imu.gyro, axis=1), 99.9))
-    slope, told = _turning_of_gravity(imu)
-    found = {"rad/s": slope, "deg/s": slope / TO_RAD_PER_SECOND["deg/s"]}
-    fitting = [name for name, share in found.items() if told and 0.5 < share < 2.0]
-    shaken = float(np.linalg.norm(imu.accel, axis=1).std()) > STEPS
-    if peak > GYRO_RANGE:
+    is_shaken = float(np.linalg.norm(imu.accel, axis=1).std()) > STEPS
+    if stated is not None:
+        scale = scale_of(stated, "gyro")
+        problem = f"sensors: the gyro never exceeds {peak * scale / DEGREE:.2g} deg/s, and that of"
+        is_slow = is_shaken and peak * scale < CARRIED_TURN * DEGREE
+        return scale, [f"{problem} a carried phone does: check its unit, {stated}"] * is_slow
+    if peak > WIDEST_RANGE:
+        problem = f"field 'gyro' reaches {peak:.3g}, beyond any gyro's range in rad/s and deg/s"
+        raise InputError(path, problem, "state its unit: mdps, or raw counts as 131/deg/s")
+    agreements = {name: agreement(imu, scale) for name, scale in TO_RAD_PER_SECOND.items()}
+    contrasts = {name: one[1] for name, one in agreements.items() if is_supported(*one)}
+    if peak > PHONE_RANGE:
         unit, reason = "deg/s", f"it reaches {peak:.3g}, beyond any phone's range in rad/s"
-    elif fitting:
-        unit, reason = fitting[0], f"gravity turns by {slope:.2g} of it"
-    elif peak <= CARRIED_TURN and shaken:
+    elif contrasts:
+        unit = max(contrasts, key=lambda name: contrasts[name])
+        reason = f"gravity turns by it, and {contrasts[unit]:.2g} times less against it"
+    elif peak <= CARRIED_TURN and is_shaken:
         reason = f"a carried phone turns faster than {CARRIED_TURN:g} deg/s"
         unit, reason = "rad/s", f"it reaches {peak:.3g}, and {reason}"
     else:
         problem = f"the unit of field 'gyro' is ambiguous (it reaches {peak:.3g})"
         raise InputError(path, problem, "state it: rad/s or deg/s")
     notes.append(f"{path.name}: gyro taken as {unit} ({reason})")
-    return TO_RAD_PER_SECOND[unit]
-
-
-def check_rad_per_second(imu: Motion, path: Path) -> None:
-    """Raise `InputError` if a gyro whose unit a format or header states differs from the rotation
-    of gravity by the factor between rad and deg. `imu` is in SI units according to that
-    statement."""
-    (slope, told), factor = _turning_of_gravity(imu), TO_RAD_PER_SECOND["deg/s"]
-    for share, looks in ((slope / factor, "deg/s"), (slope * factor, "rad/s")):
-        if told and 0.5 < share < 2.0:
-            turns = f"gravity turns by {slope:.3g} of it"
-            problem = f"its gyro looks like {looks}, which it does not say ({turns})"
-            raise InputError(path, problem, "state the unit of the gyro: rad/s or deg/s")
-
-
-def _turning_of_gravity(imu: Motion) -> tuple[float, bool]:
-    """Slope of the change of the smoothed specific force over a second against −∫ω × f, which is 1
-    if ω is in rad/s, and whether it shows the unit: if both correlate by more than 0.5."""
-    step = float(np.median(np.diff(imu.time)))
-    clock = np.arange(imu.time[0], imu.time[-1], step)
-    if len(clock) < 3.0 / step:
-        return 0.0, False
-    force, rate = (
-        gaussian_filter1d(interpolate(clock, imu.time, values), 0.5 / step, axis=0)
-        for values in (imu.accel, imu.gyro)
-    )
-    # A bias is a constant rate; deviations from the median are motion.
-    rate = rate - np.median(rate, axis=0)
-    turned = np.cumsum(-np.cross(rate, force), axis=0) * step
-    turned = np.concatenate([np.zeros((1, 3)), turned])[:-1]
-    second = max(round(1.0 / step), 1)
-    change, expected = force[second:] - force[:-second], turned[second:] - turned[:-second]
-    power, strength = float((expected**2).sum()), float((change**2).sum())
-    # If gravity has not moved, there is only noise and vibration.
-    if power == 0.0 or strength / len(change) < 0.1**2:
-        return 0.0, False
-    both = float((change * expected).sum())
-    return both / power, bool(both > 0.5 * np.sqrt(power * strength))
+    return TO_RAD_PER_SECOND[unit], []
 
 
 def signed(
     accel: Float[np.ndarray, "n 3"], sign: str, path: Path, notes: list[str]
 ) -> Float[np.ndarray, "n 3"]:
-    """`accel` with Android's sign: at rest, level, the up axis reads +1 g.
-
-    `sign` "ios" negates it, and "detect" assumes that the screen (+z) points up more than down.
-    Raises `InputError` if that is ambiguous.
-    """
+    """`accel` with Android's sign: at rest, level, the up axis reads +1 g. `sign` "ios" negates it,
+    and "detect" assumes that the screen (+z) points up more than down. Raises `InputError` if that
+    is ambiguous."""
     if sign == "detect":
         up = float(np.median(accel[:, 2]) / np.median(np.linalg.norm(accel, axis=1)))
         if abs(up) < 0.5:
-            carried = f"its z axis carries {up:.2f} of gravity"
-            problem = f"the sign of field 'accel' is ambiguous ({carried})"
-            raise InputError(path, problem, "state it: android or ios")
+            problem = f"the sign of field 'accel' is ambiguous (its z axis carries {up:.2f} of"
+            raise InputError(path, f"{problem} gravity)", "state it: android or ios")
         sign, name = ("android", "Android") if up > 0 else ("ios", "iOS")
-        assumed = "assuming that the screen points up"
-        notes.append(f"{path.name}: accel taken with {name}'s sign, {assumed}")
+        remark = f"accel taken with {name}'s sign, assuming that the screen points up"
+        notes.append(f"{path.name}: {remark}")
     if sign == "ios":
         notes.append(f"{path.name}: accel negated (iOS's sign)")
     return -accel if sign == "ios" else accel
@@ -184,9 +159,8 @@ def note_gravity(
     if abs(force - GRAVITY) > 2.0:
         problem = f"field 'accel' reads {force:.2f} m/s² in its quietest second, far from gravity"
         raise InputError(path, problem, "check its unit, and that gravity is in it")
-    reads = f"accel reads {force:.2f} m/s², mostly on {upward}"
-    notes.append(f"{path.name}: in the quietest second {reads}")
+    remark = f"in the quietest second accel reads {force:.2f} m/s², mostly on {upward}"
     if abs(force - GRAVITY) > 0.5:
-        off = f"that is off gravity by {force - GRAVITY:+.2f} m/s²"
-        notes.append(f"{path.name}: {off}: the accelerometer may need calibration")
+        remark += f", off gravity by {force - GRAVITY:+.2f} m/s²: it may need calibration"
+    notes.append(f"{path.name}: {remark}")
     return upward

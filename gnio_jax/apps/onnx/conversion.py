@@ -17,13 +17,13 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
 from gnio_jax.apps.onnx.programs import Program
-from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.filtering import Filter
 
 OPSET = 18
 """Version of the ONNX operators, which ONNX Runtime 1.14 or newer reads."""
 
 
-def to_model(program: Program, setup: FilterSetup) -> bytes:
+def to_model(program: Program, ekf: Filter) -> bytes:
     """The file of a model, weights included, whose inputs and outputs have the program's names,
     shapes and types.
 
@@ -52,9 +52,9 @@ def to_model(program: Program, setup: FilterSetup) -> bytes:
     model = onnx_ir.to_proto(RemoveUnusedNodesPass()(converted).model)
     _name_ends(model.graph, program)
     metadata = {
-        "rate": f"{1 / setup.config.dt:.17g}",
-        "first_measured": str(setup.config.first_measured),
-        "log_std_min": f"{setup.config.log_std_min:.17g}",
+        "rate": f"{1 / ekf.config.dt:.17g}",
+        "first_measured": str(ekf.config.first_measured),
+        "log_std_min": f"{ekf.config.log_std_min:.17g}",
     }
     onnx.helper.set_model_props(model, metadata)
     onnx.checker.check_model(model)

@@ -25,13 +25,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.filtering import FilterState, Pose, level_state
+from gnio_jax.filtering import Filter, FilterState, Pose, level_state
 from gnio_jax.filtering.checks import checked_state
 from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.network import network_window
 from gnio_jax.filtering.resampler import ACCEL, GYRO
-from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.filtering.start import REST_SECONDS
 from gnio_jax.filtering.state import state_shapes
 from gnio_jax.filtering.tracker import advance_filter
@@ -70,9 +69,9 @@ class DeployedState(NamedTuple):
     """The last `FilterConfig.reach` samples, gyro rad/s and accel m/s², raw; zeros at first."""
 
 
-def programs(network: Network, setup: FilterSetup) -> list[Program]:
+def programs(network: Network, ekf: Filter) -> list[Program]:
     """The four programs of a network and its filter. JAX's x64 must be on."""
-    config, noise = setup.config, setup.noise
+    config, noise = ekf.config, ekf.noise
     samples = jax.ShapeDtypeStruct((config.reach, 6), jnp.float64)
     shape = DeployedState(state_shapes(config, noise, jnp.float64), samples)
 
@@ -82,8 +81,8 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
 
     def start(arrays: Arrays) -> dict[str, Array]:
         """`level_state` of a second at rest."""
-        state = level_state(config, arrays["gyro"], arrays["accel"], setup.initial_std)
-        return _to_arrays(_deploy_state(state, setup))
+        state = level_state(ekf, arrays["gyro"], arrays["accel"])
+        return _to_arrays(_deploy_state(state, ekf))
 
     def window(arrays: Arrays) -> dict[str, Array]:
         """`network_window` from the oldest clone of the next step to the end of that step."""
@@ -99,17 +98,16 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
         prediction = arrays["displacement"], arrays["covariance"]
         measurement = scaled_displacement(*prediction, noise, config.displacement_frame)
         filtered, history = advance_filter(
+            ekf,
             state.filter,
             Imu(arrays["gyro"], arrays["accel"], None),
             jnp.zeros(n),
             lambda state, oldest: (measurement, {}),
             state.filter.step % config.clones,
-            config,
-            noise,
         )
         next_arrays = _to_arrays(DeployedState(filtered, _append_samples(state.samples, arrays)))
         next_state = {NEXT + name.removeprefix(STATE): value for name, value in next_arrays.items()}
-        fields = (name for name in Pose._fields if name != "time")
+        fields = (name for name in Pose._fields if name not in ("time", "failure"))
         return next_state | {POSE + name: getattr(history, name)[0] for name in fields}
 
     def float64(*shape: int) -> jax.ShapeDtypeStruct:
@@ -136,7 +134,7 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
     ]
 
 
-def start_arrays(state: FilterState, setup: FilterSetup) -> dict[str, np.ndarray]:
+def start_arrays(state: FilterState, ekf: Filter) -> dict[str, np.ndarray]:
     """The arrays of a filter that begins with `state`, from `initial_state` or `level_state`.
 
     Raises `ValueError` for the final state of a run: its clones are ordered by age and measured
@@ -146,14 +144,14 @@ def start_arrays(state: FilterState, setup: FilterSetup) -> dict[str, np.ndarray
         problem = f"is one after {int(state.step)} clone intervals of a run"
         raise ValueError(f"state: {problem}; a deployed filter begins with one without clones")
     return {
-        name: np.asarray(value) for name, value in _to_arrays(_deploy_state(state, setup)).items()
+        name: np.asarray(value) for name, value in _to_arrays(_deploy_state(state, ekf)).items()
     }
 
 
-def _deploy_state(state: FilterState, setup: FilterSetup) -> DeployedState:
+def _deploy_state(state: FilterState, ekf: Filter) -> DeployedState:
     """A deployed filter before its first sample."""
-    state = checked_state(state, setup.config, setup.noise)
-    return DeployedState(state, jnp.zeros((setup.config.reach, 6)))
+    state = checked_state(state, ekf)
+    return DeployedState(state, jnp.zeros((ekf.config.reach, 6)))
 
 
 def _append_samples(samples: Array, arrays: Arrays) -> Array:

@@ -19,13 +19,13 @@ from gnio_jax.apps.onnx import conversion, driver
 from gnio_jax.apps.onnx.driver import WalkResult
 from gnio_jax.apps.onnx.programs import programs, start_arrays
 from gnio_jax.config import DataConfig
-from gnio_jax.config.files import plain
+from gnio_jax.config.files import to_plain
 from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
+from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, estimate, prepare
 from gnio_jax.evaluation.metrics import ate
 from gnio_jax.files import fingerprint, replacing_folder
-from gnio_jax.filtering.settings import FilterSetup, filter_setup
+from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.models import Network
 
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
@@ -86,13 +86,13 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     source = packages.find(which)
     run = packages.load_pretrained(source)
     network = Network.of(run.model, run.variables)
-    setup = filter_setup(run.config.data, run.config.filter)
+    ekf = make_filter(run.config.data, run.config.filter)
     with replacing_folder(out) as folder, ExitStack() as at_end:
         at_end.callback(logging.disable, logging.root.manager.disable)
         logging.disable(logging.WARNING)  # Converters write a log line for almost every node.
         files = {}
-        for program in programs(network, setup):
-            content = conversion.to_model(program, setup)
+        for program in programs(network, ekf):
+            content = conversion.to_model(program, ekf)
             (folder / f"{program.name}.onnx").write_bytes(content)
             files[f"{program.name}.onnx"] = {
                 **fingerprint(content),
@@ -100,11 +100,12 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
                 "outputs": _describe_arrays(program.outputs),
             }
         windows = run.config.data
-        walk = draw_walk(windows, setup, seconds)
-        start = walk.start.state(setup.config)
+        walk = draw_walk(windows, ekf, seconds)
+        start = walk.start.state(ekf)
         models = driver.open_models(folder)
-        result = driver.walk(models, start_arrays(start, setup), walk.gyro, walk.accel)
-        (package_estimate,) = estimate([walk], network, windows, setup._replace(considered=None))
+        result = driver.walk(models, start_arrays(start, ekf), walk.gyro, walk.accel)
+        without = dataclasses.replace(ekf, considered=None)
+        (package_estimate,) = estimate([walk], network, windows, without)
         deviation = deviation_of(result, package_estimate)
         check(deviation, source.name)
         manifest = {
@@ -117,7 +118,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
             "epoch": run.epoch,
             "step": run.step,
             "accuracy": {"seconds": seconds, **deviation._asdict()},
-            **_filter(setup),
+            **_filter(ekf),
             "files": files,
         }
         text = json.dumps(manifest, indent=2, ensure_ascii=False, allow_nan=False)
@@ -133,9 +134,9 @@ def _describe_arrays(arrays: dict[str, jax.ShapeDtypeStruct]) -> list[dict[str, 
     ]
 
 
-def _filter(setup: FilterSetup) -> dict[str, Any]:
+def _filter(ekf: Filter) -> dict[str, Any]:
     """The settings of the exported filter, which are fixed."""
-    config = setup.config
+    config = ekf.config
     return {
         "rate": 1 / config.dt,
         "window": config.window,
@@ -146,21 +147,21 @@ def _filter(setup: FilterSetup) -> dict[str, Any]:
         "log_std_min": config.log_std_min,
         "filter": {
             "config": dataclasses.asdict(config),
-            "noise": plain(setup.noise),
-            "initial_std": plain(setup.initial_std),
+            "noise": to_plain(ekf.noise),
+            "initial_std": to_plain(ekf.start),
         },
     }
 
 
-def draw_walk(windows: DataConfig, setup: FilterSetup, seconds: float) -> Recording:
+def draw_walk(windows: DataConfig, ekf: Filter, seconds: float) -> PreparedRecording:
     """A pedestrian at the network's rate, with its true start."""
     length = seconds + 1.0 / windows.rate  # a stride ends with the sample after it
     sequence = pedestrian(SEED, PERSON, PLACEMENT, seconds=length, rate=windows.rate)
-    (walk,), _ = prepare([sequence], windows, setup.initial_std)
+    (walk,), _ = prepare([sequence], windows, ekf)
     return walk
 
 
-def deviation_of(result: WalkResult, package_estimate: Estimate) -> Deviation:
+def deviation_of(result: WalkResult, package_estimate: SequenceEstimate) -> Deviation:
     """The deviation of the models' walk from the package's own."""
     position, true = (
         trajectory.position[1:]

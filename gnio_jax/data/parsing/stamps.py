@@ -1,9 +1,12 @@
-"""Stamps in files: their unit, their rate, and rows that are out of order."""
+"""Stamps in files: unit, rate, order, and times of day. All limits are ours."""
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
-from jaxtyping import Float, Int, Real
+import pandas as pd
+from jaxtyping import Bool, Float, Int, Real
 
 from gnio_jax.errors import InputError
 
@@ -20,14 +23,48 @@ stamps sometimes coincide (ours)."""
 MOST_APART = 10
 """Number of neighbours in time that are not neighbours in the file, per step back in time, above
 which samples of two clocks are mixed (ours). A block of rows in the wrong place has three."""
+LONGEST_STEP = 60.0
+"""Steps longer than so many mean steps between different stamps are holes, not part of a rate."""
+SAME_RATE = 0.02
+"""Largest difference of the rates by the mean and by the median step (ours)."""
+CROWDED = 0.5
+"""Samples that follow faster than this share of the mean step come in bursts (ours)."""
+DAY = 86400 * 10**9
+"""ns."""
+FEW_ROWS, FEW_SHARE = 5, 0.01
+"""Number and share of damaged rows that are left out; more are an error."""
+
+
+def seconds_of(unit: str) -> Fraction:
+    """Seconds of one `unit`, one of `PER_SECOND` or a number of seconds. Raises `InputError`."""
+    if unit in PER_SECOND:
+        return Fraction(1, int(PER_SECOND[unit]))
+    try:
+        size = Fraction(unit)
+    except (ValueError, ZeroDivisionError):
+        size = Fraction(0)
+    if size <= 0:
+        remedy = f"known: {', '.join(PER_SECOND)}, or the seconds of one stamp, as 1e-4"
+        raise InputError("time_unit", f"unknown value '{unit}'", remedy)
+    return size
+
+
+def usual_step(stamps: Real[np.ndarray, " n"]) -> float:
+    """Mean step of stamps, sorted, without holes, in their unit; inf if they do not differ. Bursts
+    and stamps that several samples share do not change it, as they would the median."""
+    steps = np.diff(stamps).astype(np.float64)
+    if steps.min(initial=0.0) < 0:
+        steps = np.diff(np.sort(stamps)).astype(np.float64)
+    while (moving := steps[steps > 0]).size and steps.max() > LONGEST_STEP * moving.mean():
+        steps = steps[steps <= LONGEST_STEP * moving.mean()]
+    mean = float(steps.mean()) if steps.size else 0.0
+    return mean if mean > 0 else np.inf
 
 
 def time_unit(stamps: Real[np.ndarray, " n"]) -> tuple[str | None, float]:
     """The unit with which the rate of the stamps is within `RATES`, or None, and the rate in Hz if
     they were seconds. The ranges of the units do not overlap."""
-    steps = np.diff(np.sort(stamps))
-    steps = steps[steps > 0]
-    step = float(np.median(steps)) if steps.size else np.inf
+    step = usual_step(stamps)
     units = [unit for unit, count in PER_SECOND.items() if is_rate(count / step)]
     return units[0] if units else None, 1.0 / step
 
@@ -51,8 +88,13 @@ def check_seconds(time: Float[np.ndarray, " n"], source: object) -> None:
 
 
 def rounded_rate(time: Float[np.ndarray, " n"]) -> float:
-    """Rate, Hz, to four digits, because stamps are less exact than their clock."""
-    return float(f"{1.0 / float(np.median(np.diff(time))):.4g}")
+    """Rate of increasing stamps, Hz, to four digits, because stamps are less exact than their
+    clock: by the median step, or by the mean step if samples come in bursts."""
+    steps = np.diff(time)
+    step, mean = float(np.median(steps)), usual_step(time)
+    if abs(mean / step - 1.0) > SAME_RATE and (steps < CROWDED * mean).mean() > SAME_RATE:
+        step = mean
+    return float(f"{1.0 / step:.4g}")
 
 
 def first_stamp(
@@ -64,7 +106,7 @@ def first_stamp(
     their digits.
     """
     first, last = stamps.min(), stamps.max()
-    days = (float(last) - float(first)) / PER_SECOND[unit] / 86400
+    days = (float(last) - float(first)) * float(seconds_of(unit)) / 86400
     if not days <= MOST_DAYS:
         problem = f"field '{field}' goes over {days:.3g} days"
         remedy = f"cut the rows of other times, or check the unit of the stamps ({unit})"
@@ -77,7 +119,7 @@ def seconds(
 ) -> Float[np.ndarray, " n"]:
     """Time since the stamp `start`, s. Integers are subtracted as integers, because unix time in ns
     has more digits than a float."""
-    return np.asarray((stamps - start) / PER_SECOND[unit], dtype=np.float64)
+    return np.asarray((stamps - start) / float(1 / seconds_of(unit)), dtype=np.float64)
 
 
 def distinct(
@@ -87,8 +129,8 @@ def distinct(
     twice. Raises `InputError` if fewer than half of the rows have a stamp of their own."""
     rows = np.unique(stamps, return_index=True)[1]
     if len(rows) < 0.5 * len(stamps):
-        problem = f"holds only {len(rows)} different stamps in {len(stamps)} rows"
-        raise InputError(source, f"field '{field}' {problem}", "copy it again")
+        problem = f"field '{field}' holds only {len(rows)} different stamps in {len(stamps)} rows"
+        raise InputError(source, problem, "take the file as the logger wrote it")
     return rows
 
 
@@ -122,3 +164,37 @@ def in_order(
         raise InputError(source, problem, "give stamps fine enough to tell the samples apart")
     counts = {"rows_sorted": float(backward), "rows_repeated": float(again.sum())}
     return order[~again], {name: count for name, count in counts.items() if count}
+
+
+# --- damaged rows, the time of day
+
+
+def few(count: int) -> float:
+    """Largest number of damaged rows among `count` that are left out."""
+    return max(float(FEW_ROWS), FEW_SHARE * count)
+
+
+def parsed_times(cells: pd.Series) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Stamps of times of day, and which cells are one: ns since 1970, or since midnight if there is
+    no date, in UTC if there is no zone. Examples are 2024-05-03 09:15:02.250, 09:15:02:250,
+    15:02.250 and 5/3/2024 9:15:02 AM. A time without a date that is earlier by half a day than the
+    one before is of the next day, and minutes without an hour are of the next hour."""
+    text = cells.astype(str).str.strip(" \"'[]")
+    text = text.str.replace(r"(:\d+)[:, ]((?:\d{3})+)(?!\d)", r"\1.\2", regex=True)
+    text = text.str.replace(r"^(\d{4}-?\d\d-?\d\d)[_T-](?=\d\d)", r"\1 ", regex=True)
+    clock = text.str.extract(r"^((?:\d+:)?\d+:\d+(?:\.\d+)?) ?([AaPp][Mm])?$")
+    if clock[0].notna().mean() > 0.5:
+        has_hours = bool((clock[0].str.count(":") > 1).any())
+        spans = pd.to_timedelta(clock[0] if has_hours else "00:" + clock[0], errors="coerce")
+        valid = spans.notna().to_numpy()
+        stamps = spans.fillna(pd.Timedelta(0)).to_numpy().astype("timedelta64[ns]").astype(np.int64)
+        half = clock[1].str.lower().map({"am": 0, "pm": 1}).to_numpy(np.float64)
+        stamps = np.where(np.isnan(half), stamps, stamps % (DAY // 2) + (half == 1) * (DAY // 2))
+        turn = DAY if has_hours else DAY // 24
+        stamps[valid] += turn * np.cumsum(np.diff(stamps[valid], prepend=0) < -turn // 2)
+        return stamps, valid
+    dated = text.where(text.str.contains(r"\d:\d\d"))
+    is_dotted = bool(text.str.match(r"\d{1,2}\.\d").any())
+    dates = pd.to_datetime(dated, format="mixed", dayfirst=is_dotted, utc=True, errors="coerce")
+    moments = dates.dt.tz_localize(None).fillna(pd.Timestamp(0)).to_numpy()
+    return moments.astype("datetime64[ns]").astype(np.int64), dates.notna().to_numpy()

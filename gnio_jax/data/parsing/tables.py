@@ -7,7 +7,6 @@ included.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,6 +20,8 @@ from jaxtyping import Bool, Float, Int, Num
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
+from gnio_jax.data.parsing.text import head_of, is_row, layout_of, open_text, strict_frame
+from gnio_jax.data.parsing.text import shortened as shortened
 from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, check_increasing
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
@@ -30,15 +31,6 @@ if TYPE_CHECKING:
 
 LARGEST_RATIO = 100
 """Largest ratio of the size of a compressed field of HDF5 in memory to that in the file."""
-OURS = (AssertionError, NameError, ImportError)
-"""Errors that no damaged file causes in a parser: they are ours, or those of the installation."""
-
-
-def shortened(text: object, most: int = 80) -> str:
-    """A text from a file in a form that a message can quote: one line of at most `most` printable
-    characters."""
-    line = "".join(c if c.isprintable() else "\ufffd" for c in str(text)[: 4 * most])
-    return line if len(str(text)) <= most else line[: most - 3] + "..."
 
 
 def damaged(path: object, problem: str) -> InputError:
@@ -52,12 +44,14 @@ def parsed_as(path: Path, kind: str) -> Iterator[None]:
     because otherwise our own errors would be reported as damage of the file."""
     try:
         yield
-    except (InputError, *OURS):
-        raise
+    except (InputError, AssertionError, NameError, ImportError):
+        raise  # no damaged file causes these: they are ours, or those of the installation
     except MemoryError:
         problem = f"does not fit into memory as {kind}"
         raise InputError(path, problem, "if it should be smaller, copy it again") from None
     except Exception as error:  # a damaged file may cause any other error in a parser
+        if path.is_file():
+            head_of(path)
         reason = f"it may be cut short ({shortened(error, 200)})"
         raise damaged(path, f"cannot be read as {kind}, {reason}") from None
 
@@ -75,6 +69,8 @@ class Table(NamedTuple):
     """Number of lines before the first row of a text file."""
     content: bytes | None = None
     """Content of a text file that is part of an archive."""
+    rows: Int[np.ndarray, " n"] | None = None
+    """Numbers of the rows among those of the text, from 0; None: all."""
 
     def renamed(self, names: Iterable[str]) -> Table:
         """The columns of a text under these names, in their order."""
@@ -96,8 +92,8 @@ class Table(NamedTuple):
         values = np.stack(parts, axis=1) if len(parts) > 1 else parts[0]
         finite = np.isfinite(values)
         if not gaps and not finite.all():
-            row, *place = np.argwhere(~finite)[0].tolist()
-            name = names[place[0] if len(names) > 1 else 0]
+            row, *axis = np.argwhere(~finite)[0].tolist()
+            name = names[axis[0] if len(names) > 1 else 0]
             count = (~finite.reshape(len(finite), -1)).any(axis=1).sum()
             problem = f"is NaN or Inf in {count} rows, first in row {self.row(row)}"
             remedy = "repair or cut the recording there"
@@ -148,36 +144,35 @@ class Table(NamedTuple):
         """Rotations of unit quaternions in these rows. Raises `InputError` as `take` does, and if a
         norm differs from 1 by more than `UNIT_NORM_TOLERANCE`."""
         wxyz = self.take(*names, width=width, gaps=True)
-        own = np.arange(len(wxyz))[rows]
-        norm = np.linalg.norm(wxyz[own], axis=1)
+        numbers = np.arange(len(wxyz))[rows]
+        norm = np.linalg.norm(wxyz[numbers], axis=1)
         bad = ~(np.abs(norm - 1.0) <= UNIT_NORM_TOLERANCE)
         if bad.any():
             first = int(np.argmax(bad))
-            named = "', '".join(map(str, names))
-            are = f"s '{named}' are" if len(names) > 1 else f" '{named}' is"
-            place = f"first in row {self.row(int(own[first]))} (norm {norm[first]:.4g})"
-            problem = f"{self.kind}{are} not a unit quaternion in {bad.sum()} rows, {place}"
-            remedy = "check the column order and normalize, or copy it again"
-            raise InputError(self.path, problem, remedy)
-        return rotations(wxyz[own] if scalar_first else wxyz_from_xyzw(wxyz[own]))
+            labels = "', '".join(map(str, names))
+            subject = f"s '{labels}' are" if len(names) > 1 else f" '{labels}' is"
+            problem = f"{self.kind}{subject} not a unit quaternion in {bad.sum()} rows, first in"
+            problem += f" row {self.row(int(numbers[first]))} (norm {norm[first]:.4g})"
+            raise InputError(self.path, problem, "check the column order and normalize")
+        return rotations(wxyz[numbers] if scalar_first else wxyz_from_xyzw(wxyz[numbers]))
 
     def row(self, index: int) -> int:
         """The row of the file, counted from 1, with entry `index` of every column."""
+        index = index if self.rows is None else int(self.rows[index])
         if not self.before and self.content is None:
             return index + 1
         with open_text(self.path, self.content) as file:
-            lines = enumerate(file, 1)
-            rows = (n for n, line in lines if n > self.before and _is_data(line))
-            return next(islice(rows, index, None), self.before + index + 1)
+            numbers = (n for n, line in enumerate(file, 1) if n > self.before and is_row(line))
+            return next(islice(numbers, index, None), self.before + index + 1)
 
     def _column(self, name: Any) -> Any:
         if name not in self.columns:
-            known = shortened(", ".join(str(column) for column in self.columns), 600)
-            raise InputError(self.path, f"{self.kind} '{name}' is missing", f"found: {known}")
+            names = shortened(", ".join(str(column) for column in self.columns), 600)
+            raise InputError(self.path, f"{self.kind} '{name}' is missing", f"found: {names}")
         column = self.columns[name]
         if isinstance(column, pd.DataFrame):
-            times = column.shape[1]
-            raise InputError(self.path, f"column '{name}' is there {times} times", "leave one")
+            problem = f"column '{name}' is there {column.shape[1]} times"
+            raise InputError(self.path, problem, "leave one")
         return column
 
     def _numbers(self, name: Any, axes: tuple[int, ...]) -> np.ndarray:
@@ -206,19 +201,11 @@ class Table(NamedTuple):
 
 def text_of(path: Path) -> str:
     """The content of a text file, without a byte order mark."""
+    head_of(path)
     try:
         return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
         raise damaged(path, f"is no text ({shortened(error)})") from None
-
-
-def open_text(path: Path, content: bytes | None = None) -> io.TextIOWrapper:
-    """The text of a file, or `content` instead; a byte order mark is dropped."""
-    if content is None:
-        return path.open(encoding="utf-8-sig")
-    return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig")
 
 
 def read_text(
@@ -226,78 +213,34 @@ def read_text(
     separator: str = ",",
     header: bool = True,
     content: bytes | None = None,
-    decimal: str = ".",
     widths: tuple[int, ...] = (),
 ) -> Table:
-    """The columns of a text file by their names (stripped of blanks), or by their places from 0
-    without a `header`.
+    """The columns of a published table by their names, or by their places from 0 without a
+    `header`.
 
-    Lines that begin with '#' are comments. The first other line names the columns, unless it
-    contains a number. Then the last comment before it with the same number of cells names them, or
-    otherwise the numbers are the names. `separator` " " means any run of blanks. `content` is the
-    content of a file that is part of an archive; `path` is then its name in messages. Raises
-    `InputError` naming the file if it is missing, empty or no table, or if its number of columns is
-    none of `widths`.
+    The header is the line above the rows with as many cells and no number; it may be a comment, and
+    other lines above the rows must be comments. `separator` " " means any run of blanks. `content`
+    is the content of a file that is part of an archive; `path` is then its name in messages. Raises
+    `InputError` naming the file and the line if it is missing, empty or no such table, or if its
+    number of columns is none of `widths`.
     """
-    try:
-        before, first = [], ""
+    layout = layout_of(path, content, separator)
+    if not header:  # whatever stands above the rows is read as one, and refused by its column
         with open_text(path, content) as file:
-            for line in file:
-                if _is_data(line):
-                    first = line
-                    break
-                before.append(line)
-        cells, skipped = _cells(first, separator), len(before)
-        if header and not any(_is_number(cell, decimal) for cell in cells):
-            skipped += 1
-        elif header:
-            comments = [line.lstrip("#") for line in reversed(before) if line.startswith("#")]
-            names = (_cells(line, separator) for line in comments)
-            widths_of_names = (len(cells), len(cells) + 1)  # some end with a separator
-            cells = next((each for each in names if len(each) in widths_of_names), cells)
-        frame = pd.read_csv(
-            path if content is None else io.BytesIO(content),
-            header=None,
-            skiprows=skipped,
-            comment="#",
-            sep=r"\s+" if separator == " " else separator,
-            skipinitialspace=True,
-            skip_blank_lines=True,
-            low_memory=False,
-            decimal=decimal,
-        )
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from None
-    except pd.errors.EmptyDataError:
-        raise damaged(path, "holds no row") from None
-    except (UnicodeDecodeError, pd.errors.ParserError, ValueError) as error:
-        reason = f"it may be cut short or damaged ({shortened(error, 200)})"
-        raise damaged(path, f"is no table of text, {reason}") from None
-    width = frame.shape[1]
-    if widths and width not in widths:
-        raise damaged(path, f"has {width} columns, expected {' or '.join(map(str, widths))}")
-    if header:
-        labels = cells[:-1] if len(cells) == width + 1 and not cells[-1] else cells
-        if len(labels) != width:
-            raise damaged(path, f"its header names {len(labels)} columns, its rows have {width}")
-        frame.columns = labels
-    return Table(path, frame, before=skipped, content=content)
-
-
-def _is_data(line: str) -> bool:
-    return not line.startswith("#") and bool(line.strip())
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    return [cell.strip() for cell in line.strip().split(None if separator == " " else separator)]
-
-
-def _is_number(cell: str, decimal: str) -> bool:
-    try:
-        float(cell.replace(decimal, "."))
-    except ValueError:
-        return False
-    return True
+            before = next((n for n, line in enumerate(file) if is_row(line)), 0)
+        layout = layout._replace(before=before)
+    frame = strict_frame(path, layout, content)
+    if widths and frame.shape[1] not in widths:
+        problem = f"has {frame.shape[1]} columns, expected {' or '.join(map(str, widths))}"
+        raise InputError(path, problem, "take the file as published")
+    subheaders = (layout.separator.join(cells) for cells in layout.subheaders)
+    words = [line for line in (*layout.preamble, *subheaders) if is_row(line)]
+    if header and words:
+        problem = f"has a line with '{shortened(words[0], 60)}' above its rows of {layout.width}"
+        raise InputError(path, f"{problem} numbers", "gnio data import reads such a table")
+    if header and layout.labels:
+        frame.columns = list(layout.labels)
+    return Table(path, frame, before=layout.before, content=content)
 
 
 # --- other formats
@@ -342,8 +285,7 @@ def read_hdf5_fields(path: Path, names: Iterable[str]) -> Table:
 
     with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
         fields = {name: hdf5_field(file, name, path) for name in names}
-    there = {name: values for name, values in fields.items() if values is not None}
-    return Table(path, there, "field")
+    return Table(path, {n: values for n, values in fields.items() if values is not None}, "field")
 
 
 def read_npz(path: Path) -> Table:
@@ -360,8 +302,8 @@ def read_npy(path: Path, names: Mapping[str, slice], width: int) -> Table:
     if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
         problem = f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})"
         raise damaged(path, problem)
-    columns = {name: np.asarray(table[:, place]) for name, place in names.items()}
-    fields = {name: each[:, 0] if each.shape[1] == 1 else each for name, each in columns.items()}
+    fields = {name: np.asarray(table[:, columns]) for name, columns in names.items()}
+    fields = {n: field[:, 0] if field.shape[1] == 1 else field for n, field in fields.items()}
     return Table(path, fields, "field")
 
 

@@ -14,7 +14,7 @@ from gnio_jax.data.readers import (
     tlio,
     tyrex,
 )
-from gnio_jax.data.simulated.walks import RANDOMISED, SYNTHETIC
+from gnio_jax.data.simulated.walks import SYNTHETIC
 
 DATASETS: dict[str, Dataset] = {
     dataset.name: dataset
@@ -26,7 +26,6 @@ DATASETS: dict[str, Dataset] = {
         indoor_location.DATASET,
         kitti.DATASET,
         oxiod.DATASET,
-        RANDOMISED,
         ridi.DATASET,
         ronin.DATASET,
         SYNTHETIC,

@@ -22,6 +22,7 @@ from jaxtyping import Float
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.hdf5 import read_hdf5
+from gnio_jax.data.labels import ACCEL, GYRO, REFERENCE, probable
 from gnio_jax.data.parsing.stamps import check_seconds, rounded_rate
 from gnio_jax.data.parsing.tables import Table, read_text, shortened
 from gnio_jax.data.resampling import resample
@@ -33,13 +34,6 @@ from gnio_jax.numerics import finite_rows, quaternions
 from gnio_jax.types import Sequence
 
 SPLITS = ("train", "val", "test")
-GYRO = ("gyro_x", "gyro_y", "gyro_z")
-ACCEL = ("accel_x", "accel_y", "accel_z")
-REFERENCE = {
-    "orientation": ("qw", "qx", "qy", "qz"),
-    "position": ("px", "py", "pz"),
-    "velocity": ("vx", "vy", "vz"),
-}
 _FILES = (".csv", *HDF5)
 
 
@@ -168,28 +162,9 @@ def check_columns(
     if missing:
         lacking = ", ".join(f"'{expected[field]}'" for field in missing)
         are = "columns {} are" if len(missing) > 1 else "column {} is"
-        words = " ".join(f"{field}={_guess(field, names)}" for field in missing)
+        words = " ".join(f"{field}={probable(field, names)}" for field in missing)
         problem = f"{are.format(lacking)} missing; found: {shortened(', '.join(names), 600)}"
         raise InputError(path, problem, f"{remedy} {words}")
-
-
-_LIKE = {
-    "time": r"(unix_?)?(time.*|stamps?|t)(_?(s|ms|us|ns))?",
-    "accel_time": r"(accel|acc)_?(time.*|stamps?|t)",
-    "gyro": r"(gyro\w*|gyr|g|omega|angular\w*|rotation\w*|w)[_ .]*",
-    "accel": r"(accel\w*|acce|acc|linear\w*|a)[_ .]*",
-}
-"""Names of the columns in loggers, without unit and in small letters; the axis follows."""
-
-
-def _guess(field: str, names: list[str]) -> str:
-    """The column that is probably meant, or a placeholder."""
-    sensor, _, axis = field.partition("_")
-    pattern = _LIKE[field] if field in _LIKE else _LIKE[sensor] + axis
-    for name in names:
-        if re.fullmatch(pattern, re.sub(r"\s*[\[(].*", "", name).strip().lower()):
-            return f"'{name}'" if " " in name else name
-    return "COLUMN"
 
 
 DATASET = Dataset(

@@ -7,11 +7,11 @@ randomisation). A network can then use only what all walkers have in common: bou
 with the speed, and the trunk is fastest where it is lowest, which distinguishes forward from
 backward. In a run it is slowest there.
 
-`MANY_PEOPLE` has wide ranges. The trunk follows the inverted pendulum (Zijlstra & Hof, 2003). The
-gains of its motion and the strength of the heel strike in a hand, a pocket and a bag were set so
-that the spectra of the simulated accelerations cover those of OxIOD's training and validation
-sessions; no network learns from these sessions. `FEW_PEOPLE` has narrow ranges about the same
-middle, from which a small network learns in a minute. All ranges are ours.
+The trunk follows the inverted pendulum (Zijlstra & Hof, 2003). The gains of its motion and the
+strength of the heel strike in a hand, a pocket and a bag were set so that the spectra of the
+simulated accelerations cover those of OxIOD's training and validation sessions; no network learns
+from these sessions. `PEOPLE` takes a fifth of the widths of these ranges about the same middle, so
+that a small network learns from them in a minute. All ranges are ours.
 """
 
 from __future__ import annotations
@@ -37,8 +37,6 @@ class Carrying(NamedTuple):
     `_CADENCE`).
     """
 
-    share: float
-    """Probability."""
     surge: Range
     """Gain of the trunk's fore-aft motion at step frequency."""
     surge_phase: Range
@@ -69,7 +67,6 @@ class Carrying(NamedTuple):
 
 CARRYING = {
     "handheld": Carrying(
-        share=0.4,
         surge=(0.4, 1.1),
         surge_phase=(-0.2, 0.25),
         bounce=(0.7, 1.6),
@@ -85,7 +82,6 @@ CARRYING = {
         lever=((0.1, 0.4), (-0.1, 0.2), (0.0, 0.3)),
     ),
     "pocket": Carrying(
-        share=0.25,
         surge=(0.8, 2.2),
         surge_phase=(-0.2, 0.35),
         bounce=(0.6, 1.7),
@@ -101,7 +97,6 @@ CARRYING = {
         lever=((-0.1, 0.15), (0.1, 0.2), (-0.3, 0.0)),
     ),
     "bag": Carrying(
-        share=0.2,
         surge=(0.05, 1.2),
         surge_phase=(0.0, 1.0),
         bounce=(0.7, 1.7),
@@ -117,7 +112,6 @@ CARRYING = {
         lever=((-0.2, 0.1), (0.05, 0.3), (-0.5, 0.1)),
     ),
     "chest": Carrying(
-        share=0.15,
         surge=(0.7, 1.2),
         surge_phase=(-0.1, 0.2),
         bounce=(0.8, 1.4),
@@ -185,22 +179,7 @@ def _narrow_carrying(carrying: Carrying, share: float) -> Carrying:
     return carrying._replace(**ranges, turned=0.0, roll=share * carrying.roll)
 
 
-MANY_PEOPLE = Population(
-    activities={
-        "walk": Activity(0.60, (0.5, 1.7), (5.0, 25.0), 0.0, 0.0),
-        "stroll": Activity(0.08, (0.2, 0.5), (4.0, 10.0), 0.0, 0.0),
-        "run": Activity(0.12, (1.0, 3.2), (5.0, 15.0), 0.0, 1.0),
-        "stand": Activity(0.10, (0.0, 0.0), (3.0, 8.0), 0.0, 0.0),
-        "upstairs": Activity(0.05, (0.4, 0.65), (5.0, 10.0), 0.6, 0.0),
-        "downstairs": Activity(0.05, (0.45, 0.7), (5.0, 10.0), -0.6, 0.0),
-    },
-    carrying=CARRYING,
-    cadence=(0.86, 1.16),
-    idle=(0.001, 0.006),
-)
-"""People with wide ranges."""
-
-FEW_PEOPLE = Population(
+PEOPLE = Population(
     activities={
         "walk": Activity(0.50, (1.0, 1.6), (8.0, 20.0), 0.0, 0.0),
         "stroll": Activity(0.15, (0.5, 0.8), (6.0, 12.0), 0.0, 0.0),
@@ -213,7 +192,7 @@ FEW_PEOPLE = Population(
     cadence=_narrow((0.86, 1.16), 0.2),
     idle=(0.001, 0.003),
 )
-"""People with the same middles and a fifth of the widths."""
+"""People with the middles of `CARRYING` and a fifth of its widths."""
 
 
 class Plan(NamedTuple):
@@ -263,22 +242,21 @@ class PhoneMotion(NamedTuple):
 
 def draw_motion(
     rng: np.random.Generator,
-    people: Population,
     placement: str,
     time: Float[np.ndarray, " n"],
     dt: float,
-    person: int | None = None,
+    person: int,
 ) -> PhoneMotion:
-    """The motion of a phone on a walk that is drawn from `people`; `time` (s) is uniform with the
-    step `dt`. `placement` is a way of `people.carrying`.
+    """The motion of a phone on a walk that is drawn from `PEOPLE`; `time` (s) is uniform with the
+    step `dt`. `placement` is a way of `PEOPLE.carrying`.
 
-    The gait of walker number `person` is the same in every walk; without a number it is also drawn
-    from `rng`. Position and velocity are value and derivative of one spline.
+    The gait of walker number `person` is the same in every walk. Position and velocity are value
+    and derivative of one spline.
     """
-    gait_rng = rng if person is None else np.random.default_rng([7, person])
-    carrying = people.carrying[placement]
-    plan = _plan(rng, people.activities, time, dt)
-    walking_cadence = step_frequency(plan.speed, gait_rng.uniform(*people.cadence))
+    gait_rng = np.random.default_rng([7, person])
+    carrying = PEOPLE.carrying[placement]
+    plan = _plan(rng, PEOPLE.activities, time, dt)
+    walking_cadence = step_frequency(plan.speed, gait_rng.uniform(*PEOPLE.cadence))
     running_cadence = gait_rng.uniform(2.3, 2.8) + 0.1 * plan.speed
     cadence = walking_cadence + plan.running * (running_cadence - walking_cadence)
     cadence = cadence * (1.0 + 0.03 * wander(rng, time, 1, 1.0, 0.05, 0.5)[:, 0])
@@ -289,7 +267,7 @@ def draw_motion(
     offset = offset + _strikes(gait_rng, carrying, steps, dt)
     lever = np.array([rng.uniform(*bounds) for bounds in carrying.lever])
     lever[1] *= rng.choice([-1.0, 1.0])
-    offset = offset + lever + wander(rng, time, 3, rng.uniform(*people.idle), 0.1, 0.8)
+    offset = offset + lever + wander(rng, time, 3, rng.uniform(*PEOPLE.idle), 0.1, 0.8)
     swing = _swing(rng, gait_rng, carrying, steps)
 
     # The yaw of the mounting is arbitrary, so that the phone's heading does not show the direction

@@ -1,5 +1,4 @@
-"""Simulated walks with a known truth: a few walks for the demo and the tests, and ten hours of
-walks of many people.
+"""Simulated walks with a known truth, for the demo and the tests.
 
 The motion of the phone is that of `walker.draw_motion`. Sample k of the IMU is the mean over its
 interval, gyro_k = log(R_kᵀ R_{k+1}) / dt and accel_k = R_kᵀ ((v_{k+1} − v_k) / dt − g), so that
@@ -8,7 +7,6 @@ integrating the noise-free IMU sample by sample returns the trajectory.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,8 +17,6 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.simulated.walker import (
     CARRYING,
-    FEW_PEOPLE,
-    MANY_PEOPLE,
     PhoneMotion,
     draw_motion,
     wander,
@@ -74,38 +70,12 @@ def pedestrian(
     """
     rng = np.random.default_rng([seed])
     time, dt = np.arange(round(seconds * rate) + 1) / rate, 1.0 / rate
-    motion = draw_motion(rng, FEW_PEOPLE, placement, time, dt, person)
+    motion = draw_motion(rng, placement, time, dt, person)
     attributes = {"dataset": "synthetic", "placement": placement, "seed": seed}
     attributes |= {"subject": f"person {person}", "licence": SYNTHETIC.licence}
     return walk_sequence(
         rng, f"synthetic_{seed}_{placement}", motion, dt, PHONE, attributes, imu_errors
     )
-
-
-def random_walk(seed: int, seconds: float = 60.0, rate: float = 100.0) -> Sequence:
-    """A walk of `seconds` at `rate` Hz. Everything is drawn from `seed`: walker, gait, way of
-    carrying the phone, and IMU, from a good one to a poor one. It starts with 3 s of standing. The
-    attributes include the true biases at the start."""
-    rng = np.random.default_rng([11, seed])
-    names = list(CARRYING)
-    placement = str(rng.choice(names, p=[CARRYING[name].share for name in names]))
-    count, dt = round(seconds * rate), 1.0 / rate
-
-    def log_uniform(low: float, high: float) -> float:
-        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-    errors = SensorErrors(
-        gyro_density=log_uniform(5e-5, 4e-4),
-        accel_density=log_uniform(1e-3, 5e-3),
-        gyro_bias_walk=log_uniform(1e-6, 3e-5),
-        accel_bias_walk=log_uniform(5e-5, 5e-4),
-        gyro_bias=(0.0, 0.01),
-        accel_bias=(0.0, 0.25),
-    )
-    motion = draw_motion(rng, MANY_PEOPLE, placement, np.arange(count + 1) * dt, dt)
-    attributes = {"dataset": "randomised", "placement": placement, "seed": seed}
-    attributes |= {"licence": RANDOMISED.licence}
-    return walk_sequence(rng, f"randomised_{seed}", motion, dt, errors, attributes)
 
 
 def walk_sequence(
@@ -176,22 +146,20 @@ def device_attitude(rng: np.random.Generator, motion: PhoneMotion, dt: float) ->
     return about_z(drift) * Rotation.from_rotvec(tilt_error) * motion.attitude[:-1]
 
 
-# --- the datasets
+# --- the dataset
 
 # split: (first seed of its sequences, first person, number of people, number of sequences,
 # seconds); no person is in two splits.
-_FEW = {
+_SPLITS = {
     "train": (1000, 0, 12, 24, 120.0),
     "val": (2000, 100, 4, 4, 60.0),
     "test": (3000, 200, 6, 6, 120.0),
 }
-# split: (first seed, number of walks, seconds).
-_MANY = {"train": (100_000, 600, 60.0), "val": (200_000, 40, 60.0), "test": (300_000, 24, 120.0)}
 
 
-def _few_recordings(_: Path | None, split: str) -> list[RecordingSource]:
-    """The walks of few people, not yet computed."""
-    seed, first_person, people, count, seconds = _FEW[split]
+def _recordings(_: Path | None, split: str) -> list[RecordingSource]:
+    """The walks, not yet computed."""
+    seed, first_person, people, count, seconds = _SPLITS[split]
     placements, walks = list(CARRYING), []
     for index in range(count):
         person = first_person + index % people
@@ -203,29 +171,17 @@ def _few_recordings(_: Path | None, split: str) -> list[RecordingSource]:
     return walks
 
 
-def _many_recordings(_: Path | None, split: str) -> list[RecordingSource]:
-    """The walks of many people, not yet computed."""
-    first, count, seconds = _MANY[split]
-    return [
-        RecordingSource(f"randomised_{seed}", partial(_compute_one, random_walk, seed, seconds))
-        for seed in range(first, first + count)
-    ]
-
-
 def _compute_one(compute: Any, *arguments: Any) -> list[Sequence]:
     return [compute(*arguments)]
 
 
 SYNTHETIC = Dataset(
     name="synthetic",
-    recordings=_few_recordings,
-    splits=tuple(_FEW),
+    recordings=_recordings,
+    splits=tuple(_SPLITS),
     rate=200.0,
     source="computed by gnio_jax.data.simulated",
     layout="no files are needed",
     licence="Apache-2.0, as this package",
     needs_root=False,
-)
-RANDOMISED = replace(
-    SYNTHETIC, name="randomised", recordings=_many_recordings, splits=tuple(_MANY), rate=100.0
 )

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.apps.importing import read_imported, write_imported
-from gnio_jax.apps.importing.units import named_unit
+from gnio_jax.data.labels import unit_of, unit_text
 from gnio_jax.data.readers import csv_files
 from tests.support import known_walk
 from tests.support.csv_writers import AXES, SECONDS, compare_imu, imu, write, write_native
@@ -42,18 +42,26 @@ def write_logger(path, unit="ns", gyro=1.0, accel=1.0, separator=",", spoil=None
 
 
 def test_rows_are_those_that_an_editor_shows(tmp_path):
-    """Behind comments, the header, a blank line and rows of another sensor, whatever is wrong."""
+    """Behind comments, the header, a blank line and rows of another sensor, whatever is wrong. One
+    damaged row is left out and named, many are refused."""
     path = write_native(tmp_path / "walk.csv", reference=False)
     header, *rows = path.read_text().splitlines()
     names = header.split(",")
+    other = ["100.001", *[""] * (len(names) - 1)]
+    lines = ["# mine", "", header, *rows[:20], ",".join(other), "", "# pause", *rows[20:]]
+    first = lines.index(rows[41])
     for column, value in (("gyro_y", "three"), ("accel_z", "inf"), ("time", "")):
-        cells = rows[41].split(",")
-        cells[names.index(column)] = value
-        other = ["100.001", *[""] * (len(names) - 1)]
-        lines = ["# mine", "", header, *rows[:20], ",".join(other), "", "# pause"]
-        lines += [*rows[20:41], ",".join(cells)]
-        path.write_text("\n".join([*lines, *rows[42:]]))
-        refused(path, rf"row {len(lines)}\b")
+        spoiled = [line.split(",") for line in lines]
+        for count, words in ((1, "left out"), (40, rf"row {first + 1}\b")):
+            for cells in spoiled[first : first + 2 * count : 2]:
+                cells[names.index(column)] = value
+            path.write_text("\n".join(map(",".join, spoiled)))
+            if count > 1:
+                refused(path, words)
+            else:
+                sequence, notes = import_recording(path)
+                compare_imu(sequence)
+                assert any(words in note and f"row {first + 1}" in note for note in notes)
 
 
 # --- units and signs
@@ -132,18 +140,18 @@ def test_what_no_unit_explains_is_refused_until_it_is_stated(tmp_path):
 def test_a_header_tells_the_unit(tmp_path):
     """A phone that hardly turns: the numbers alone would be ambiguous."""
     time = np.arange(300) / 100
-    rows = np.tile([0.1, -0.2, 0.1, 0.0, 0.0, 9.81], (300, 1)).T
+    rows = np.random.default_rng(4).normal([0.1, -0.2, 0.1, 0.0, 0.0, 9.81], 0.01, (300, 6)).T
     names = {name: f"g{name[-1]} [deg/s]" for name in AXES[:3]}
     path = write(tmp_path / "still.csv", ["time", *names.values(), *AXES[3:]], [time, *rows])
     sequence, notes = import_recording(path, names)
-    np.testing.assert_allclose(sequence.gyro[0], np.radians([0.1, -0.2, 0.1]))
+    np.testing.assert_allclose(sequence.gyro, np.radians(rows[:3].T), atol=1e-9)
     assert "still.csv: gyro in deg/s, by its header" in notes
     path.write_text(path.read_text().replace(" [deg/s]", ""))
     plain = {name: label.split()[0] for name, label in names.items()}
     refused(path, "the unit of field 'gyro' is ambiguous", plain)
     labels = ["w_RS_S_x [rad s^-1]", "X (°/s)", "a_RS_S_x [m s^-2]", "#timestamp [ns]", "a (g)"]
-    assert [*map(named_unit, labels)] == ["rad/s", "deg/s", "m/s2", "ns", "g"]
-    assert not any(map(named_unit, ["Magnetic field x (µT)", "gyro_x", "g"]))
+    assert [unit_of(unit_text(label)) for label in labels] == ["rad/s", "deg/s", "m/s2", "ns", "g"]
+    assert not any(unit_of(unit_text(label)) for label in ("Magnetic field x (µT)", "gyro_x", "g"))
 
 
 def test_signs_are_turned_when_stated_or_asked_for(tmp_path):
@@ -214,8 +222,11 @@ def test_files_without_a_header_are_read_by_the_places_of_their_columns(tmp_path
     stated = {"accel_path": paths[1], "gyro_unit": "rad/s"}
     summed, _ = import_recording(paths[0], columns | {"gyro_x": "1+2"}, **stated)
     np.testing.assert_allclose(summed.gyro[:, 0], sequence.gyro[:, :2].sum(axis=1), atol=1e-9)
-    words = "has 4 columns of numbers and no header; .* time=0 gyro_x=1 gyro_y=2 gyro_z=3$"
-    refused(paths[0], words, accel_path=paths[1])
+    # A table of one sensor needs no names: stamps that increase, then three axes.
+    compare_imu(import_recording(paths[0], accel_path=paths[1])[0])
+    compare_imu(import_recording(paths[0])[0])  # the other sensor's file is beside it
+    words = "has 4 columns of numbers and no header; .*gyro_x=0 .*accel_z=5 --sample-rate HZ$"
+    refused(paths[0].rename(tmp_path / "board.txt"), words)
 
 
 def test_rows_of_one_sensor_each_are_told_apart(tmp_path):
@@ -231,7 +242,11 @@ def test_rows_of_one_sensor_each_are_told_apart(tmp_path):
     assert sum("rows have no" in note for note in notes) == 2
     values[5, 1] = np.nan
     path = write(tmp_path / "torn.csv", ["time", *AXES], [time[order], *values[order].T])
-    refused(path, r"torn\.csv: field 'gyro' is NaN or Inf in 1 rows")
+    _, notes = import_recording(path)
+    assert any("field 'gyro' is NaN or Inf in 1 rows" in note for note in notes)
+    values[np.flatnonzero(np.isfinite(values[:, 0]))[::9], 1] = np.nan
+    path = write(tmp_path / "torn.csv", ["time", *AXES], [time[order], *values[order].T])
+    refused(path, r"torn\.csv: a stamp or a value of field 'gyro' is NaN or Inf in 157 rows")
 
 
 # --- stamps

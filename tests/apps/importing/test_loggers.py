@@ -4,7 +4,7 @@ import numpy as np
 import openpyxl
 import pytest
 
-from gnio_jax.apps.importing import loggers
+from gnio_jax.apps.importing import files
 from tests.support import known_walk, logger_files
 from tests.support.importing import import_recording, refused
 from tests.support.logger_files import (
@@ -110,7 +110,7 @@ def test_the_metadata_tell_the_sign_or_it_must_be_stated(tmp_path):
             "TotalAcceleration.csv: column 'x' is missing",
         ),
         (sensor_logger(seconds=0.5), "walk.zip: both sensors were recorded for 0.49 s, less than"),
-        ({"notes.txt": "hello"}, "layout of no known recording .found: no CSV file.; known"),
+        ({"notes.md": "hello"}, "layout of no known recording .found: no CSV file.; known"),
         (sensor_logger() | {"../../etc/Gyroscope.csv": "x"}, r"2 recordings: ., \.\./\.\./etc"),
         ({f"{number}.csv": "" for number in range(201)}, "walk.zip: holds 201 CSV files"),
     ],
@@ -131,7 +131,7 @@ def test_degrees_where_the_format_says_radians_are_refused(tmp_path):
     members = {"TotalAcceleration.csv": sensor_table(time, force)}
     degrees = members | {"Gyroscope.csv": sensor_table(time, np.degrees(turning))}
     path = zipped(tmp_path / "walk.zip", degrees)
-    refused(path, "its gyro looks like deg/s, which it does not say .* state the unit")
+    refused(path, "its gyro looks like deg/s by the turning .* state the unit")
     sequence, _ = import_recording(path, gyro_unit="deg/s")
     np.testing.assert_allclose(sequence.gyro, turning, atol=1e-6)
     members["Gyroscope.csv"] = sensor_table(time, turning)
@@ -179,7 +179,7 @@ def test_phyphox_as_a_workbook(tmp_path, monkeypatch):
         sequence, notes = import_recording(tmp_path / name)
         compare(sequence)
         assert f"{name}: phyphox; time in s, Gyroscope in rad/s, Accelerometer in m/s2" in notes[0]
-    monkeypatch.setattr(loggers, "LARGEST", 2**15)
+    monkeypatch.setattr(files, "LARGEST", 2**15)
     refused(tmp_path / "walk.xlsx", "walk.xlsx: unpacks to 0 MiB; no table may exceed 0 MiB")
     (tmp_path / "cut.xls").write_bytes((tmp_path / "walk.xls").read_bytes()[:3000])
     refused(tmp_path / "cut.xls", "cut.xls: cannot be read as a workbook")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.apps.importing import ros
 from tests.support import bag_files, known_walk
 from tests.support.bag_files import EPOCH, KINDS, LOGGED, Maker, imu, poses, text, write
-from tests.support.importing import compare_reference, import_recording, refused
+from tests.support.importing import compare_reference, import_recording, imported, refused
 
 ZERO = (0.0, 0.0, 0.0, 0.0)
 ONE = (Rotation.identity(), np.zeros(3))
@@ -177,6 +177,41 @@ def test_only_what_a_library_cannot_read_is_called_damage(tmp_path, monkeypatch,
         monkeypatch.setattr(ros, "_stamp", fails)
         with pytest.raises(error):
             import_recording(path)
+
+
+def test_headers_that_do_not_run_as_the_bag_are_not_used(tmp_path):
+    """Twice as fast, not at all, and a twentieth too fast; a delay that varies is none of these."""
+    for pace, words in ((2.0, "run 2 times as"), (0.0, "run 0 times as"), (1.05, "run 1.05 times")):
+        make = Maker()
+        make.header = lambda time, frame, own=make.header, pace=pace: own(time * pace, frame)
+        path = write(tmp_path, "mcap", imu(make))
+        found = imported(path)
+        compare_imu(found.sequence)
+        assert any(f"the headers of /imu/data {words}" in warning for warning in found.warnings)
+        assert found.sequence.attributes["start_time"] == pytest.approx(
+            (EPOCH + LOGGED) * 1e-9, abs=1e-6
+        )
+    late = np.random.default_rng(0).integers(0, 2 * LOGGED, 600)
+    entries = [
+        (*row[:2], row[2] + int(delay), row[3])
+        for row, delay in zip(imu(Maker()), late, strict=True)
+    ]
+    found = imported(write(tmp_path, "mcap", entries))
+    compare_imu(found.sequence)
+    assert found.warnings == ()
+
+
+def test_a_bag_without_an_index_and_a_name_for_another_file_have_a_remedy(tmp_path):
+    path = write(tmp_path, "rosbag1", imu(Maker("rosbag1"), seconds=2.0))
+    content = bytearray(path.read_bytes())
+    place = content.index(b"index_pos=") + 10
+    end = int.from_bytes(content[place : place + 8], "little")
+    content[place : place + 8] = bytes(8)  # as rosbag leaves it when it is killed
+    path.write_bytes(content[:end])
+    refused(path, r"walk\.bag: has no index, .*; make one: rosbag reindex walk\.bag$")
+    path = write(tmp_path, "db3", imu(Maker("db3"), seconds=2.0))
+    other = path.rename(path.with_name("walk%41.db3"))  # SQLite would open walkA.db3
+    refused(other, "has %, . or # in its name; rename it")
 
 
 def test_a_bag_compressed_as_a_whole_is_unpacked_by_its_owner(tmp_path, monkeypatch):

@@ -13,7 +13,6 @@ from gnio_jax import filtering
 from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated.walks import pedestrian
-from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.models import Network
 from gnio_jax.numerics import matrix_from_quaternion
 from gnio_jax.training.checkpoint import load_run
@@ -59,9 +58,9 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="package")
 def package(run):
-    """The odometry of the package over the walk, from a state made of its setup."""
+    """The odometry of the package over the walk, from a state made of its ekf."""
     loaded = load_run(run)
-    setup = filter_setup(loaded.config.data, loaded.config.filter)
+    ekf = filtering.make_filter(loaded.config.data, loaded.config.filter)
     network = Network.of(loaded.model, loaded.variables)
 
     def predict(windows):
@@ -69,9 +68,9 @@ def package(run):
 
     @jax.jit
     def odometry(state, gyro, accel):
-        return filtering.run_odometry(predict, state, gyro, accel, setup.config, setup.noise)[1]
+        return filtering.run_odometry(predict, ekf, state, gyro, accel)[1]
 
-    return lambda start, *signals: odometry(start(setup), *signals)
+    return lambda start, *signals: odometry(start(ekf), *signals)
 
 
 @pytest.fixture(scope="package")

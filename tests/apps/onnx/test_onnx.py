@@ -18,7 +18,6 @@ from gnio_jax.apps.onnx import driver
 from gnio_jax.apps.onnx.programs import start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check
 from gnio_jax.commands import app, console
-from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.training.checkpoint import load_run
 from tests.apps.onnx.conftest import BIAS, CONFIG, SECONDS
 
@@ -35,15 +34,15 @@ def found(models, walked):
     return driver.walk(opened, state, walked.gyro, walked.accel)
 
 
-def from_rest(setup, walked):
+def from_rest(ekf, walked):
     """The start of `gnio track` and `gnio live`."""
     gyro, accel = walked.gyro[:REST], walked.accel[:REST]
-    return filtering.level_state(setup.config, gyro, accel, setup.initial_std)
+    return filtering.level_state(ekf, gyro, accel)
 
 
 def test_a_minute_is_that_of_the_package(found, models, walked, package):
-    def start(setup):
-        return from_rest(setup, walked)
+    def start(ekf):
+        return from_rest(ekf, walked)
 
     history = package(start, walked.gyro, walked.accel)
     first = round(1.0 / CONFIG.data.stride_seconds)
@@ -70,17 +69,17 @@ def test_the_start_has_the_bias_of_a_gyro_at_rest(run, models, walked):
     rest = {"gyro": walked.gyro[:REST], "accel": walked.accel[:REST]}
     arrays = driver.run(driver.open_models(models[0]).start, rest)
     loaded = load_run(run).config
-    setup = filter_setup(loaded.data, loaded.filter)
-    wanted = start_arrays(from_rest(setup, walked), setup)
+    ekf = filtering.make_filter(loaded.data, loaded.filter)
+    wanted = start_arrays(from_rest(ekf, walked), ekf)
     assert arrays.keys() == wanted.keys()
     for name, value in wanted.items():
         np.testing.assert_allclose(arrays[name], value, atol=1e-9, err_msg=name)
     np.testing.assert_allclose(arrays["state.gyro_bias"], BIAS, atol=1e-9)
     # The clones of a state that a run left are ordered by age: the models would take them for a
     # ring.
-    state = from_rest(setup, walked)
+    state = from_rest(ekf, walked)
     with pytest.raises(ValueError, match=r"^state: is one after 3 clone intervals of a run"):
-        start_arrays(state._replace(step=state.step + 3), setup)
+        start_arrays(state._replace(step=state.step + 3), ekf)
 
 
 def test_the_filter_is_in_float64_and_every_tensor_is_described(models):

@@ -14,11 +14,6 @@ def val():
     return data.load("synthetic", split="val")
 
 
-@pytest.fixture(scope="module")
-def randomised():
-    return [walks.random_walk(seed, 40.0) for seed in range(12)]
-
-
 def strap_down(sequence):
     """Positions from integrating the IMU alone, sample by sample: R exp((gyro) dt), v + (R accel +
     g) dt."""
@@ -41,21 +36,17 @@ def test_the_error_free_imu_integrates_to_the_trajectory(placement):
     assert np.abs(strap_down(sequence) - sequence.position).max() < 1e-3
 
 
-def test_every_walk_is_physical(val, randomised):
-    for sequence in [*val, *randomised]:
+def test_every_walk_is_physical(val):
+    for sequence in val:
         data.validate(sequence, sequence.name)
         check = data.self_check(sequence)
-        assert check.failures == () and check.accel_correlation_horizontal > 0.9
-    for sequence in val:  # by far
-        check = data.self_check(sequence)
+        assert check.failures == ()
         np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.15)
         assert check.rate == pytest.approx(200.0) and 0.5 < check.median_speed < 2.0
         assert check.gyro_consistency_degrees < 1.0 and check.accel_correlation_horizontal > 0.99
         difference = (sequence.position[2:] - sequence.position[:-2]) * (check.rate / 2)
         np.testing.assert_allclose(difference, sequence.velocity[1:-1], atol=0.02)
-    for some in (val, randomised):
-        assert {walk.attributes["placement"] for walk in some} == set(CARRYING)
-    assert sum(each.share for each in CARRYING.values()) == pytest.approx(1.0)
+    assert {walk.attributes["placement"] for walk in val} == set(CARRYING)
 
 
 def test_the_stated_biases_and_noise_are_the_true_ones():
@@ -87,33 +78,15 @@ def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
     ]
     for values in zip(*(map(set, zip(*pairs, strict=True)) for pairs in found), strict=True):
         assert len(set.union(*values)) == sum(map(len, values))  # seeds, then people
-    names = [{each.name for each in walks.RANDOMISED.recordings(None, split)} for split in splits]
-    assert sum(map(len, names)) == len(set.union(*names)) == 600 + 40 + 24
 
 
-# seed -> where the walk of 20 s ends (m), and the sums of |accel| and |gyro| over its samples.
-KNOWN = {
-    200000: (
-        [-15.987564707673124, 2.143442584612825, -0.031023060489223764],
-        [2188.972821880198, 19507.96905872019, 2362.0737368805467],
-        [674.5280856928983, 1185.0200491000644, 700.2600224902284],
-    ),
-    3001: (  # of `synthetic`, a pocket
-        [8.268985122117613, -22.153815669098634, 3.3990187167441333],
-        [6570.717909661941, 43481.49970855106, 8982.95660633462],
-        [2304.07557312174, 2838.0901640423767, 3220.1150007217034],
-    ),
-}
-
-
-@pytest.mark.parametrize("seed", KNOWN)
-def test_a_seed_is_the_walk_that_it_has_always_been(seed):
-    """Published networks were trained on these walks."""
-    if seed == 3001:
-        walk = walks.pedestrian(seed, 201, "pocket", 20.0)
-    else:
-        walk = walks.random_walk(seed, 20.0)
-    end, accel, gyro = KNOWN[seed]
+def test_a_seed_is_the_walk_that_it_has_always_been():
+    """Published figures are of these walks: where this one ends (m), and the sums of |accel| and
+    |gyro| over its samples."""
+    walk = walks.pedestrian(3001, 201, "pocket", 20.0)
+    end = [8.268985122117613, -22.153815669098634, 3.3990187167441333]
+    accel = [6570.717909661941, 43481.49970855106, 8982.95660633462]
+    gyro = [2304.07557312174, 2838.0901640423767, 3220.1150007217034]
     np.testing.assert_allclose(walk.position[-1], end, rtol=1e-9)
     np.testing.assert_allclose(np.abs(walk.accel).sum(axis=0), accel, rtol=1e-9)
     np.testing.assert_allclose(np.abs(walk.gyro).sum(axis=0), gyro, rtol=1e-9)

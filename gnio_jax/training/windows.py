@@ -80,10 +80,10 @@ def window_source(
     if not parts:
         length = f"{config.context_seconds + config.window_seconds:g} s"
         raise InputError("data", f"no window of {length} with a valid reference in any sequence")
-    return joined(parts)
+    return join_windows(parts)
 
 
-def joined(sources: list[WindowSource]) -> WindowSource:
+def join_windows(sources: list[WindowSource]) -> WindowSource:
     """The recordings of all sources, one source after the other, as host arrays."""
     parts: list[WindowSource] = []
     rows = windows = 0

@@ -11,8 +11,8 @@ from typing import NamedTuple
 from gnio_jax import data
 from gnio_jax.config import CalibrateConfig, FilterSettings, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
-from gnio_jax.filtering import filter_setup
+from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, estimate, prepare
+from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run
@@ -21,33 +21,33 @@ OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
 
 
-class Evidence(NamedTuple):
-    """Recordings and the estimates of a network for each, in the same order."""
+class Predictions(NamedTuple):
+    """Recordings and their estimates with a network in the filter, in the same order."""
 
-    recordings: list[Recording]
-    estimates: list[Estimate]
+    recordings: list[PreparedRecording]
+    estimates: list[SequenceEstimate]
 
 
-class Source(NamedTuple):
-    """A network and the recordings for which it predicts displacements."""
+class FoldNetwork(NamedTuple):
+    """A network and the part of the split for which it predicts displacements."""
 
     run: Run
     fold: data.Fold | None
-    """The part of the split; None for all of it."""
+    """None: all of the split."""
 
 
 def load_run(workdir: Path, config: CalibrateConfig) -> Run:
     """A run with the network that is to be calibrated. Raises `InputError` as `checkpoint.load_run`
-    and `checkpoint.averaged_over_headings` do."""
+    and `checkpoint.average_over_headings` do."""
     run = checkpoint.load_run(workdir)
     if not config.average_headings:
         return run
-    return checkpoint.averaged_over_headings(run, f"--average-headings with {workdir}")
+    return checkpoint.average_over_headings(run, f"--average-headings with {workdir}")
 
 
-def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
-    """The split, and the networks that predict its displacements: the run's own, or one for each
-    fold.
+def choose_networks(run: Run, config: CalibrateConfig) -> tuple[str, list[FoldNetwork]]:
+    """Choose the split and the networks that predict its displacements: the run's own network, or
+    one for each fold.
 
     Raises `InputError` for a split that is neither the run's validation nor its training split, and
     for runs that are not the folds of one experiment.
@@ -58,7 +58,7 @@ def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
             problem = "is neither the validation nor the training split of the run"
             remedy = f"give {val} or {train}: the filter must not be fitted to test walks"
             raise InputError(f"--split {config.split}", problem, remedy)
-        return config.split or val, [Source(run, None)]
+        return config.split or val, [FoldNetwork(run, None)]
     if config.split:
         problem = "is of no use with --out-of-fold, which takes the training split"
         raise InputError(f"--split {config.split}", problem)
@@ -73,7 +73,7 @@ def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
         remedy = f"train one run for each of --data.train-split {train}-0ofK, {train}-1ofK, ..."
         raise InputError("--out-of-fold", f"were trained on the splits {', '.join(splits)}", remedy)
     return train, [
-        Source(fold_run, folds[name]) for fold_run, name in zip(runs, splits, strict=True)
+        FoldNetwork(fold_run, folds[name]) for fold_run, name in zip(runs, splits, strict=True)
     ]
 
 
@@ -89,16 +89,16 @@ def _check_alike(folder: str, fold_run: TrainConfig, run: TrainConfig) -> None:
             raise InputError(folder, f"differs from the calibrated run in '{name}'")
 
 
-def gather(
+def predict(
     split: str,
-    networks: list[Source],
+    networks: list[FoldNetwork],
     config: CalibrateConfig,
     settings: FilterSettings,
     progress: OnStage,
     workers: int,
-) -> Evidence:
-    """The predictions of each network for its recordings of the split. Raises `InputError` for
-    missing data.
+) -> Predictions:
+    """Predict the displacements of the split, each network for its recordings. Raises `InputError`
+    for missing data.
 
     The network runs in the loop of the filter with `settings`, and the filter's attitude rotates
     the windows.
@@ -113,30 +113,28 @@ def gather(
         data.load(name, root, split, workers, lambda share: progress("reading", share))
         for name, root in zip(trained.datasets, roots, strict=True)
     ]
-    evidence = Evidence([], [])
-    for number, source in enumerate(networks):
-        windows, subset = source.run.config.data, f"dataset {names}, split '{split}'"
+    predictions = Predictions([], [])
+    for number, fold_network in enumerate(networks):
+        windows, subset = fold_network.run.config.data, f"dataset {names}, split '{split}'"
         sequences = [sequence for dataset in datasets for sequence in dataset]
-        if source.fold is not None:
-            subset = f"{subset}, fold {source.fold.number}"
+        if fold_network.fold is not None:
+            subset = f"{subset}, fold {fold_network.fold.number}"
             sequences = [
-                sequence for dataset in datasets for sequence in source.fold.select(dataset)
+                sequence for dataset in datasets for sequence in fold_network.fold.select(dataset)
             ]
         with_reference = [sequence for sequence in sequences if sequence.valid.any()]
-        prepared, _ = prepare(
-            with_reference, windows, settings.start, raw_gyro_bias=settings.raw_gyro_bias
-        )
+        prepared, _ = prepare(with_reference, windows, make_filter(windows, settings))
         if not prepared:
             problem = "has no recording with a reference that is long enough to be fitted"
             raise InputError(subset, problem)
-        network = Network.of(source.run.model, source.run.variables)
+        network = Network.of(fold_network.run.model, fold_network.run.variables)
         estimates = estimate(
             prepared,
             network,
             trained.data,
-            filter_setup(trained.data, settings),
+            make_filter(trained.data, settings),
             progress=lambda share, n=number: progress("estimating", (n + share) / len(networks)),
         )
-        evidence.recordings.extend(prepared)
-        evidence.estimates.extend(estimates)
-    return evidence
+        predictions.recordings.extend(prepared)
+        predictions.estimates.extend(estimates)
+    return predictions

@@ -10,8 +10,8 @@ from scipy import signal, stats
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import AugmentConfig, DataConfig
-from gnio_jax.data import windows
 from gnio_jax.errors import InputError
+from gnio_jax.training import windows
 from gnio_jax.types import Sequence, Windows
 
 KEY = jax.random.key(3)

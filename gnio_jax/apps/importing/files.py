@@ -1,0 +1,146 @@
+"""The tables of a log: one text, the texts of a zip, of a folder or of a gzip, the sheets of a
+workbook. Nothing is unpacked to the disk."""
+
+from __future__ import annotations
+
+import functools
+import gzip
+import io
+import warnings
+import zipfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from gnio_jax.data.parsing import text as parsing
+from gnio_jax.data.parsing.tables import Table, parsed_as
+from gnio_jax.errors import InputError, require_packages
+
+XLS_MAGIC, GZIP_MAGIC = b"\xd0\xcf\x11\xe0", b"\x1f\x8b"
+"""First bytes of an OLE file (.xls) and of a gzip."""
+LARGEST = 512 * 2**20
+"""Largest unpacked size of a table, bytes: six hours of a sensor at 200 Hz are less (ours)."""
+MOST_TABLES = 200
+"""Largest number of tables; a logger writes one for each sensor (ours)."""
+_SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".gcsv", ".json")
+
+
+_Content = Callable[[], bytes | None]
+"""A function that gives the text of a table; None: it is that of the file at its path."""
+
+
+class LogFile(NamedTuple):
+    """A table of a log, not yet read."""
+
+    name: str
+    """Name within a zip, folder or workbook, such as "meta/time.csv"."""
+    path: Path
+    """Path for messages."""
+    layout: parsing.Layout
+    content: _Content
+    read: Callable[[], tuple[Table, list[str]]]
+    """A function that gives the table, and notes about what is left out of it."""
+
+    @property
+    def location(self) -> PurePosixPath:
+        """Its folder and name."""
+        return PurePosixPath(self.name)
+
+
+def log_file(
+    name: str, path: Path, content: _Content = lambda: None, head: bytes | None = None
+) -> LogFile:
+    """A table with the shape that its first bytes `head` have (None: those of `content`)."""
+    layout = parsing.layout_of(path, content() if head is None else head)
+
+    @functools.cache
+    def read() -> tuple[Table, list[str]]:
+        notes: list[str] = []
+        frame, rows = parsing.tolerant_frame(path, layout, content(), notes)
+        if words := [line for line in layout.preamble if parsing.is_row(line)]:
+            problem = f"{len(words)} lines above the header are no rows"
+            notes.append(f"{path.name}: {problem} ('{parsing.shortened(words[0], 40)}')")
+        frame.columns = list(layout.labels or map(str, frame.columns))
+        return Table(path, frame, before=layout.before, content=content(), rows=rows), notes
+
+    return LogFile(name, path, layout, content, read)
+
+
+def listed(files: list[LogFile]) -> str:
+    """Names of files, for messages."""
+    return parsing.shortened(", ".join(file.name for file in files) or "no CSV file", 200)
+
+
+def files_of(path: Path) -> list[LogFile]:
+    """The tables at a path. Those of a zip or folder that are no text are left out. Raises
+    `InputError` for a damaged file or one that unpacks to more than a logger writes."""
+    if path.is_dir():
+        files = sorted(file for file in (*path.glob("*"), *path.glob("*/*")) if file.is_file())
+        return _texts(path, {file.relative_to(path).as_posix(): file for file in files})
+    magic = parsing.head_of(path)[:4]
+    if magic == XLS_MAGIC:
+        return _sheets(path, "xlrd")
+    if magic.startswith(GZIP_MAGIC):
+        with parsed_as(path, "a gzip"), gzip.open(path) as file:
+            content = file.read(LARGEST + 1)
+        _check_size(len(content), path)
+        return [log_file(path.stem, path, partial(bytes, content))]
+    if not magic.startswith(b"PK"):
+        return [log_file(path.name, path)]
+    with parsed_as(path, "a zip"), zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+    if any(member.filename == "xl/workbook.xml" for member in members):  # ECMA-376, part 2
+        _check_size(sum(member.file_size for member in members), path)
+        return _sheets(path, "openpyxl")
+    return _texts(path, {member.filename: None for member in members})
+
+
+def _texts(path: Path, members: dict[str, Path | None]) -> list[LogFile]:
+    """The tables among the files of a zip (name → None) or folder (name → file)."""
+    files, problems = list[LogFile](), list[InputError]()
+    # macOS adds a file "._Gyroscope.csv" to each Gyroscope.csv.
+    hidden = {name for name in members if PurePosixPath(name).name.startswith(".")}
+    texts = [name for name in members if name.lower().endswith(_SUFFIXES) and name not in hidden]
+    if len(texts) > MOST_TABLES:
+        raise InputError(path, f"holds {len(texts)} CSV files", "give one recording of a logger")
+    for name in texts:
+        file, member = members[name], partial(_member, path, name)
+        head = member(parsing.HEAD) if file is None else None
+        try:
+            one = log_file(name, file) if file else log_file(name, path / name, member, head)
+            files.append(one)
+        except InputError as error:
+            problems.append(error)
+    if problems and not files:
+        raise problems[0]
+    return files
+
+
+def _member(path: Path, name: str, most: int = -1) -> bytes:
+    """The content of a file of a zip, or its first `most` bytes."""
+    with parsed_as(path, "a zip"), zipfile.ZipFile(path) as archive:
+        _check_size(archive.getinfo(name).file_size, path / name)
+        with archive.open(name) as file:  # it gives at most the announced size
+            return file.read(most)
+
+
+def _check_size(size: int, file: Path) -> None:
+    if size > LARGEST:
+        problem = f"unpacks to {size / 2**20:.0f} MiB"
+        raise InputError(file, problem, f"no table may exceed {LARGEST / 2**20:.0f} MiB")
+
+
+def _sheets(path: Path, engine: str) -> list[LogFile]:
+    """The sheets of a workbook as texts."""
+    require_packages(path, "excel", engine)
+    options: dict[str, Any] = {"engine": engine, "header": None}
+    if engine == "xlrd":  # it writes remarks about a damaged file to the standard output
+        options["engine_kwargs"] = {"logfile": io.StringIO()}
+    with parsed_as(path, "a workbook"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # warnings about styles
+        sheets: dict[Any, pd.DataFrame] = pd.read_excel(path, sheet_name=None, **options)
+    texts = {str(n): one.to_csv(index=False, header=False).encode() for n, one in sheets.items()}
+    return [log_file(n, path / n, partial(bytes, text)) for n, text in texts.items() if text]

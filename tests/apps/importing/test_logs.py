@@ -1,0 +1,665 @@
+"""Logs of any board or phone tell of the known walk again, or are refused or warned of in one true
+sentence."""
+
+import gzip
+import re
+import zipfile
+
+import numpy as np
+import openpyxl
+import pytest
+
+from gnio_jax.apps.importing import units
+from gnio_jax.data.labels import resolved
+from gnio_jax.errors import InputError
+from tests.support.csv_writers import AXES, compare_imu
+from tests.support.importing import import_recording, imported, refused
+from tests.support.log_tables import (
+    COUNT,
+    HEADER,
+    ROWS,
+    TIME,
+    WALK,
+    G,
+    by_sensor,
+    clock_text,
+    interleaved,
+    lines,
+    rows,
+    table,
+)
+
+NS = 1_714_720_502_250_000_000 + ROWS * 10**7
+DEGREES = 180 / np.pi
+
+
+def put(folder, content, name="walk.csv", encoding="utf-8"):
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode(encoding))
+    return path
+
+
+def check(path, words="", atol=2e-3, options=None, inner=slice(None)):
+    """The file is the known walk to `atol` (and its values have no more than 3 digits of error
+    elsewhere), from its first sample on, and a note or warning has the `words`."""
+    found = imported(path, **(options or {}))
+    text = " | ".join([*found.notes, *found.warnings])
+    assert re.search(words, text), text
+    compare_imu(
+        found.sequence._replace(
+            time=found.sequence.time[inner],
+            gyro=found.sequence.gyro[inner],
+            accel=found.sequence.accel[inner],
+        ),
+        atol=atol,
+    )
+    return found.sequence
+
+
+# --- preamble, header, units, rows
+
+UNITS = "s,mdps,mdps,mdps,mg,mg,mg"
+XSENS = ("PacketCounter", "SampleTimeFine", *(f"{n}_{a}" for n in ("Gyr", "Acc") for a in "XYZ"))
+SHIMMER = ("Timestamp", *(f"{n} {a}" for n in ("Gyroscope", "Accelerometer") for a in "XYZ"))
+HEADS = {
+    "a line of the device": "gyroscope-imu1,vendor,2024-05-03\n" + table(),
+    "sep=": "sep=;\n" + table(separator=";"),
+    "sep= in quotes": '"sep=\t"\n' + table(separator="\t"),
+    "slashes": "// General information:\n//  Rate: 100.0Hz\n" + table(separator="\t"),
+    "percent, as MATLAB and rostopic": "% logger\n% " + table(),
+    "a count": f"{COUNT}\n" + table(),
+    "a hundred lines": lines(*(f"Device line {n},value {n}" for n in range(100))) + table(),
+    "a row of units": table().replace("\n", f"\n{UNITS}\n", 1).replace(",", ","),
+    "bars": table(separator="|"),
+    "blanks": table(separator=" "),
+    "a comma ends every row": table().replace("\n", ",\n").replace(",\n", "\n", 1),
+    "a comma ends some rows": "\n".join(
+        row + "," * (n % 2) for n, row in enumerate(table().splitlines())
+    ),
+    "blank lines": table().replace("\n", "\n\n"),
+}
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_what_stands_above_the_rows(tmp_path, name):
+    scales = {"gyro": DEGREES * 1e3, "accel": 1e3 / G}
+    text = HEADS[name]
+    if name == "a row of units":
+        text = table(**scales).replace("\n", f"\n{UNITS}\n", 1)
+    check(put(tmp_path, text))
+
+
+def test_several_header_rows_and_units_in_their_last(tmp_path):
+    text = table(TIME * 1e3, SHIMMER, gyro=DEGREES, separator="\t")
+    marks = [["Shimmer_5E77"] * 7, ["CAL"] * 7, ["mSecs", *["deg/s"] * 3, *["m/(s^2)"] * 3]]
+    device, kind, unit = ("\t".join(cells) for cells in marks)
+    header, others = rows(text)
+    check(put(tmp_path, lines('"sep=\t"', device, header, kind, unit, *others)), "deg/s, by its h")
+
+
+def test_the_tick_of_a_clock_known_by_its_name(tmp_path):
+    stamps = [f"{n % 65536}\t{917352 + n * 100}" for n in range(60000, 60000 + COUNT)]
+    check(put(tmp_path, table(stamps, XSENS, separator="\t"), "walk.txt"))
+
+
+def test_gcsv_states_its_scales(tmp_path):
+    head = ("GYROFLOW IMU LOG", "version,1.1", "tscale,0.001", "gscale,0.0001", "ascale,0.00005")
+    text = table(ROWS * 10, ("t", "gx", "gy", "gz", "ax", "ay", "az"), 1e4, 2e4 / G, digits=0)
+    check(put(tmp_path, lines(*head, "orientation,XYZ") + text, "clip.gcsv"), "gcsv with the units")
+
+
+# --- encodings and containers
+
+
+def test_any_encoding_and_decimal_mark(tmp_path):
+    header = ("Zeit (s)", *(f"Gyro {a} (°/s)" for a in "XYZ"), *(f"Acc {a} (m/s²)" for a in "XYZ"))
+    degrees = table(header=header, gyro=DEGREES)
+    quoted = [
+        ",".join(f'"{c.replace(".", ",")}"' for c in row.split(",")) for row in rows(table())[1]
+    ]
+    whole = [row.replace(".", ",") for row in rows(table(separator=";"))[1]]
+    whole[:500] = [re.sub(r",(\d+)", "", row) for row in whole[:500]]  # the first have no fraction
+    for text, encoding in (
+        (degrees.replace("Zeit", "time"), "latin-1"),
+        (table(), "utf-16"),
+        (table(separator="\t"), "utf-16-le"),
+        (lines(",".join(HEADER), *quoted), "utf-8"),
+        (table(separator=";").replace(".", ","), "utf-8"),
+    ):
+        check(put(tmp_path, text, encoding=encoding))
+    path = put(tmp_path, lines(";".join(HEADER), *whole))
+    sequence, _ = import_recording(path)
+    np.testing.assert_allclose(sequence.gyro[501:], WALK[501:, :3], atol=2e-3)
+
+
+def test_one_table_in_any_container_is_that_table(tmp_path):
+    text = table()
+    with zipfile.ZipFile(tmp_path / "walk.zip", "w") as archive:
+        archive.writestr("walk/walk.csv", text)
+        archive.writestr("walk/readme.txt", "A walk.\nOn a Monday\n")
+    put(tmp_path / "folder", text)
+    book = openpyxl.Workbook()
+    sheet = book.active
+    assert sheet is not None
+    for row in [HEADER, *np.column_stack([TIME, WALK]).tolist()]:
+        sheet.append(row)
+    book.save(tmp_path / "walk.xlsx")
+    put(tmp_path, gzip.compress(text.encode()), "walk.csv.gz")
+    for name in ("walk.zip", "folder", "walk.xlsx", "walk.csv.gz"):
+        check(tmp_path / name)
+    for name in ("csv.zip", "csv.gz", "csv.xz"):  # names may be wrong
+        check(put(tmp_path, text, name))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (
+            "version https://git-lfs.github.com/spec/v1\noid sha256:4d\nsize 12\n",
+            "is a pointer of Git LFS",
+        ),
+        ("<!DOCTYPE html>\n<html><body>no entry</body></html>\n", "is a web page"),
+        ('[{"sensor":"Gyroscope","time":"1","x":"0.1"}]', "is JSON; export the recording as CSV"),
+        ('{\n "a": 1}', "is JSON"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 20, "is no text"),
+    ],
+)
+def test_what_is_no_table_is_told_by_its_beginning(tmp_path, content, words):
+    for name in ("walk.csv", "walk.zip", "walk.bag"):
+        refused(put(tmp_path, content, name), f"{re.escape(name)}: {words}")
+
+
+# --- damaged rows
+
+DAMAGE = {
+    "a boot message": lambda r: [*r[:400], "ets Jul 29 2019 12:21:46 rst:0x1", *r[400:]],
+    "a repeated header": lambda r: [*r[:700], ",".join(HEADER), *r[700:]],
+    "a text at the end": lambda r: [*r, "", "stopped after 14 s", f"{COUNT} rows, no error"],
+    "a short row": lambda r: [*r[:300], "3.000,0.1", *r[301:]],
+    "two rows in one": lambda r: [*r[:300], r[300] + r[301], *r[302:]],
+    "an open quote": lambda r: [*r[:300], '"', *r[300:]],
+    "infinity": lambda r: [*r[:300], re.sub(",[^,]*", ",inf", r[300], count=1), *r[301:]],
+    "NaN": lambda r: [*r[:300], re.sub(",[^,]*", ",NaN", r[300], count=1), *r[301:]],
+    "zeros at the end": lambda r: [*r, "\0" * 60],
+    "a cut last row": lambda r: [*r[:-1], r[-1][:-20]],
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_few_damaged_rows_are_left_out_and_named(tmp_path, name):
+    header, others = rows(table())
+    path = put(tmp_path, "\n".join([header, *DAMAGE[name](others)]))
+    assert len(check(path, r"row \d+", atol=2e-2).time) >= COUNT - 3
+
+
+def test_rows_of_other_times_are_left_out(tmp_path):
+    """The first stamp before the clock was set; what was buffered before the start."""
+    first = [0, *(NS // 10**6)[1:].tolist()]
+    found = imported(put(tmp_path, table(first)))
+    np.testing.assert_allclose(found.sequence.gyro, WALK[1:, :3], atol=1e-5)
+    buffered = np.where(ROWS < 5, TIME - 100.0, TIME)
+    path = put(tmp_path, table([f"{stamp + 200:.3f}" for stamp in buffered]))
+    sequence, notes = import_recording(path)
+    np.testing.assert_allclose(sequence.gyro, WALK[5:, :3], atol=1e-5)
+    assert any("5 rows of gyro are left out, whose stamps are far" in note for note in notes)
+
+
+def test_many_damaged_rows_are_refused_by_line_and_cells(tmp_path):
+    header, others = rows(table())
+    words = r"walk\.csv: row 3 is no row of 7 numbers: it has 2 cells .'error,x'., as 139 others"
+    broken = [row for n, r in enumerate(others) for row in ([r] if n % 10 else [r, "error, x"])]
+    refused(put(tmp_path, lines(header, *broken)), words)
+    # Rows with a position between the sensors are of another kind: their cells are others.
+    longer = [row + ",1.0,52.1,4.3" if n in (40, 80) else row for n, row in enumerate(others)]
+    refused(put(tmp_path, lines(header, *longer)), r"row 42 is no row of 7 numbers: it has 10 cel")
+
+
+# --- names
+
+ROS = [f"{n}.{a}" for n in ("angular_velocity", "linear_acceleration") for a in "xyz"]
+NAMES = {
+    "Arduino": ("millis", "gx", "gy", "gz", "ax", "ay", "az"),
+    "ESP32": ("timestamp_ms", *(f"{n}{a}" for n in ("Gyro", "Acc") for a in "XYZ")),
+    "Kaggle": ("Timestamp", *(f"{n}_{a}" for n in ("gyro", "acc") for a in "XYZ")),
+    "wx": ("t", "wx", "wy", "wz", "ax", "ay", "az"),
+    "EuRoC": ("#timestamp", *(f"{n}_RS_S_{a}" for n in "wa" for a in "xyz")),
+    "Core Motion": ("time", *(f"{n}{a}" for n in ("rotationRate", "acceleration") for a in "XYZ")),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_known_names_are_found_and_noted(tmp_path, name):
+    path = put(tmp_path, table(ROWS * 10, NAMES[name]))
+    check(path, "columns taken by their names: ")
+
+
+def test_stamps_of_robots(tmp_path):
+    """Those of the header are taken, in one column or two, and not those of the arrival."""
+    late = NS + 40_000_000 + np.random.default_rng(3).integers(0, 10**6, COUNT)
+    one = ("%time", "field.header.seq", "field.header.stamp", *(f"field.{n}" for n in ROS))
+    stamps = [f"{a},{n},{b}" for n, (a, b) in enumerate(zip(late, NS, strict=True))]
+    check(put(tmp_path, table(stamps, one)), "time=field.header.stamp")
+    two = ("Time", "header.stamp.secs", "header.stamp.nsecs", "header.frame_id", *ROS)
+    stamps = [f"{a / 1e9:.6f},{b // 10**9},{b % 10**9},imu" for a, b in zip(late, NS, strict=True)]
+    sequence = check(put(tmp_path, table(stamps, two)), r"time=header\.stamp\.secs\+header")
+    assert sequence.attributes["start_time"] == pytest.approx(NS[0] / 1e9, abs=1e-6)
+    names = {"time": "header.stamp.secs+header.stamp.nsecs"}
+    compare_imu(import_recording(tmp_path / "walk.csv", names)[0])
+
+
+def test_a_column_that_is_written_twice_is_one(tmp_path):
+    header = (
+        "Unix time[nanosec]",
+        *(
+            f"{n}[{u}]"
+            for n, u in zip(
+                ("gx", "gy", "gz", "ax", "ay", "az"), ["rad/s"] * 3 + ["m/s^2"] * 3, strict=True
+            )
+        ),
+    )
+    text = table(NS, header)
+    double = [f"{row},{row.split(',')[0]}" for row in text.splitlines()]
+    check(put(tmp_path, lines(*double), "gyro_accel.csv"))
+
+
+def test_what_fits_twice_is_not_taken():
+    assert "gyro_x" not in resolved(["time", *(f"imu{n}_gyro_{a}" for n in (0, 1) for a in "xyz")])
+    labels = ["t", "ACCELEROMETER X (m/s²)", "LINEAR ACCELERATION X (m/s²)", "GRAVITY X (m/s²)"]
+    labels += [label.replace(" X ", f" {axis} ") for label in labels[1:] for axis in "YZ"]
+    assert resolved(labels)["accel_x"] == "ACCELEROMETER X (m/s²)"
+    assert "accel_x" not in resolved(["time", *(f"userAcceleration.{axis}" for axis in "xyz")])
+
+
+def test_a_sign_and_a_reference_can_be_named(tmp_path):
+    header = ("time", "up", "left", "ahead", *AXES[3:])
+    values = WALK * [1, -1, 1, 1, 1, 1]
+    path = put(tmp_path, table(header=header, values=values))
+    names = {"gyro_x": "up", "gyro_y": "-left", "gyro_z": "ahead"}
+    compare_imu(import_recording(path, names)[0])
+    poses = [f"{row},{n / 100},0,0,1,0,0,0" for n, row in enumerate(rows(table())[1])]
+    header = (*HEADER, "pos_x", "pos_y", "pos_z", "ori_w", "ori_x", "ori_y", "ori_z")
+    path = put(tmp_path, lines(",".join(header), *poses))
+    names = dict(zip(("px", "py", "pz", "qw", "qx", "qy", "qz"), header[7:], strict=True))
+    _, notes = import_recording(path, names)
+    assert any("the reference given does not fit the IMU" in note for note in notes)
+
+
+def test_a_folder_or_one_of_its_files_is_the_recording(tmp_path):
+    """RoNIN's recorder, OpenCamera, EuRoC's layout."""
+    ronin = tmp_path / "ronin"
+    for name, axes in (("gyro", slice(0, 3)), ("acce", slice(3, 6)), ("magnet", slice(0, 3))):
+        text = [
+            f"{stamp} " + " ".join(f"{v:.6f}" for v in row)
+            for stamp, row in zip(NS, WALK[:, axes], strict=True)
+        ]
+        put(ronin, lines("# Created at Wed Dec 27", *text), f"{name}.txt")
+        camera = [
+            f"{row[0]:.6f},{row[1]:.6f},{row[2]:.6f},{stamp}"
+            for stamp, row in zip(NS, WALK[:, axes], strict=True)
+        ]
+        put(
+            tmp_path / "camera",
+            lines("X-data,Y-data,Z-data,timestamp (ns)", *camera),
+            f"v_{name}.csv",
+        )
+    names = [f"w_RS_S_{a} [rad s^-1]" for a in "xyz"] + [f"a_RS_S_{a} [m s^-2]" for a in "xyz"]
+    put(tmp_path / "mav0" / "imu0", table(NS, ("#timestamp [ns]", *names)), "data.csv")
+    for path in (
+        ronin,
+        ronin / "gyro.txt",
+        tmp_path / "camera",
+        tmp_path / "camera" / "v_acce.csv",
+    ):
+        check(path)
+    check(tmp_path / "mav0" / "imu0" / "data.csv", "EuRoC's layout")
+
+
+def test_rows_without_stamps_need_a_rate(tmp_path):
+    bare = lines(*(row.partition(",")[2] for row in table().splitlines()))
+    path = put(tmp_path, bare)
+    refused(path, "if it has no column of time, give --sample-rate HZ; name them: --columns time=")
+    check(path, options={"sample_rate": 100.0})
+    refused(path, "sample_rate: 0 Hz is out of range", sample_rate=0.0)
+    path = put(tmp_path, bare.partition("\n")[2])
+    refused(path, "has 6 columns of numbers and no header; .*accel_z=5 --sample-rate HZ$")
+
+
+# --- clocks
+
+SHARED = "rounded to|share the stamp"
+
+
+def test_bursts_and_shared_stamps_are_spread_evenly(tmp_path):
+    jitter = np.random.default_rng(5).integers(0, 4, COUNT // 5)[ROWS // 5]
+    for stamps, words, atol in (
+        (ROWS // 4 * 40 + ROWS % 4, "share the stamp of a burst", 1e-3),
+        (ROWS // 25 * 250 + ROWS % 25, "share the stamp of a burst", 1e-3),
+        (ROWS // 2 * 20, SHARED, 1e-2),
+        (ROWS // 7 * 70, SHARED, 1e-1),
+        (np.where(ROWS % 4, "", ROWS * 10), "without a stamp share the last one", 1e-1),
+        (ROWS // 5 * 50 + jitter + ROWS % 5, "share the stamp of a burst", 2.0),
+        (clock_text(ROWS * 10, "{h:02d}:{m:02d}:{s:02d}"), SHARED, 1e-1),
+    ):
+        path = put(tmp_path, table(stamps))
+        sequence = check(path, words, atol=atol)
+        assert np.median(np.diff(sequence.time)) == pytest.approx(0.01, rel=2e-3)
+        assert sequence.time[-1] == pytest.approx(TIME[-1], abs=0.03)
+
+
+def test_a_delay_of_every_second_row_is_no_rate(tmp_path):
+    """1 and 19 ms in turn: 100 samples a second."""
+    sequence, _ = import_recording(
+        put(tmp_path, table(np.where(ROWS % 2, ROWS * 10 + 9, ROWS * 10)))
+    )
+    np.testing.assert_allclose(np.diff(sequence.time), 0.01, atol=1e-9)
+    np.testing.assert_allclose(sequence.gyro[2:-2], WALK[1:-3, :3], atol=0.2)
+
+
+def test_rounded_stamps_do_not_change_the_rate(tmp_path):
+    """400 Hz in whole ms, 208 Hz in hundredths of a second."""
+    for rate, unit in ((400, 1000), (208, 100)):
+        stamps = np.floor(ROWS / rate * unit).astype(int) * (1000 // unit)
+        sequence, notes = import_recording(put(tmp_path, table(stamps)))
+        assert 1 / np.diff(sequence.time)[0] == pytest.approx(rate, rel=1e-3)
+        assert any("are rounded to" in note for note in notes)
+
+
+def test_lost_samples_are_told(tmp_path):
+    header, others = rows(table())
+    lasting = np.random.default_rng(1).random(COUNT) < 0.75
+    path = put(
+        tmp_path, lines(header, *(r for r, here in zip(others, lasting, strict=True) if here))
+    )
+    sequence = check(path, r"7\d\.\d+ samples a second, but its usual step is that of 100 Hz", 0.2)
+    assert sequence.time[-1] == pytest.approx(TIME[-1], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "period"),
+    [
+        ((2**32 - 4_000_000 + ROWS * 10_000) % 2**32, "us"),
+        ((64_000 + ROWS * 10) % 2**16, "ms"),
+        ((2**24 - 10**6 + ROWS * 10_000) % 2**24, "us"),
+        ((ROWS * 10_000) % 2**16, "us"),
+        (((2**31 - 4_000_000 + ROWS * 10_000) + 2**31) % 2**32 - 2**31, "us"),
+        (np.round((4294.967296 - 5 + TIME) % 4294.967296, 6), "s"),
+    ],
+)
+def test_a_clock_that_wraps_goes_on(tmp_path, stamps, period):
+    path = put(tmp_path, table(stamps))
+    check(path, rf"the clock of gyro wrapped \d+ times.*time of gyro taken as {period}\b")
+
+
+def test_a_clock_that_starts_again_is_never_mixed_in(tmp_path):
+    def again(first):
+        return put(
+            tmp_path, table([f"{t:.3f}" for t in np.where(ROWS < first, TIME, TIME - first / 100)])
+        )
+
+    for first in (COUNT - 4, COUNT - 100):
+        found = imported(again(first))
+        np.testing.assert_allclose(found.sequence.gyro, WALK[:first, :3], atol=1e-5)
+        lost = COUNT - first
+        target = found.notes if lost < 15 else found.warnings
+        assert any(
+            f"starts again or was set back near row {first + 2}: {lost} rows" in t for t in target
+        )
+    refused(again(700), "starts again .* 700 rows overlap others; cut the recording there")
+    back = put(tmp_path, table([f"{t:.3f}" for t in np.where(ROWS < 900, TIME, TIME - 3.0)]))
+    refused(back, "starts again or was set back near row 902")
+
+
+@pytest.mark.parametrize(
+    ("stamps", "words"),
+    [
+        (5000 + ROWS, "counts samples: its steps are 1; give --sample-rate"),
+        (ROWS % 256, "counts samples"),
+        (ROWS // 4, "counts samples"),
+        (917352 + ROWS * 100, "samples come 10 times faster .* give --time-unit"),
+        (133 * 10**15 + ROWS * 10**5, "samples come 10 times faster"),
+        ([f"{t / 60:.8f}" for t in TIME], "unit of field 'time' is ambiguous .* --time-unit"),
+        ([f"{739375.4 + t / 86400:.10f}" for t in TIME], "unit of field 'time' is ambiguous"),
+        (["1.71472E+18"] * COUNT, "same stamp 1.71472e.18; a spreadsheet may have cut its digits"),
+    ],
+)
+def test_what_is_no_stamp_is_asked_for(tmp_path, stamps, words):
+    refused(put(tmp_path, table(stamps)), words)
+
+
+def test_a_clock_may_have_any_unit_that_is_stated(tmp_path):
+    for stamps, unit in (
+        (917352 + ROWS * 100, "1e-4"),
+        (133 * 10**15 + ROWS * 10**5, "1e-7"),
+        (5000 + ROWS, "0.01"),
+        (ROWS, "1/100"),
+        ([f"{t / 60:.9f}" for t in TIME], "60"),
+    ):
+        check(put(tmp_path, table(stamps)), options={"time_unit": unit})
+    refused(tmp_path / "walk.csv", "time_unit: unknown value 'h'; known: s, ms", time_unit="h")
+
+
+def test_a_rate_at_the_edge_is_believed_if_gravity_turns_as_the_gyro_says(tmp_path):
+    """10 Hz, by a phone; 1000 Hz, of a table that lies still."""
+    time = np.arange(600) / 10
+    slow = np.stack([np.zeros(600), 0.3 * np.cos(0.5 * time), np.zeros(600)], axis=1)
+    angle = 0.6 * np.sin(0.5 * time)
+    force = 9.81 * np.stack([-np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+    noise = np.random.default_rng(0).normal(0, 0.01, (600, 6))
+    values = np.hstack([slow, force]) + noise
+    path = put(tmp_path, table(np.arange(600) * 100, values=values))
+    sequence, _ = import_recording(path)
+    assert sequence.time[-1] == pytest.approx(59.9)
+    still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (600, 1)) + noise
+    path = put(tmp_path, table([f"{t:.4f}" for t in np.arange(600) / 10], values=still))
+    refused(path, "makes it run at 10 Hz, which may be wrong", gyro_unit="rad/s")
+    import_recording(path, gyro_unit="rad/s", time_unit="s")
+
+
+@pytest.mark.parametrize(
+    ("pattern", "start"),
+    [
+        ("{h:02d}:{m:02d}:{s:02d}:{ms:03d}", 33_302_250),
+        ("{h}:{m:02d}:{s:02d},{ms:03d}", 33_302_250),
+        ("{minutes}:{s:02d}.{ms:03d}", 902_250),
+        ("{h:02d}:{m:02d}:{s:02d}.{ms:03d}", 86_400_000 - 5_000),
+        ("2024-05-03 {h:02d}:{m:02d}:{s:02d}.{ms:03d}000", 33_302_250),
+        ("2024-05-03T{h:02d}:{m:02d}:{s:02d}.{ms:03d}Z", 33_302_250),
+        ("2024-05-03T{h:02d}:{m:02d}:{s:02d}.{ms:03d}+02:00", 33_302_250),
+        ("3.5.2024 {h:02d}:{m:02d}:{s:02d}.{ms:03d}", 33_302_250),
+        ("5/3/2024 {h:02d}:{m:02d}:{s:02d}.{ms:03d} AM", 33_302_250),
+    ],
+)
+def test_times_of_day_are_stamps(tmp_path, pattern, start):
+    texts = clock_text(start + ROWS * 10, pattern)
+    mark = ";" if "," in pattern else ","
+    check(put(tmp_path, table(texts, separator=mark)))
+
+
+def test_a_date_and_a_time_are_one_stamp(tmp_path):
+    texts = clock_text(86_400_000 - 5_000 + ROWS * 10, "{h:02d}:{m:02d}:{s:02d}.{ms:03d}")
+    dates = np.where(ROWS < 500, "2024-05-03", "2024-05-04")
+    stamps = [f"{date},{text}" for date, text in zip(dates, texts, strict=True)]
+    path = put(tmp_path, table(stamps, ("date", *HEADER)))
+    check(path)
+    sequence, _ = import_recording(path, {"time": "date+time"})
+    compare_imu(sequence)
+    assert sequence.attributes["start_time"] == pytest.approx(1_714_780_795.0)
+
+
+# --- units
+
+
+def test_units_of_a_header_and_counts(tmp_path):
+    names = [f"g_{a} [mdps]" for a in "xyz"] + [f"a_{a} [cm/s^2]" for a in "xyz"]
+    check(put(tmp_path, table(header=("time [s]", *names), gyro=DEGREES * 1e3, accel=100.0)))
+    names = [f"g_{a} (deg/s)" for a in "xyz"] + [f"a_{a} (LSB)" for a in "xyz"]
+    path = put(tmp_path, table(header=("time", *names), gyro=DEGREES, accel=16384 / G))
+    refused(path, "column 'a_x .LSB.' is in 'LSB', .* raw counts: --accel-unit 16384/g")
+    check(path, options={"accel_unit": "16384/g"})
+    path = put(tmp_path, table(gyro=DEGREES * 131, accel=16384 / G, digits=0))
+    refused(path, "raw counts. 16384 per g is the scale of ±2 g: --accel-unit 16384/g$")
+    both = {"accel_unit": "16384/g", "gyro_unit": "131/deg/s"}
+    check(path, options=both, atol=5e-3)
+    check(path, options=both | {"accel_unit": "0.06103515625*mg"}, atol=5e-3)
+    path = put(tmp_path, table(gyro=DEGREES * 1e3))
+    refused(path, "beyond any gyro's range in rad/s and deg/s; state its unit: mdps, or raw counts")
+    path = put(tmp_path, table(accel=100.0))
+    (warning,) = imported(path).warnings
+    assert "gravity in mg (1000) as well as in cm/s² (981), which is ambiguous" in warning
+    check(path, options={"accel_unit": "cm/s2"})
+    for option, value in (("gyro_unit", "rpm"), ("accel_unit", "0/g"), ("accel_unit", "x/g")):
+        refused(path, f"{option}: unknown value '{value}'; known: ", **{option: value})
+
+
+def test_a_scale_is_a_unit_counts_in_it_or_the_size_of_one():
+    for text, value in (
+        ("rad/s", 1.0),
+        ("131/deg/s", np.pi / 180 / 131),
+        ("0.07*deg/s", 0.07 * np.pi / 180),
+    ):
+        assert units.scale_of(text, "gyro") == pytest.approx(value)
+    for text in ("", "deg", "131", "-1/deg/s", "1e400*deg/s", "nan*deg/s"):
+        with pytest.raises(InputError, match="gyro_unit: unknown value"):
+            units.scale_of(text, "gyro")
+
+
+# --- rows of several sensors
+
+
+def test_rows_that_name_their_sensor(tmp_path):
+    """GetSensorData, GnssLogger, and a column of names behind the stamp."""
+    stamps = [(f"{t + 0.001:.3f}", f"{3600 + t:.3f}") for t in TIME]
+    header = "% ACCE;AppTimestamp(s);SensorTimestamp(s);Acc_X(m/s^2);Acc_Y(m/s^2);Acc_Z(m/s^2)"
+    accel, gyro = WALK[:, 3:], WALK[:, :3]
+    both = interleaved(by_sensor("ACCE", stamps, accel, ";"), by_sensor("GYRO", stamps, gyro, ";"))
+    both[100:100] = ["WIFI;0.500;1.0;SSID;aa:bb;-70;2412;3"]
+    check(put(tmp_path, lines("% LogFile", header, *both), "ipin.txt"))
+    stamps = [(str(n // 10**6), str(n)) for n in NS]
+    header = [
+        f"# Uncal{n},utcTimeMillis,elapsedRealtimeNanos,Uncal{n}X{u},Uncal{n}Y{u},Uncal{n}Z{u}"
+        for n, u in (("Accel", "Mps2"), ("Gyro", "RadPerSec"))
+    ]
+    both = interleaved(by_sensor("UncalAccel", stamps, accel), by_sensor("UncalGyro", stamps, gyro))
+    check(
+        put(tmp_path, lines("# Version: v3", "# Raw,a,b", *header, *both), "gnss.txt"), "elapsedR"
+    )
+    stamps = [(f"{t:.3f}",) for t in TIME]
+    both = interleaved(
+        by_sensor("accelerometer", stamps, accel), by_sensor("gyroscope", stamps, gyro)
+    )
+    swapped = [",".join([c[1], c[0], *c[2:]]) for c in (row.split(",") for row in both)]
+    check(put(tmp_path, lines("time,sensor,x,y,z", *swapped)))
+
+
+def test_rows_of_two_imus_are_chosen_by_a_column(tmp_path):
+    header, others = rows(table([f"{n * 10000},0" for n in ROWS], ("TimeUS", "I", *AXES)))
+    second = rows(table([f"{n * 10000},1" for n in ROWS], values=WALK + 0.1))[1]
+    path = put(tmp_path, lines(header, *interleaved(others, second)))
+    refused(path, "rows of several sensors: column 'I' holds 0, 1 in turn; choose one: --where I=0")
+    check(path, options={"where": "I=0"})
+    refused(path, "has no row with I=7; there are: 0, 1", where="I=7")
+    refused(path, "has no row with J=0; there are: TimeUS, I, gyro_x", where="J=0")
+
+
+# --- sensors that contradict each other
+
+
+@pytest.mark.parametrize(
+    ("turn", "words"),
+    [
+        ([0, 1, 2, 3, 4, 5], ""),
+        (["-", 0, 1, 2, 3, 4, 5], "gravity turns against the gyro: its sign is wrong, or the axes"),
+        (
+            [1, 0, 2, 4, 3, 5],
+            "gravity turns against the gyro: its sign is wrong, or the axes are l",
+        ),
+        (
+            [0, 1, 2, 4, 3, 5],
+            r"gravity does not turn as the gyro says.* \(-y, -x, -z\) of the gyro",
+        ),
+        ([1, 2, 0, 3, 4, 5], r"the sensors contradict each other.* \(z, x, y\) of the gyro"),
+    ],
+)
+def test_gravity_tells_signs_and_axes(tmp_path, turn, words):
+    sign = [-1 if turn[0] == "-" else 1] * 3 + [1] * 3
+    order = [place for place in turn if place != "-"]
+    path = put(tmp_path, table(values=(WALK * sign)[:, order]))
+    if words:
+        refused(path, words)
+        refused(path, words, gyro_unit="rad/s")  # stated or not
+    else:
+        check(path)
+
+
+def test_the_remedy_for_wrong_axes_works(tmp_path):
+    """The message gives the words that repair it."""
+    path = put(tmp_path, table(values=WALK[:, [1, 0, 2, 3, 4, 5]] * [1, -1, 1, 1, 1, 1]))
+    with pytest.raises(InputError, match="--columns gyro_x=") as caught:
+        import_recording(path)
+    words = re.findall(r"(gyro_[xyz])=(-?gyro_[xyz])", str(caught.value))
+    compare_imu(import_recording(path, dict(words))[0])
+
+
+def test_dead_sensors_are_refused(tmp_path):
+    for values, words in (
+        (
+            WALK * [0, 0, 0, 1, 1, 1],
+            r"field 'gyro' reads \(0, 0, 0\) throughout; the sensor was off",
+        ),
+        (
+            WALK * [1, 1, 1, 0, 0, 0] + [0, 0, 0, 0, 0, 9.8],
+            "field 'accel' reads .0, 0, 9.8. throughou",
+        ),
+    ):
+        refused(put(tmp_path, table(values=values)), words)
+    found = imported(put(tmp_path, table(values=WALK * [1, 0, 1, 1, 1, 1])))
+    assert any("gyro_y reads 0 throughout: this axis is dead" in w for w in found.warnings)
+
+
+def test_rows_that_a_hung_sensor_repeats_are_missing_samples(tmp_path):
+    noisy = WALK + np.random.default_rng(2).normal(0, 0.01, WALK.shape)
+
+    def stuck(first, last, axes=slice(0, 6)):
+        values = noisy.copy()
+        values[first:last, axes] = noisy[first, axes]
+        return put(tmp_path, table(values=values))
+
+    found = imported(stuck(1200, COUNT))
+    assert found.sequence.time[-1] == pytest.approx(12.0)
+    assert any("gyro repeats the same values in 199 of 1400 rows" in w for w in found.warnings)
+    for axes in (slice(0, 6), slice(3, 6)):
+        found = imported(stuck(600, 660, axes))
+        valid = found.sequence.imu_valid
+        assert valid is not None and not valid[610:650].any() and valid[:600].all()
+        assert any("accel repeats the same values in 59 of 1400" in w for w in found.warnings)
+    refused(stuck(400, 700), "repeats the same values for 3.00 s after 4.00 s: it was stuck; cut")
+
+
+def test_a_gyro_may_read_zero_at_rest(tmp_path):
+    """Some suppress small rates."""
+    noise = np.random.default_rng(2).normal(0, 0.02, WALK.shape)
+    values = WALK + noise
+    values[:300] = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (300, 1)) + noise[:300] * [
+        0,
+        0,
+        0,
+        1,
+        1,
+        1,
+    ]
+    found = imported(put(tmp_path, table(values=values)), gyro_unit="rad/s")
+    assert found.sequence.imu_valid is None and not any("repeats" in w for w in found.warnings)
+
+
+def test_a_sensor_slower_than_its_rows_runs_at_its_own_rate(tmp_path):
+    slow = WALK[ROWS // 5 * 5]
+    sequence, notes = import_recording(put(tmp_path, table(values=slow)), gyro_unit="rad/s")
+    assert np.median(np.diff(sequence.time)) == pytest.approx(0.05)
+    assert any("they are no samples, and it runs at 20 Hz" in note for note in notes)
+    half = np.hstack([WALK[:, :3], WALK[ROWS // 2 * 2, 3:]])
+    sequence, notes = import_recording(put(tmp_path, table(values=half)))
+    np.testing.assert_allclose(
+        sequence.accel[20:-20], WALK[20:-20, 3:][: len(sequence.time) - 40], atol=0.05
+    )
+    assert any("accel repeats the same values" in n and "50 Hz" in n for n in notes)

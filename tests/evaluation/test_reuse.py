@@ -1,0 +1,115 @@
+"""Existing evaluations are used if they are the requested ones."""
+
+import dataclasses
+
+import pytest
+
+from gnio_jax import config as configuration
+from gnio_jax.config import EvaluateConfig
+from gnio_jax.evaluation import report, reuse
+from gnio_jax.evaluation.folder import read
+from gnio_jax.reporting import Lines
+from gnio_jax.training import checkpoint
+from gnio_jax.training.checkpoint import Run
+from tests.support.filter_settings import changed
+from tests.support.reports import BASE, report_of, write_report, write_run
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run that has learnt from the recordings of a folder."""
+    (tmp_path / "data").mkdir()
+    config = dataclasses.replace(BASE, data_root=str(tmp_path / "data"))
+    write_run(tmp_path / "run")
+    configuration.save(tmp_path / "run" / "config.yaml", config)
+    return tmp_path / "run"
+
+
+def evaluation(run, **settings):
+    """Write an evaluation of the run; without other settings it is the requested one."""
+    all_settings = {
+        "dataset": "tlio",
+        "data_root": str(run.parent / "data"),
+        "step": 7,
+        "filter": configuration.to_plain(BASE.filter),
+        **settings,
+    }
+    folder = run / "eval" / f"tlio_test_{settings.get('estimator', 'ekf')}"
+    return write_report(folder, report_of({"a": 1.0}, {"a": "x"}, **all_settings))
+
+
+def find(run, **options):
+    return reuse.find_existing(EvaluateConfig(str(run), plots=False, **options))
+
+
+def test_existing_figures_are_used(run, monkeypatch):
+    folder = evaluation(run)
+    request = find(run)
+    assert (request.folder, request.problem) == (folder, "")
+    monkeypatch.setattr(reuse, "evaluate", None)
+    assert reuse.load_or_evaluate(request, Lines()) == read(folder)
+
+
+@pytest.mark.parametrize(
+    "settings, problem",
+    [
+        ({"definitions": report.DEFINITIONS - 1}, "another version"),
+        ({"step": 6}, "of a checkpoint that the run has no more"),
+        ({"filter": {**configuration.to_plain(BASE.filter), "gravity": 9.0}}, "of another filter"),
+        ({"alignment": "se3"}, "of alignment se3"),
+    ],
+)
+def test_figures_with_another_meaning_are_made_again(run, monkeypatch, settings, problem):
+    folder = evaluation(run, **settings)
+    lines, requests = [], []
+
+    def evaluate(config, progress, workers, **_):
+        requests.append(config)
+        evaluation(run)
+
+    monkeypatch.setattr(reuse, "evaluate", evaluate)
+    monkeypatch.setattr(Lines, "line", lambda self, text: lines.append(text))
+    request = find(run)
+    assert problem in request.problem and request.report is None
+    assert reuse.load_or_evaluate(request, Lines()) == read(folder) and len(requests) == 1
+    assert requests[0].filter == BASE.filter and problem in lines[0]
+    assert find(run).problem == ""
+    (folder / "metrics.json").write_text("{}")
+    assert "is not a metrics.json" in find(run).problem
+
+
+def test_figures_of_another_folder_are_never_used(run, tmp_path):
+    """A run that was evaluated on A has no figures on B, whatever the names of the recordings. The
+    figures of `integrate` have no filter, so its options do not matter."""
+    evaluation(run)
+    (tmp_path / "other").mkdir()
+    request = find(run, data_root=str(tmp_path / "other"))
+    assert request.report is None and request.config.data_root == str(tmp_path / "other")
+    assert request.folder.name.startswith("tlio_test_ekf_other-")  # the figures of A stay
+    (tmp_path / "link").symlink_to(tmp_path / "data")
+    assert find(run, data_root=str(tmp_path / "link")).problem == ""
+    evaluation(run, estimator="integrate", filter={"gravity": 9.0})
+    assert find(run, estimator="integrate").problem == ""
+
+
+def test_a_run_with_a_trained_filter_is_loaded_once(run, monkeypatch):
+    config = configuration.load(run / "config.yaml")
+    through = dataclasses.replace(config.through_filter, learn=("noise",))
+    configuration.save(
+        run / "config.yaml", dataclasses.replace(config, through_filter=through, init_from="walks")
+    )
+    trained = Run(
+        dataclasses.replace(config, filter=changed(noise={"gyro_density": 0.5})), *[None] * 4
+    )
+    restored, calls = [], []
+    monkeypatch.setattr(checkpoint, "load_run", lambda *asked: restored.append(asked) or trained)
+
+    def evaluate(config, progress, workers, run):
+        calls.append((config.filter, run))
+        evaluation(folder, filter=configuration.to_plain(trained.config.filter))
+
+    folder = run
+    monkeypatch.setattr(reuse, "evaluate", evaluate)
+    reuse.load_or_evaluate(find(run), Lines())
+    assert calls == [(trained.config.filter, trained)] and restored == [(run, "best")]
+    assert find(run).run is None  # the figures exist
