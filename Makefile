@@ -46,8 +46,8 @@ MAKEFLAGS += --no-builtin-rules
 demo: $(VENV)/.package
 	rm -rf $(DEMO)
 	$(BIN)/gnio train --config quickstart --workdir $(DEMO)
-	$(BIN)/gnio evaluate --workdir $(DEMO) --estimator imu_only
-	$(BIN)/gnio evaluate --workdir $(DEMO)
+	$(BIN)/gnio evaluate --network $(DEMO) --estimator imu_only
+	$(BIN)/gnio evaluate --network $(DEMO)
 
 # A network of a quarter of the width learns from poses between the waypoints, and makes truer ones
 # for the network of half the width.
@@ -55,10 +55,10 @@ pedestrian: $(VENV)/.package
 	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_calibrated
 	rm -rf $(RUNS)/pedestrian_first $(RUNS)/pedestrian_first_calibrated
 	$(BIN)/gnio train --config pedestrian --model.width 16 --workdir $(RUNS)/pedestrian_first
-	$(BIN)/gnio calibrate --workdir $(RUNS)/pedestrian_first
+	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian_first
 	$(BIN)/gnio train --config pedestrian --workdir $(RUNS)/pedestrian \
 		--set data.poses_by=$(RUNS)/pedestrian_first_calibrated
-	$(BIN)/gnio calibrate --workdir $(RUNS)/pedestrian --average-headings
+	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian --average-headings
 
 test: $(VENV)/.with-$(EXTRAS)
 	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) $(SHARED_OUT) -m 'not slow' $(PYTEST_ARGS)

@@ -22,8 +22,7 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
-from gnio_jax import filtering  # noqa: E402
-from gnio_jax.apps import packages  # noqa: E402
+from gnio_jax import filtering, networks  # noqa: E402
 from gnio_jax.apps.onnx import driver, export_run  # noqa: E402
 from gnio_jax.apps.onnx.programs import start_arrays  # noqa: E402
 from gnio_jax.apps.onnx.run import draw_walk  # noqa: E402
@@ -38,7 +37,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="length of the walk")
     parser.add_argument("--threads", type=int, default=1, help="of ONNX Runtime")
     arguments = parser.parse_args()
-    run = packages.load_pretrained(arguments.run)
+    run = networks.load(arguments.run)
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {run.config.model}")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "models"

@@ -24,7 +24,7 @@ from gnio_jax.errors import InputError
 class Replay:
     csv: str
     """The recording: a CSV, or the package's HDF5 (.h5)."""
-    weights: str | None = None
+    network: str | None = None
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
     run below runs/."""
     out: str | None = None
@@ -187,17 +187,17 @@ def follow(request: Replay, _call: options.Call) -> None:
 
     examples:
       python examples/replay_csv.py --csv examples/walk.csv
-      python examples/replay_csv.py --weights runs/mine --csv walk.csv --out walk.txt
-      python examples/replay_csv.py --weights runs/mine --csv walk.h5 --realtime
+      python examples/replay_csv.py --network runs/mine --csv walk.csv --out walk.txt
+      python examples/replay_csv.py --network runs/mine --csv walk.h5 --realtime
     """
     # The filter needs float64. The network states its float32 everywhere.
     jax.config.update("jax_enable_x64", True)
     path = Path(request.csv)
     recorded = read(path)
 
-    from gnio_jax.apps import packages
+    from gnio_jax import networks
 
-    run = packages.load_pretrained(request.weights)
+    run = networks.load(request.network)
     if len(recorded.time) < 2:
         raise InputError(path, "holds a single sample", "record a walk of some seconds")
     with console.terminal() as terminal:

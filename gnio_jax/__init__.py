@@ -21,7 +21,9 @@ __all__ = [
     "interop",
     "load_pretrained",
     "models",
+    "networks",
     "tables",
+    "track",
     "training",
 ]
 
@@ -30,7 +32,9 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.metadata.version("gnio-jax")
     if name == "load_pretrained":
-        return importlib.import_module("gnio_jax.apps.packages").load_pretrained
+        return importlib.import_module("gnio_jax.networks").load
+    if name == "track":
+        return importlib.import_module("gnio_jax.apps.arrays").track
     if name in __all__:
         return importlib.import_module(f"gnio_jax.{name}")
     raise AttributeError(f"module 'gnio_jax' has no attribute '{name}'")

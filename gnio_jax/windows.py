@@ -72,11 +72,14 @@ def align_recording(
 ) -> AlignedRecording:
     """The computation that all windows of a recording have in common, in float64.
 
-    accel m/s² and gyro rad/s, biases subtracted, in the body frame; attitude body → world; start
-    the samples whose yaw the windows remove: their first ones after the context. With
-    `window_rotation="per_sample"` every sample is rotated to the world by its own attitude, and a
-    window needs only its start's yaw removed. With `"single"` the samples stay in the body, and a
-    window is rotated by its start's attitude without yaw.
+    Args:
+        accel: (t, 3) specific force without its bias, body frame, m/s².
+        gyro: (t, 3) angular rate without its bias, body frame, rad/s.
+        attitude: (t, 3, 3) body → world.
+        start: (m,) samples whose yaw the windows remove: their first ones after the context.
+        window_rotation: With "per_sample" every sample is rotated to the world by its own attitude,
+            and a window needs only its start's yaw removed. With "single" the samples stay in the
+            body, and a window is rotated by its start's attitude without yaw.
     """
     signals = np.stack([accel, gyro], axis=2)
     rotation = remove_yaw(attitude[start])
@@ -166,12 +169,25 @@ def cut_window(
     dt: float,
     context: int = 0,
 ) -> Float[jax.Array, "n 6"]:
-    """The window of n raw samples, `dt` seconds apart, whose first after `context` samples has the
-    attitude `rotation`.
+    """A window of n raw samples in the gravity-aligned frame of its start. Jittable and
+    differentiable.
 
-    gyro rad/s and accel m/s² in the body frame. Attitudes are propagated by R_{j+1} = R_j exp(φ_j),
-    where φ is the bias-corrected rate times dt, as `cut` specifies: forwards from there, and
-    backwards through the context. Jittable and differentiable.
+    Attitudes are propagated by R_{j+1} = R_j exp(φ_j), where φ is the bias-corrected rate times dt,
+    as `cut` specifies: forwards from the first sample after the context, and backwards through the
+    context.
+
+    Args:
+        rotation: (3, 3) body → world, attitude of the first sample after the context.
+        gyro: (n, 3) body frame, rad/s.
+        accel: (n, 3) body frame, m/s².
+        gyro_bias: (3,) body frame, rad/s.
+        accel_bias: (3,) body frame, m/s².
+        cut: How the window is cut (`WINDOW_CUTS`).
+        dt: Time between samples, s.
+        context: Number of samples before the window's start.
+
+    Returns:
+        (n, 6): [accel m/s², gyro rad/s].
     """
     rates = gyro - gyro_bias[None]
     if cut.subtract_biases:

@@ -16,14 +16,15 @@ ROOMS = {
     "data": BASE,
     "models": BASE,
     "filtering": BASE,
-    "training": BASE | {"data", "models", "filtering"},
-    "evaluation": BASE | {"data", "models", "filtering", "training"},
-    "calibration": BASE | {"data", "models", "filtering", "training", "evaluation"},
-    "interop": BASE | {"models", "training"},
-    "tables": BASE | {"data", "models", "training", "evaluation", "calibration"},
-    "apps": BASE | {"data", "models", "filtering", "training", "evaluation", "calibration"},
+    "networks": BASE | {"models"},
+    "training": BASE | {"data", "models", "filtering", "networks"},
+    "evaluation": BASE | {"data", "models", "filtering", "networks", "training"},
+    "calibration": BASE | {"data", "models", "filtering", "networks", "training", "evaluation"},
+    "interop": BASE | {"models", "networks"},
+    "tables": BASE | {"data", "models", "networks", "training", "evaluation", "calibration"},
+    "apps": BASE | {"data", "models", "filtering", "networks", "evaluation"},
     "commands": BASE
-    | {"data", "filtering", "training", "evaluation", "calibration", "interop"}
+    | {"data", "filtering", "networks", "training", "evaluation", "calibration", "interop"}
     | {"tables", "apps"},
     **{name: BASE for name in BASE},
 }
@@ -32,7 +33,7 @@ ROOMS = {
 ONNX = {"apps.onnx.conversion", "apps.onnx.driver"}
 LIBRARIES = {
     "bokeh": {"evaluation.page"},
-    "flax": {"models", "training", "evaluation", "interop"},
+    "flax": {"models", "networks", "training", "evaluation"},
     "jax2onnx": {"apps.onnx.conversion"},
     "loky": {"data.workers"},
     "mcap": {"apps.importing.ros", "apps.export"},
@@ -45,7 +46,7 @@ LIBRARIES = {
     "rosbags": {"apps.importing.ros", "apps.export"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
-    "safetensors": {"apps.packages"},
+    "safetensors": {"networks.folder"},
     "tensorboardX": {"training.run_folder"},
 }
 """Libraries that only these rooms or modules import."""

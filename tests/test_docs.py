@@ -1,7 +1,9 @@
 """What the pages say runs: their Python, and their command lines as far as the parser."""
 
 import ast
+import dataclasses
 import importlib
+import inspect
 import re
 
 import jax
@@ -10,8 +12,8 @@ import pytest
 
 import gnio_jax
 from gnio_jax import config as configuration
-from gnio_jax import data, models
-from gnio_jax.apps import packages
+from gnio_jax import data, models, networks
+from gnio_jax.apps.publish import publish
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import measurements
@@ -27,8 +29,10 @@ SMALLER = {
         "6001": "221",
         "300": "11",
         "range(15)": "range(2)",
+        "skiprows=1": "skiprows=1, max_rows=300",
     },
     "docs/differentiable_filter.md": {"20 * 100": "20 * 25", "range(20)": "range(5)"},
+    "docs/many_sequences.md": {"2000": "400", "np.arange(4)": "np.arange(2)", ", 100)": ", 6)"},
     "docs/notebooks/learn_noise.py": {"SECONDS = 30": "SECONDS = 2", "STEPS = 150": "STEPS = 2"},
 }
 """Fewer samples and steps than on the page: page -> what stands there -> what runs."""
@@ -70,11 +74,17 @@ def code_of(page):
 
 
 @pytest.mark.slow
-def test_the_example_of_the_readme(one_walk, capsys, monkeypatch):
+def test_the_examples_of_the_readme(one_walk, tmp_path, capsys, monkeypatch):
     """With weights that NumPy has drawn: those of each shape would be a program."""
     monkeypatch.setattr(models, "initialise", lambda model, _: drawn(models.variable_shapes(model)))
-    run("README.md", code_of("README.md"))
-    shape, *steps = capsys.readouterr().out.splitlines()
+    monkeypatch.chdir(pages.ROOT)
+    with tiny_run.known():
+        config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
+        network = networks.read_network(tiny_run.save(tmp_path / "run", config))
+        monkeypatch.setattr(networks, "load", lambda _: network)
+        run("README.md", code_of("README.md"))
+    last, shape, *steps = capsys.readouterr().out.replace("\n ", " ").splitlines()
+    assert last.startswith("2.9 [") and last.count(".") == 13
     assert shape == "(11, 3)"
     losses, densities = np.array([line.split() for line in steps], float).T
     assert losses[1] < losses[0] and densities[1] < densities[0] < 1e-2
@@ -87,6 +97,21 @@ def test_the_loop_of_ones_own(one_walk, capsys):
     losses = [float(loss) for _, loss in lines[:5]]
     assert losses[-1] < losses[0]
     assert float(lines[5][-1]) < 3 and " ".join(lines[6]) == "taken 3 of 3"
+
+
+@pytest.mark.slow
+def test_many_sequences_and_draws(one_walk, capsys):
+    """The spread of six runs of 2 s is what the filter says, give or take a half."""
+    names = run("docs/many_sequences.md", code_of("docs/many_sequences.md"))
+    shape, rms, expected, _, nees = capsys.readouterr().out.splitlines()
+    assert shape == "positions (2, 20, 3)"
+    assert 0.5 < float(rms.split()[-1]) / float(expected.split()[-1]) < 1.5
+    assert 0.3 < float(nees.split()[4]) < 2.0
+    # A sequence of the batch is the run of this sequence alone.
+    starts = (part[1] for part in names["starts"])
+    signals = (names[name][1] for name in ("gyro", "accel", "measured"))
+    alone = names["run"](*starts, *signals).position
+    np.testing.assert_allclose(names["history"].position[1], alone, atol=1e-9)
 
 
 def test_a_measurement_of_ones_own(capsys):
@@ -103,13 +128,13 @@ def test_a_measurement_of_ones_own(capsys):
 
 
 def test_weights_that_are_loaded(tmp_path, monkeypatch):
-    """`mine` is the package of a tiny network."""
+    """`mine` is a tiny network."""
     config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
     monkeypatch.setenv("GNIO_WEIGHTS", str(tmp_path))
     names = {"gnio_jax": gnio_jax, "windows": np.zeros((2, 50, 6), np.float32)}
     with tiny_run.known():
         folder = tiny_run.save(tmp_path / "run", config)
-        packages.publish(folder, tmp_path / "mine", "mine", "nobody's walks", "CC0")
+        publish(folder, tmp_path / "mine", "mine", "nobody's walks", "CC0")
         run("docs/weights.md", code_of("docs/weights.md"), names)
     assert names["prediction"].displacement.shape == (2, 3)
 
@@ -153,7 +178,7 @@ def test_the_imports_of_the_reference():
 
 def test_every_block_that_runs_has_a_test():
     tested = {"README.md", "docs/differentiable_filter.md", "docs/networks.md", "docs/weights.md"}
-    tested |= {"docs/measurements.md"}
+    tested |= {"docs/measurements.md", "docs/many_sequences.md"}
     tested |= {"docs/api/index.md", "CONTRIBUTING.md"}
     assert {block.page for block in RUN} == tested
 
@@ -236,6 +261,49 @@ def test_the_reference_has_every_room():
             page = (docs / "api" / f"{room}.md").read_text(encoding="utf-8")
             assert f"\n::: gnio_jax.{room}\n" in page
             assert f"api/{room}.md" in navigation and room in gnio_jax.__all__
+
+
+def functions_of_the_reference():
+    """Every function and every class with a constructor of its own that docs/api shows."""
+    members = {}
+    for page in (pages.ROOT / "docs/api").glob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        for target, options in re.findall(r"^::: ([\w.]+)\n?(?: +options: (.*))?", text, re.M):
+            try:
+                module = importlib.import_module(target)
+            except ModuleNotFoundError:
+                home, _, name = target.rpartition(".")
+                members[target] = member(home, name)
+                continue
+            listed = re.search(r"members: (?:\[(.*)\]|false)", options)
+            names = getattr(module, "__all__", None) or [
+                name
+                for name, value in vars(module).items()
+                if not name.startswith("_") and getattr(value, "__module__", "") == target
+            ]
+            names = filter(None, (listed[1] or "").split(", ")) if listed else names
+            members |= {f"{target}.{name}": getattr(module, name) for name in names}
+    return {
+        name: value
+        for name, value in members.items()
+        if inspect.isfunction(value)
+        or (inspect.isclass(value) and inspect.isfunction(value.__init__))
+    }
+
+
+def test_a_function_of_five_arguments_lists_them():
+    """With all names and no other; fields of settings and tuples have docstrings of their own."""
+    long = 0
+    for name, value in functions_of_the_reference().items():
+        if dataclasses.is_dataclass(value):
+            continue
+        arguments = list(inspect.signature(value).parameters)
+        if len(arguments) >= 5:
+            section = re.search(r"\nArgs:\n((?: .*\n?)+)", inspect.cleandoc(value.__doc__ or ""))
+            assert section, f"{name}: its docstring has no section 'Args:'"
+            assert re.findall(r"^ {4}(\w+): ", section[1], re.M) == arguments, name
+            long += 1
+    assert long >= 20
 
 
 def test_every_network_is_named_where_people_look():

@@ -84,7 +84,7 @@ def test_the_wheel_holds_the_package_its_configs_and_its_types(wheel):
 def test_train_and_evaluate_from_anywhere(gnio, tmp_path):
     trained = gnio("train", "--config", "quickstart", *SMALL)
     assert trained.returncode == 0, trained.stderr
-    assert "look at it with: gnio evaluate --workdir runs/synthetic_gnio" in trained.stdout
+    assert "look at it with: gnio evaluate --network runs/synthetic_gnio" in trained.stdout
     evaluated = gnio("evaluate", "--split", "val", "--estimator", "integrate", "--no-plots")
     assert evaluated.returncode == 0, evaluated.stderr
     folder = tmp_path / "runs" / "synthetic_gnio" / "eval" / "synthetic_val_integrate"

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from gnio_jax import config, data, evaluation, filtering, geometry
-from gnio_jax.training import checkpoint, loop
+from gnio_jax import config, data, evaluation, filtering, geometry, networks
+from gnio_jax.training import loop
 from gnio_jax.training.windows import gather, window_source
 
 jax.config.update("jax_enable_x64", True)  # the filter runs in float64, the network in float32
@@ -80,8 +80,7 @@ print("moved in this second:", np.asarray(batch.displacement[number]).round(2), 
 # ## The network
 #
 # A small network learns from other walkers, with an eighth of the paper's width and ten epochs. If
-# you have a package of weights, `run = gnio_jax.load_pretrained(NAME)` takes the place of this
-# cell.
+# you have a trained network, `run = gnio_jax.load_pretrained(NAME)` takes the place of this cell.
 
 # %%
 workdir = tempfile.mkdtemp()
@@ -93,7 +92,7 @@ small = dataclasses.replace(
 )
 small = dataclasses.replace(small, data=dataclasses.replace(windows, train_stride_seconds=0.2))
 loop.train(small)
-run = checkpoint.load_run(workdir)
+run = networks.load(workdir)
 
 # %% [markdown]
 # It predicts a displacement and the logarithm of its standard deviation, in the frame of each

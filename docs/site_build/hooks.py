@@ -56,7 +56,7 @@ def on_page_content(content, page, config, **_):
     def to_page(match):
         if not (Path(config["docs_dir"]) / f"{match[1]}.md").is_file():
             log.warning(f"{page.file.src_uri}: link to '{match[1]}.md', which is not there")
-        return f'href="../../{match[1]}/'
+        return f'href="../{match[1]}.html'
 
     if page.file.src_uri.startswith("notebooks/"):
         content = NOTEBOOK_LINK.sub(to_page, content)

@@ -19,6 +19,9 @@ from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.reuse import IDENTITY, RequestedEvaluation
 from gnio_jax.evaluation.statistics import Cell
 from gnio_jax.files import with_ending
+from gnio_jax.networks import list_networks
+from gnio_jax.networks.find import is_network
+from gnio_jax.networks.folder import name_of
 from gnio_jax.reporting import Lines, Reporter
 
 USUAL = (
@@ -93,8 +96,8 @@ def compare(
             remedy = f"write the runs before --metrics; the metrics are: {', '.join(NAMES)}"
             raise InputError("--metrics", f"no metric '{word}'", remedy)
     if len(config.rows) < 2:
-        remedy = "name the run to compare with first, and all of them before --metrics"
-        raise InputError("RUNS", "needs two or more", remedy)
+        remedy = "name the one to compare with first, and all of them before --metrics"
+        raise InputError("NETWORKS", "needs two or more", remedy)
     sources_by_row = [[_source(path, config) for path in find(word)] for word in config.rows]
     sources = [source for row in sources_by_row for source in row]
     _check_sources(sources)
@@ -109,7 +112,7 @@ def compare(
     rows = [
         ComparedRow(
             label,
-            [source.run.name for source in row],
+            [name_of(source.run) for source in row],
             [report_of(source.figures) for source in row],
         )
         for label, row in zip(_labels(config.rows), sources_by_row, strict=True)
@@ -135,7 +138,7 @@ def compare(
 
 
 def find(word: str) -> list[Path]:
-    """The runs, or folders of evaluations, that `word` names: itself, or its seeds.
+    """The networks, or folders of evaluations, that `word` names: itself, or its seeds.
 
     A name without a seed stands for all its seeds, in their order: `runs/gnio` for `runs/gnio_s0`,
     `runs/gnio_s1` and so on, `runs/gnio_calibrated` for `runs/gnio_s0_calibrated` and so on. Raises
@@ -159,8 +162,12 @@ def find(word: str) -> list[Path]:
     if missing and len(missing) < len(paths):
         problem = f"exists for {len(paths) - len(missing)} of {len(paths)} seeds only"
         raise InputError(word, problem, f"missing: {', '.join(map(str, missing))}")
+    if not paths and word in list_networks():
+        return [list_networks()[word]]
     if not paths or missing:
-        remedy = "name a run, the folder of an evaluation, or a run of several seeds without _s0"
+        remedy = (
+            "name a network, the folder of an evaluation, or a run of several seeds without _s0"
+        )
         if "eval" in path.parts:
             remedy = "make it with gnio evaluate, whose help names the options"
         raise InputError(word, "is not there", remedy)
@@ -168,18 +175,18 @@ def find(word: str) -> list[Path]:
 
 
 def _source(path: Path, config: CompareConfig) -> EvaluationSource:
-    """The evaluation of a run with all options at their defaults, or the evaluation that is
+    """The evaluation of a network with all options at their defaults, or the evaluation that is
     named."""
-    if (path / "config.yaml").is_file():
-        settings = {"split": config.split, "estimator": config.estimator, "plots": False}
-        evaluation = reuse.find_existing(
-            EvaluateConfig(str(path), data_root=config.data_root, **settings)
-        )
+    if is_network(path):
+        names = ("dataset", "data_root", "split", "estimator")
+        settings = {name: getattr(config, name) for name in names}
+        evaluation = reuse.find_existing(EvaluateConfig(str(path), plots=False, **settings))
         identity = {name: getattr(evaluation.config, name) for name in IDENTITY}
         return EvaluationSource(path, path, evaluation.folder, identity, evaluation)
     report = read(path)
-    run = Path(os.path.abspath(path)).parent.parent
-    if path.resolve().parent.name == "eval" and (problem := reuse.find_missing_step(report, run)):
+    folder = Path(os.path.abspath(path)).parent
+    run = folder.parent if folder.name == "eval" else folder
+    if path.resolve().parent.name == "eval" and (problem := reuse.find_change(report, run)):
         raise InputError(path, problem, REMEDY)
     identity = {name: report.settings.get(name) for name in IDENTITY}
     return EvaluationSource(path, run, path, identity, report)

@@ -35,8 +35,8 @@ from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.filtering import Pose, Tracker, make_filter
 from gnio_jax.filtering.start import level_state
 from gnio_jax.models import Network
+from gnio_jax.networks import TrainedNetwork
 from gnio_jax.numerics import quaternion_from_matrix
-from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
 # --- samples
@@ -322,7 +322,9 @@ TURNING_SECONDS = 10.0
 """Time after which the rotation of gravity is compared with the gyro, s (ours)."""
 
 
-def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float = 1.0) -> Tracker:
+def create_tracker(
+    run: TrainedNetwork, imu_rate: float | None = None, rest_seconds: float = 1.0
+) -> Tracker:
     """The compiled tracker of a run, with the filter and the start of `gnio track`.
 
     From the same samples it makes the same trajectory as `gnio track`, to rounding, if the
@@ -344,19 +346,19 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
     )
 
 
-def longest_interval(run: Run, imu_rate: float | None = None) -> float:
+def longest_interval(run: TrainedNetwork, imu_rate: float | None = None) -> float:
     """Largest time between samples without missing ones, s; `imu_rate` as in `create_tracker`."""
     own = 1 / run.config.data.rate
     return 1.5 * max(own, 1 / imu_rate if imu_rate else own)
 
 
-def expect(tracker: Tracker, found: Followed, run: Run, imu_rate: float) -> None:
+def expect(tracker: Tracker, found: Followed, run: TrainedNetwork, imu_rate: float) -> None:
     """Set the rate of the samples, Hz, in the tracker of a run and in `found`."""
     tracker.expect(imu_rate, longest_interval(run, imu_rate))
     found.bridged = longest_bridge(imu_rate)
 
 
-def begins_at_rest(run: Run) -> Callable[[list[Sample]], bool]:
+def begins_at_rest(run: TrainedNetwork) -> Callable[[list[Sample]], bool]:
     """A function that tells whether the first second of some samples is quiet enough for the start
     of the filter."""
     ekf = make_filter(run.config.data, run.config.filter)

@@ -1,6 +1,6 @@
 """The trajectory of your own recording and its accuracy (`gnio track`).
 
-recording + weights → check → prepare → estimate → score → summarise → write
+recording + network → check → prepare → estimate → score → summarise → write
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from gnio_jax import config as configuration
 from gnio_jax.apps import export, rerun
 from gnio_jax.apps.importing import GAPS, Imported
-from gnio_jax.apps.packages import Weights
+from gnio_jax.apps.publish import describe_data
 from gnio_jax.config import TrainConfig
 from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.resampling import longest_bridge
@@ -37,6 +37,7 @@ from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
 from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.filtering.zero_velocity import quiet_samples
 from gnio_jax.models import Network
+from gnio_jax.networks import TrainedNetwork
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.types import GRAVITY, Sequence
 
@@ -67,9 +68,9 @@ class Summary(NamedTuple):
     """The figures and remarks about a track."""
 
     recording: str
-    weights: str
+    network: str
     trained_on: str
-    """The training data, and the measured error of these weights if there is one."""
+    """The training data, and the measured error of the network if there is one."""
     start_time: float
     """Duration by the recording's own clock, s."""
     seconds: float
@@ -106,51 +107,43 @@ class Tracked(NamedTuple):
 
 def track(
     recording: Imported,
-    weights: Weights,
+    trained: TrainedNetwork,
     out: Path,
     formats: tuple[str, ...] = (),
     progress: Progress = silent,
     command: str = "",
     rerun_file: Path | None = None,
 ) -> Tracked:
-    """Track a recording and write trajectory, picture, page and summary into the folder `out`.
+    """Track a recording and write trajectory, picture, page and summary into a folder.
 
-    The trajectory starts at the origin with yaw zero; its stamps are the recording's own. The tilt
-    at the start comes from the gravity of the first second. The velocity is zero, with a standard
-    deviation that depends on how quiet that second is, and a rest at the start gives the gyro's
-    bias. A reference is not used for the start, only for comparison. `formats` are further ones of
-    `export.FORMATS`, `command` is the command line, for the page, and `rerun_file` a file to write
-    for the viewer Rerun. The folder is written whole or not at all and replaces an earlier track.
-    Raises `InputError`.
+    The stamps are the recording's own. `estimate_recording` says where the trajectory starts. A
+    reference is only compared with it.
+
+    Args:
+        recording: The recording, on a uniform clock.
+        trained: The network.
+        out: The folder. It is written whole or not at all and replaces an earlier track.
+        formats: Further formats of the trajectory, of `export.FORMATS`.
+        progress: A function that gets the finished share.
+        command: The command line, for the page.
+        rerun_file: A file to write for the viewer Rerun.
+
+    Raises:
+        InputError: The results could not be written, or the recording is too short or has a hole
+            that is too long.
     """
-    sequence, config = recording.sequence, weights.run.config
+    sequence, config = recording.sequence, trained.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
-    _check_bridged(sequence)
-    ekf = make_filter(config.data, config.filter)
-    ready, left_out = prepare(
-        [sequence],
-        config.data,
-        ekf,
-        init="static",
-        gyro_bias="rest",
-        from_first=True,
-    )
-    if not ready:
-        raise InputError(sequence.name, left_out[sequence.name], "record for longer")
-    if ekf.considered is not None and not ready[0].start.raw_gyro:
-        considered = ekf.considered._replace(raw_gyro_bias=0.0)
-        ekf = dataclasses.replace(ekf, considered=considered if any(considered) else None)
-    network = Network.of(weights.run.model, weights.run.variables)
-    (found,) = estimate(ready, network, config.data, ekf, 1, progress)
+    found, ready, ekf = estimate_recording(sequence, trained, progress)
     compared = np.isfinite(found.reference.position).any() or found.waypoints is not None
     errors = metrics.score([found])[found.name].values if compared else {}
-    summary = summarise(found, errors, ready[0], recording, weights, ekf)
+    summary = summarise(found, errors, ready, recording, trained, ekf)
     with replacing_folder(out) as folder:
         _write_figures(folder, found, summary, formats)
         _draw(folder, found, summary, config, command)
     if rerun_file is not None:
-        rerun.write(rerun_file, [found], ready)
+        rerun.write(rerun_file, [found], [ready])
     return Tracked(found, summary, out)
 
 
@@ -166,6 +159,37 @@ def _check_results(
         export.check("--format", kind, stamps)
     if rerun_file is not None:
         rerun.check(rerun_file)
+
+
+def estimate_recording(
+    sequence: Sequence, trained: TrainedNetwork, progress: Progress = silent
+) -> tuple[SequenceEstimate, PreparedRecording, Filter]:
+    """The estimate of a recording, the recording as the filter took it, and the filter.
+
+    The trajectory starts at the origin with yaw zero. The tilt at the start comes from the gravity
+    of the first second. The velocity is zero, with a standard deviation that depends on how quiet
+    that second is, and a rest at the start gives the gyro's bias. A reference is not used. Raises
+    `InputError` for a recording that is too short or has a hole that is too long.
+    """
+    _check_bridged(sequence)
+    config = trained.config
+    ekf = make_filter(config.data, config.filter)
+    ready, left_out = prepare(
+        [sequence],
+        config.data,
+        ekf,
+        init="static",
+        gyro_bias="rest",
+        from_first=True,
+    )
+    if not ready:
+        raise InputError(sequence.name, left_out[sequence.name], "record for longer")
+    if ekf.considered is not None and not ready[0].start.raw_gyro:
+        considered = ekf.considered._replace(raw_gyro_bias=0.0)
+        ekf = dataclasses.replace(ekf, considered=considered if any(considered) else None)
+    network = Network.of(trained.model, trained.variables)
+    (found,) = estimate(ready, network, config.data, ekf, 1, progress)
+    return found, ready[0], ekf
 
 
 def _check_bridged(sequence: Sequence) -> None:
@@ -184,10 +208,19 @@ def summarise(
     errors: dict[str, float | None],
     ready: PreparedRecording,
     recording: Imported,
-    weights: Weights,
+    trained: TrainedNetwork,
     ekf: Filter,
 ) -> Summary:
-    """The figures of a finished track, up to a divergence if there was one."""
+    """The figures of a finished track, up to a divergence if there was one.
+
+    Args:
+        found: The estimate, with the filter's covariances.
+        errors: Metrics against the reference by their names; empty without a reference.
+        ready: The recording as the filter took it.
+        recording: The recording as it was imported, with its notes and warnings.
+        trained: The network, for its name and its training data.
+        ekf: The filter.
+    """
     filtered, sequence = found.filtered, recording.sequence
     assert filtered is not None
     rows = int(np.flatnonzero(found.trajectory.known)[-1]) + 1
@@ -204,8 +237,8 @@ def summarise(
         counted += "so the real error is probably larger"
     summary = Summary(
         recording=sequence.name,
-        weights=weights.name,
-        trained_on=weights.trained_on,
+        network=trained.name,
+        trained_on=describe_data(trained),
         start_time=float(sequence.attributes.get("start_time", 0.0)),
         seconds=seconds,
         path_length=length,
@@ -219,7 +252,7 @@ def summarise(
         warnings=(),
         notes=(*recording.notes, *ready.notes),
         limits=f"limits: {length:.1f} m in {seconds:.0f} s; expected error at the end "
-        f"{error:.1f} m{share} by the filter, {counted}; weights {weights.name}; place and heading "
+        f"{error:.1f} m{share} by the filter, {counted}; network {trained.name}; place and heading "
         "are relative to the start",
     )
     own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
@@ -333,7 +366,7 @@ def _draw(
         "command": command,
         "walked": f"{length}, ends {summary.from_start:.1f} m from the start",
         "expected error at the end": f"{expected} by the filter",
-        "weights": f"{summary.weights}, trained on {summary.trained_on}",
+        "network": f"{summary.network}, trained on {summary.trained_on}",
         "window orientation": "filter",
         "alignment": aligned if summary.errors else "",
         "reference": partly if 0 < known < 1 else "",

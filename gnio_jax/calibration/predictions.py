@@ -8,14 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from gnio_jax import data
+from gnio_jax import config as configuration
+from gnio_jax import data, models, networks
 from gnio_jax.config import CalibrateConfig, FilterSettings, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, estimate, prepare
 from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
-from gnio_jax.training import checkpoint
-from gnio_jax.training.checkpoint import Run
+from gnio_jax.networks import TrainedNetwork
 
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
@@ -31,21 +31,33 @@ class Predictions(NamedTuple):
 class FoldNetwork(NamedTuple):
     """A network and the part of the split for which it predicts displacements."""
 
-    run: Run
+    run: TrainedNetwork
     fold: data.Fold | None
     """None: all of the split."""
 
 
-def load_run(workdir: Path, config: CalibrateConfig) -> Run:
-    """A run with the network that is to be calibrated. Raises `InputError` as `checkpoint.load_run`
-    and `checkpoint.average_over_headings` do."""
-    run = checkpoint.load_run(workdir)
+def load_network(network: str | Path, config: CalibrateConfig) -> TrainedNetwork:
+    """The network that is to be calibrated. Raises `InputError` as `networks.load` and
+    `average_over_headings` do."""
+    trained = networks.load(network)
     if not config.average_headings:
-        return run
-    return checkpoint.average_over_headings(run, f"--average-headings with {workdir}")
+        return trained
+    return average_over_headings(trained, f"--average-headings with {network}")
 
 
-def choose_networks(run: Run, config: CalibrateConfig) -> tuple[str, list[FoldNetwork]]:
+def average_over_headings(network: TrainedNetwork, source: str) -> TrainedNetwork:
+    """Average a network over four headings (`models.equivariance.FourHeadings`), which has the same
+    weights. Raises `InputError` naming `source` for a network that was not trained on every
+    heading, or is equivariant in another way."""
+    if network.config.model.equivariance == "canonical_frame":
+        raise InputError(source, "its network has a canonical frame: there is nothing to average")
+    averaged = dataclasses.replace(network.config.model, equivariance="four_headings")
+    config = dataclasses.replace(network.config, model=averaged)
+    configuration.validate(config, source)
+    return network._replace(config=config, model=models.from_config(averaged))
+
+
+def choose_networks(run: TrainedNetwork, config: CalibrateConfig) -> tuple[str, list[FoldNetwork]]:
     """Choose the split and the networks that predict its displacements: the run's own network, or
     one for each fold.
 
@@ -62,7 +74,7 @@ def choose_networks(run: Run, config: CalibrateConfig) -> tuple[str, list[FoldNe
     if config.split:
         problem = "is of no use with --out-of-fold, which takes the training split"
         raise InputError(f"--split {config.split}", problem)
-    runs = [load_run(Path(folder), config) for folder in config.out_of_fold]
+    runs = [load_network(folder, config) for folder in config.out_of_fold]
     for folder, fold_run in zip(config.out_of_fold, runs, strict=True):
         _check_alike(folder, fold_run.config, run.config)
     splits, count = [fold_run.config.data.train_split for fold_run in runs], len(runs)

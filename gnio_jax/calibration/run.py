@@ -23,15 +23,16 @@ from gnio_jax.calibration.fit import (
     fit_std_factors,
     start_of_fit,
 )
-from gnio_jax.calibration.predictions import OnStage, choose_networks, load_run, predict
+from gnio_jax.calibration.predictions import OnStage, choose_networks, load_network, predict
 from gnio_jax.config import CalibrateConfig, ConsideredStd, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Displacements
 from gnio_jax.evaluation.estimate import filter_inputs
 from gnio_jax.files import replacing_folder, write_text
 from gnio_jax.filtering.settings import filter_config
+from gnio_jax.networks import TrainedNetwork, find_network, newest_run, write_network
+from gnio_jax.networks.folder import SPLITS, has_card, name_of
 from gnio_jax.numerics import filled_up
-from gnio_jax.training import checkpoint
 
 MOST_STEPS = 60
 """Largest number of steps of the search for the settings (L-BFGS)."""
@@ -90,9 +91,9 @@ def calibrate(
     if not config.fit:
         raise InputError("--fit", "names nothing", f"name some of {', '.join(GROUPS)}")
     paths = [path for group in dict.fromkeys(config.fit) for path in GROUPS[group]]
-    workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
-    run = load_run(workdir, config)
-    folder = _choose_folder(config, workdir)
+    path = find_network(config.network or newest_run())
+    run = load_network(path, config)
+    folder = _choose_folder(config, path)
     split, networks = choose_networks(run, config)
     windows = run.config.data
     noise = run.config.filter.noise._replace(measurement_scale=1.0, std_factor=(1.0, 1.0, 1.0))
@@ -131,16 +132,16 @@ def calibrate(
     progress("comparing", 1.0)
     counts = len(recordings), sum(bool(recording.start.raw_gyro) for recording in recordings)
     calibration = Calibration(before, innovation_fit, consider_fit, effect, *counts, folder)
-    _write(calibration, workdir, run, config, split)
+    _write(calibration, path, run, config, split)
     return calibration
 
 
-def _choose_folder(config: CalibrateConfig, workdir: Path) -> Path:
-    if (workdir / RECORD).exists():
+def _choose_folder(config: CalibrateConfig, path: Path) -> Path:
+    if (path / RECORD).exists():
         remedy = "calibrate the run that it was made from"
-        raise InputError(workdir, "is a calibrated run", remedy)
-    absolute = workdir.resolve()
-    folder = Path(config.out) if config.out else absolute.with_name(f"{absolute.name}_calibrated")
+        raise InputError(path, "is a calibrated run", remedy)
+    parent = Path("runs") if path.is_file() or has_card(path) else path.resolve().parent
+    folder = Path(config.out) if config.out else parent / f"{name_of(path.resolve())}_calibrated"
     if folder.exists():
         raise InputError(folder, "is there already", "remove it, or give another --out")
     return folder
@@ -148,16 +149,16 @@ def _choose_folder(config: CalibrateConfig, workdir: Path) -> Path:
 
 def _write(
     calibration: Calibration,
-    workdir: Path,
-    trained: checkpoint.Run,
+    path: Path,
+    trained: TrainedNetwork,
     config: CalibrateConfig,
     split: str,
 ) -> None:
-    """Write the run with its new settings, its checkpoint, and the record of the fit."""
+    """Write the network with its new settings, and the record of the fit."""
     fit, effect = calibration.innovation_fit, calibration.effect
     settings = calibration.consider_fit.settings
     record: dict[str, Any] = {
-        "run": str(workdir),
+        "run": str(path),
         "split": split,
         "out_of_fold": list(config.out_of_fold),
         "average_headings": config.average_headings,
@@ -182,9 +183,8 @@ def _write(
             trained.config, workdir=str(calibration.folder), filter=settings
         )
         configuration.validate(experiment, "the calibrated run")
-        configuration.save(new / "config.yaml", experiment)
+        write_network(new, trained._replace(config=experiment))
         write_text(new / RECORD, json.dumps(record, indent=2) + "\n")
-        checkpoint.write_best(new, trained._replace(config=experiment))
-        for name in ("splits.yaml", "metrics.jsonl"):
-            if (workdir / name).exists():
-                shutil.copy2(workdir / name, new / name)
+        for name in (SPLITS, "metrics.jsonl"):
+            if (path / name).exists():
+                shutil.copy2(path / name, new / name)

@@ -12,7 +12,7 @@ HELP = """Gated Neural Inertial Odometry: where has a person walked, from the IM
 examples:
   {prog} track walk.zip                                    the path of your own recording
   {prog} train --config quickstart --workdir runs/demo     a first network, without a download
-  {prog} evaluate --workdir runs/demo                      its trajectories, errors and pictures
+  {prog} evaluate --network runs/demo                      its trajectories, errors and pictures
   {prog} data list                                         the datasets, and where to get them"""
 DATA_HELP = """Datasets and recordings.
 

@@ -29,9 +29,9 @@ def calibrate(request: CalibrateConfig, _call: options.Call) -> None:
 
     examples:
       {prog}                                    the newest run below runs/
-      {prog} --workdir runs/oxiod --fit measurement noise --out runs/oxiod_honest
-      {prog} --workdir runs/oxiod --average-headings
-      {prog} --workdir runs/oxiod --out-of-fold runs/fold0 runs/fold1
+      {prog} --network runs/oxiod --fit measurement noise --out runs/oxiod_honest
+      {prog} --network runs/oxiod --average-headings
+      {prog} --network runs/oxiod --out-of-fold runs/fold0 runs/fold1
     """
     from gnio_jax import calibration  # late, so that mistakes do not wait for JAX
 
@@ -58,7 +58,7 @@ def calibrate(request: CalibrateConfig, _call: options.Call) -> None:
     )
     for warning in result.warnings:
         console.warn(warning)
-    console.say(f"look at it with: gnio evaluate --workdir {result.folder}")
+    console.say(f"look at it with: gnio evaluate --network {result.folder}")
 
 
 def _trajectories(effect: Effect) -> Table:

@@ -17,9 +17,9 @@ ENDINGS = (".md", ".csv", ".png")
 
 
 def compare(request: CompareConfig, _call: options.Call) -> None:
-    """Compare runs sequence by sequence: their differences, with intervals.
+    """Compare networks sequence by sequence: their differences, with intervals.
 
-    The others are compared with the first run. Runs that have no evaluation yet are evaluated
+    The others are compared with the first one. Networks that have no evaluation yet are evaluated
     first. Seeds of a run are averaged, and the name of a run without its seed stands for all of
     them: runs/plain for runs/plain_s0, runs/plain_s1, ..., runs/plain_calibrated for
     runs/plain_s0_calibrated, ...
@@ -32,6 +32,7 @@ def compare(request: CompareConfig, _call: options.Call) -> None:
     examples:
       {prog} runs/plain runs/context --split sessions_test
       {prog} runs/plain runs/context --metrics ate rpe_1s rte_60s --out runs/plain_or_context
+      {prog} pedestrian runs/mine --dataset oxiod --split unseen
       {prog} runs/gnio_s0 runs/gnio_s0/eval/oxiod_test_ekf_loose
     """
     if request.out is not None:

@@ -1,4 +1,4 @@
-"""`gnio doctor`: installed packages, and datasets, weights and caches."""
+"""`gnio doctor`: installed packages, and datasets, networks and caches."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class DoctorOptions:
 
 
 def doctor(request: DoctorOptions, _call: options.Call) -> None:
-    """Show what is installed and found here: packages, devices, datasets, weights, caches.
+    """Show what is installed and found here: packages, devices, datasets, networks, caches.
 
     A missing part is not an error. Include the output when you ask for help. A dataset is looked
     for in $GNIO_DATA/NAME, then in data/NAME.
@@ -69,12 +69,10 @@ def _devices() -> dict[str, str]:
 
 
 def _find_places() -> dict[str, str]:
-    """Datasets whose folder exists, weights, runs, caches."""
+    """Datasets whose folder exists, networks, runs, caches."""
     import jax
 
-    from gnio_jax import config as configuration
-    from gnio_jax import data
-    from gnio_jax.apps import packages
+    from gnio_jax import data, networks
     from gnio_jax.data.hdf5 import cache_folder
 
     facts = {}
@@ -83,11 +81,11 @@ def _find_places() -> dict[str, str]:
             location = str(data.find_root(name)) if data.get(name).needs_root else "computed"
             facts[f"dataset {name}"] = location
     try:
-        facts["weights"] = ", ".join(packages.packages())
+        facts["networks"] = ", ".join(networks.list_networks())
     except InputError as error:
-        facts["weights"] = f"none: {error}"
+        facts["networks"] = f"none: {error}"
     try:
-        facts["newest run"] = str(configuration.newest_run())
+        facts["newest run"] = str(networks.newest_run())
     except InputError as error:
         facts["newest run"] = f"none: {error}"
     compiled = jax.config.values["jax_compilation_cache_dir"]

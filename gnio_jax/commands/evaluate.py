@@ -26,7 +26,8 @@ class ScoreOptions:
 def evaluate(request: EvaluateConfig, call: options.Call) -> None:
     """Estimate the trajectories of a split with a trained network and report the errors.
 
-    Results go to WORKDIR/eval/<dataset>_<split>_<estimator>/: metrics.json, metrics.csv,
+    Results go to NETWORK/eval/<dataset>_<split>_<estimator>/, or to evaluations/NAME/... for a
+    published network: metrics.json, metrics.csv,
     trajectories/ and references/ in TUM format (for evo), plots/, and report.html, a page with map,
     curves and a time slider. If that folder has figures of another --data-root, they are kept, and
     the name of the new folder ends with that of the data folder. Every table has two rows to
@@ -37,9 +38,10 @@ def evaluate(request: EvaluateConfig, call: options.Call) -> None:
 
     examples:
       {prog}                       the newest run below runs/
-      {prog} --workdir runs/tlio --dataset oxiod --data-root ~/oxiod --split unseen
-      {prog} --workdir runs/tlio --estimator integrate --orientation device
-      {prog} --workdir runs/tlio --set filter.noise.measurement_scale=1
+      {prog} --network runs/tlio --dataset oxiod --data-root ~/oxiod --split unseen
+      {prog} --network pedestrian --dataset oxiod --split unseen
+      {prog} --network runs/tlio --estimator integrate --orientation device
+      {prog} --network runs/tlio --set filter.noise.measurement_scale=1
     """
     from gnio_jax import evaluation  # late: mistakes do not wait for JAX
     from gnio_jax.apps import rerun

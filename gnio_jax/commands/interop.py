@@ -38,7 +38,7 @@ def interop(request: InteropOptions, _call: options.Call) -> None:
     examples:
       {prog} checkpoint_best.pt runs/tlio_public
       {prog} model_torchscript.pt runs/tlio_public --stride-seconds 0.1
-      gnio evaluate --workdir runs/tlio_public --dataset tlio --data-root ~/tlio
+      gnio evaluate --network runs/tlio_public --dataset tlio --data-root ~/tlio
     """
     from gnio_jax import interop as tlio  # late: mistakes do not wait for JAX
 
@@ -48,4 +48,4 @@ def interop(request: InteropOptions, _call: options.Call) -> None:
         stride_seconds=request.stride_seconds,
     )
     tlio.write_run(request.checkpoint, request.workdir, data, request.dataset)
-    print(f"run: {request.workdir}; next: gnio evaluate --workdir {request.workdir}")
+    print(f"run: {request.workdir}; next: gnio evaluate --network {request.workdir}")

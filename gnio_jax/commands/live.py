@@ -34,9 +34,9 @@ class LiveOptions:
     source: Annotated[str, UNNAMED] = "-"
     """- for standard input; udp:PORT from this machine, udp:0.0.0.0:PORT from any machine; or a
     recording."""
-    weights: str | None = None
-    """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
-    run below runs/."""
+    network: str | None = None
+    """Network: the folder of a run, a package or a name (see gnio weights); by default the one that
+    comes with gnio-jax, else the newest run below runs/."""
     out: NewFile | None = None
     """File for the trajectory in TUM format, which is written when the stream has ended."""
     rerun: str | None = None
@@ -69,7 +69,7 @@ def live(request: LiveOptions, _call: options.Call) -> None:
     columns of a recording must be named, import it first (gnio data import).
 
     examples:
-      phone_stream | {prog} --weights runs/mine      lines on standard input
+      phone_stream | {prog} --network runs/mine      lines on standard input
       {prog} udp:0.0.0.0:5555                        the same lines as datagrams, from a phone
       {prog} walk.zip --speed 4                      a recording or bag, four times as fast
     """
@@ -78,8 +78,9 @@ def live(request: LiveOptions, _call: options.Call) -> None:
     import jax  # late, so that mistakes do not wait for it
     import numpy as np
 
+    from gnio_jax import networks
     from gnio_jax.apps import live as following
-    from gnio_jax.apps import packages, rerun
+    from gnio_jax.apps import rerun
     from gnio_jax.apps.export import export
     from gnio_jax.apps.importing import read_imported
 
@@ -89,9 +90,8 @@ def live(request: LiveOptions, _call: options.Call) -> None:
         check_writable(request.out)  # otherwise the trajectory would be lost at the end
     if request.rerun:
         rerun.check(request.rerun)
-    weights = packages.choose(request.weights)
-    run, say = weights.run, console.say
-    say(f"following {request.source} with {weights.name}; Ctrl-C ends it")
+    run, say = networks.load(request.network), console.say
+    say(f"following {request.source} with {run.name}; Ctrl-C ends it")
     stream, rate = None, 0.0
     if datagrams is None and request.source != "-":
         units = ImportOptions(gyro_unit=request.gyro_unit, accel_unit=request.accel_unit)

@@ -23,9 +23,9 @@ ERRORS += ("leg_ratio", "leg_error", "waypoint_rms")
 class TrackOptions:
     file: Annotated[Path, UNNAMED]
     """The recording, a file or a folder. If each sensor has its own CSV, give the gyro's."""
-    weights: str | None = None
-    """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
-    run below runs/."""
+    network: str | None = None
+    """Network: the folder of a run, a package or a name (see gnio weights); by default the one that
+    comes with gnio-jax, else the newest run below runs/."""
     out: Path | None = None
     """Folder for the results; by default tracks/ and the recording's name."""
     format: tuple[Literal["csv", "mcap"], ...] = ()
@@ -44,7 +44,7 @@ def track(request: TrackOptions, call: options.Call) -> None:
 
     examples:
       {prog} walk.zip                              of Sensor Logger or phyphox
-      {prog} walk.bag --imu-topic /imu --weights runs/mine --out tracks/walk
+      {prog} walk.bag --imu-topic /imu --network runs/mine --out tracks/walk
       {prog} walk.csv --accel-sign ios --format csv mcap
       {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
           accel_z=az
@@ -52,24 +52,25 @@ def track(request: TrackOptions, call: options.Call) -> None:
     console.compile_quickly()
     import jax  # late, so that mistakes do not wait for it
 
-    from gnio_jax.apps import packages
+    from gnio_jax import networks
     from gnio_jax.apps import track as tracking
     from gnio_jax.apps.importing import read_imported
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     recording = read_imported(request.file, request.recording)
-    weights = packages.choose(request.weights)
+    trained = networks.load(request.network)
     out = request.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)
         details = {"command": str(call), "rerun_file": request.rerun}
-        result = tracking.track(recording, weights, out, request.format, **details)
+        result = tracking.track(recording, trained, out, request.format, **details)
     for note in result.summary.notes:
         console.say(f"  {note}")
     console.say(_table(result.summary))
     for warning in result.summary.warnings:
         console.say(f"warning: {warning}")
-    console.say(f"weights: {weights.name}, trained on {weights.trained_on}")
+    summary = result.summary
+    console.say(f"network: {summary.network}, trained on {summary.trained_on}")
     console.say(result.summary.limits)
     console.say(f"results: {result.folder} (look at track.png, report.html)")
 
@@ -86,7 +87,7 @@ def _table(summary: Any) -> Table:
     from gnio_jax.evaluation import tabulate
 
     grid = Table(box=box.SIMPLE_HEAD, title_style="bold", title_justify="left")
-    grid.add_column(f"{summary.recording}, by {summary.weights}", overflow="fold")
+    grid.add_column(f"{summary.recording}, by {summary.network}", overflow="fold")
     grid.add_column("", justify="right")
     grid.add_row("time", f"{summary.seconds:.1f} s")
     grid.add_row("path", f"{summary.path_length:.1f} m")

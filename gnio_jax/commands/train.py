@@ -38,9 +38,9 @@ def train(request: TrainOptions, call: options.Call) -> None:
     Settings come from four places, and later ones override earlier ones: the paper's defaults;
     --config, or the config.yaml of the run that is resumed; the options below; --set, which reaches
     every setting of a YAML file. --resume continues from the latest checkpoint. The result is that
-    of a run that was never stopped. --init-from starts from the weights of a run or package (gnio
-    weights) of the same network. With --through-filter.learn, network and filter are trained
-    together, and the filter begins with the settings of that run (gnio calibrate).
+    of a run that was never stopped. --init-from starts from the weights of another network of the
+    same kind (see gnio weights). With --through-filter.learn, network and filter are trained
+    together, and the filter begins with the settings of that network (gnio calibrate).
 
     These come with the package, for --config: {configs}.
 
@@ -54,7 +54,6 @@ def train(request: TrainOptions, call: options.Call) -> None:
     """
     config = experiment(request, call)
     from gnio_jax import filtering, parallel  # late: mistakes do not wait for JAX
-    from gnio_jax.apps import packages
     from gnio_jax.training import loop
 
     if config.through_filter.learn:
@@ -62,7 +61,7 @@ def train(request: TrainOptions, call: options.Call) -> None:
     parallel.initialise(request.distributed, request.devices)
     with console.terminal(shown=parallel.is_first()) as terminal:
         configs = configuration.with_seeds(config, request.seeds) if request.seeds else [config]
-        resources = terminal, usable_cores(), request.devices, packages.load_pretrained
+        resources = terminal, usable_cores(), request.devices
         try:
             outcomes = loop.train_all(configs, request.resume, *resources)
         except FloatingPointError as error:
@@ -78,7 +77,7 @@ def train(request: TrainOptions, call: options.Call) -> None:
         print(f"stopped and saved; continue with: {remedy}", file=sys.stderr)
     else:
         for outcome in outcomes:
-            following = f"{call.prog.replace('train', 'evaluate')} --workdir {outcome.workdir}"
+            following = f"{call.prog.replace('train', 'evaluate')} --network {outcome.workdir}"
             if outcome.best_loss is None:
                 problem = "no epoch had a finite figure on validation"
                 print(f"{outcome.workdir}: {problem}", file=sys.stderr)
@@ -115,10 +114,9 @@ def experiment(request: TrainOptions, call: options.Call) -> TrainConfig:
         return dataclasses.replace(resumed, workdir=config.workdir)  # not that of the first seed
     if not config.through_filter.learn or config.init_from is None:
         return config
-    from gnio_jax import filtering
-    from gnio_jax.apps import packages
+    from gnio_jax import filtering, networks
 
     filtering.cores_as_devices()  # before the checkpoint's arrays fix the devices
-    source = packages.load_pretrained(config.init_from).config.filter
+    source = networks.load(config.init_from).config.filter
     start = dataclasses.replace(source, considered=ConsideredStd())
     return combine(TrainConfig(filter=start))

@@ -1,4 +1,4 @@
-"""`gnio weights`, `gnio publish`, `gnio export`: trained networks for other people."""
+"""`gnio weights`, `gnio publish`, `gnio export`: trained networks, here and for other people."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ from gnio_jax.errors import InputError
 
 @dataclass(frozen=True)
 class WeightsOptions:
-    name: Annotated[str | None, UNNAMED] = None
-    """Name, folder or zip of a package; by default all are listed."""
-    out: Path | None = None
-    """Folder for a run made from the package; by default its model card is shown."""
+    network: Annotated[str | None, UNNAMED] = None
+    """Name, folder or zip of a published network, whose card is shown; by default all networks are
+    listed."""
 
 
 @dataclass(frozen=True)
 class PublishOptions:
-    run: Annotated[Path, UNNAMED]
-    """Folder of the run; its best checkpoint is used."""
+    network: Annotated[str, UNNAMED]
+    """Network: the folder of a run, a package or a name."""
     out: Path
     """Folder to write, or NAME.zip."""
     data: str
@@ -34,88 +33,95 @@ class PublishOptions:
     fails: tuple[str, ...] = ()
     """Cases in which it is known to fail, one sentence each."""
     name: str | None = None
-    """Name of the package; by default that of OUT."""
+    """Name of the network; by default that of OUT."""
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    run: Annotated[str, UNNAMED]
-    """Folder of the run, a package or its name."""
+    network: Annotated[str, UNNAMED]
+    """Network: the folder of a run, a package or a name."""
     out: Path | None = None
-    """Folder to write; by default exports/NAME_onnx, with the name of RUN."""
+    """Folder to write; by default exports/NAME_onnx, with the name of NETWORK."""
 
 
 def weights(request: WeightsOptions, _call: options.Call) -> None:
     """List the trained networks that are found here: name, size, training data, key metric.
 
-    Packages are looked for in the installed gnio-jax and in the folders of $GNIO_WEIGHTS. gnio
-    track --weights NAME uses one; gnio publish makes one from a run. With --out a package becomes a
-    run, which gnio evaluate, gnio calibrate and gnio train --init-from take.
+    Networks are looked for in the installed gnio-jax and in the folders of $GNIO_WEIGHTS. Every
+    command with --network takes their names. gnio publish writes a network with a card for other
+    people.
 
     examples:
       {prog}                                     a list of what is found
-      {prog} pedestrian                          its model card
-      {prog} pedestrian --out runs/pedestrian    a run of it
-      GNIO_WEIGHTS=~/packages {prog}
+      {prog} pedestrian                          its card
+      gnio evaluate --network pedestrian --dataset oxiod --split unseen
+      GNIO_WEIGHTS=~/networks {prog}
     """
-    if request.name is None and request.out is not None:
-        raise InputError(f"--out {request.out}", "is for one package", "name it before --out")
-    from gnio_jax.apps import packages  # late: mistakes do not wait for JAX
+    from gnio_jax import networks  # late: mistakes do not wait for JAX
+    from gnio_jax.networks.folder import read_text
 
-    if request.name is not None and request.out is not None:
-        packages.write_run(request.name, request.out)
-        following = f"gnio evaluate --workdir {request.out} --dataset ..."
-        console.say(f"run: {request.out}; next: {following}")
-        return
-    if request.name is not None:
-        console.say(packages.card_of(request.name))
+    if request.network is not None:
+        console.say(read_text(networks.find_network(request.network)))
         return
     damaged, headings = [], ("name", "size", "network", "trained on", "licence", "measured")
     grid = console.columns(*headings, box=box.SIMPLE_HEAD)
-    for name, path in packages.packages().items():
+    for name, path in networks.list_networks().items():
         try:
-            manifest = packages.read_manifest(path)
+            grid.add_row(name, *_describe(path))
         except InputError as error:
             damaged.append(str(error))
-            continue
-        size, measured = f"{manifest.weights['bytes'] / 1e6:.2f} MB", manifest.measured or "–"
-        grid.add_row(name, size, manifest.network, manifest.data, manifest.license, measured)
     if grid.row_count:
         console.say(grid)
     elif not damaged:
-        remedy = "gnio publish makes one of a run, and $GNIO_WEIGHTS names folders to look in"
-        console.say(f"no packages found; {remedy}")
+        remedy = "gnio publish writes one, and $GNIO_WEIGHTS names folders to look in"
+        console.say(f"no networks found; {remedy}")
     for line in damaged:
         console.say(line)
 
 
-def publish(request: PublishOptions, _call: options.Call) -> None:
-    """Make a package from a run: weights, settings, model card, checksums.
+def _describe(path: Path) -> tuple[str, ...]:
+    """Size, network, training data, licence and measured error of a network."""
+    from gnio_jax.networks.folder import WEIGHTS, has_card, read_card, read_settings
 
-    It contains no data, and no code that runs when it is loaded. It includes the figures of the
-    run's evaluations, so evaluate before you publish.
+    if path.is_file() or has_card(path):
+        card = read_card(path)
+        size = card.files[WEIGHTS]["bytes"]
+        texts = card.network, card.data, card.license, card.measured or "–"
+    else:
+        config, size = read_settings(path).config, (path / WEIGHTS).stat().st_size
+        data = f"dataset {', '.join(config.datasets)}, split {config.data.train_split}"
+        texts = config.model.name, data, "–", "–"
+    return f"{size / 1e6:.2f} MB", *texts
+
+
+def publish(request: PublishOptions, _call: options.Call) -> None:
+    """Publish a network for other people: weights, settings, card, checksums.
+
+    It contains no data, and no code that runs when it is loaded. Its card has the figures of the
+    network's evaluations, so evaluate before you publish.
 
     examples:
-      {prog} runs/mine --out packages/mine --data "12 h of walks by 9 people, phone in hand" \\
+      {prog} runs/mine --out networks/mine --data "12 h of walks by 9 people, phone in hand" \\
           --license "CC BY 4.0"
       {prog} runs/mine --out mine.zip --data "..." --license "..." --fails "Running." "In a car."
-      gnio track walk.zip --weights mine.zip
+      gnio track walk.zip --network mine.zip
     """
-    from gnio_jax.apps import packages  # late: mistakes do not wait for JAX
+    from gnio_jax.apps import publish as publishing  # late: mistakes do not wait for JAX
+    from gnio_jax.networks.folder import WEIGHTS
 
     name = request.name or request.out.name.removesuffix(".zip")
-    card_fields = (name, request.data, request.license, request.fails)
-    manifest = packages.publish(request.run, request.out, *card_fields)
-    size = f"{manifest.weights['bytes'] / 1e6:.2f} MB"
-    console.say(f"{request.out}: {manifest.name}, network {manifest.network}, {size}")
-    if not manifest.measured:
-        line = "the run holds no evaluation, so the card has no figures: gnio evaluate"
-        console.say(f"warning: {line} --workdir {request.run}")
-    console.say(f"next: gnio track RECORDING --weights {request.out}")
+    texts = (name, request.data, request.license, request.fails)
+    card = publishing.publish(request.network, request.out, *texts)
+    size = f"{card.files[WEIGHTS]['bytes'] / 1e6:.2f} MB"
+    console.say(f"{request.out}: {card.name}, network {card.network}, {size}")
+    if not card.measured:
+        line = "there is no evaluation, so the card has no figures: gnio evaluate"
+        console.say(f"warning: {line} --network {request.network}")
+    console.say(f"next: gnio track RECORDING --network {request.out}")
 
 
 def export(request: ExportOptions, _call: options.Call) -> None:
-    """Export a run as ONNX models for programs without Python.
+    """Export a network as ONNX models for programs without Python.
 
     The models are network, start, window and filter step, and the filter is that of gnio track.
     They are then run over a minute of a simulated walk, and their deviation from the package is
@@ -131,11 +137,11 @@ def export(request: ExportOptions, _call: options.Call) -> None:
     from gnio_jax.apps import onnx
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    name = Path(request.run).name.removesuffix(".zip")
+    name = Path(request.network).name.removesuffix(".zip")
     out = request.out or Path("exports") / f"{name}_onnx"
     with console.terminal() as terminal:
         terminal.progress("exporting and measuring", 0.0)
-        exported = onnx.export_run(request.run, out)
+        exported = onnx.export_run(request.network, out)
     for file, size in exported.bytes.items():
         console.say(f"  {out / file}  {size / 1e6:.2f} MB")
     deviation = exported.deviation

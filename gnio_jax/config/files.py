@@ -99,22 +99,6 @@ def without_paths(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(config, data=windows, **nowhere)
 
 
-def newest_run(folder: str | Path = "runs") -> Path:
-    """The run below `folder` that was trained last; calibrated copies of a run do not count. Raises
-    `InputError` if there is none."""
-    folders = [path.parent for path in Path(folder).glob("*/config.yaml")]
-    runs = [run for run in folders if not (run / "calibration.json").exists()]
-    if not runs:
-        remedy = "train one with gnio train, or name its folder with --workdir"
-        raise InputError(folder, "holds no run", remedy)
-
-    def last_trained(run: Path) -> float:
-        files = (run / "config.yaml", run / "metrics.jsonl")
-        return max(path.stat().st_mtime for path in files if path.exists())
-
-    return max(runs, key=last_trained)
-
-
 # Reading
 # ------------------------------------------------------------------------------------------------
 
@@ -139,7 +123,7 @@ def load(path: str | Path, base: TrainConfig | None = None) -> TrainConfig:
 
 def parse(content: str, source: str, base: TrainConfig | None = None) -> TrainConfig:
     """`load` of a file's text; `source` names the file in errors."""
-    fields = _parse_yaml(content, source)
+    fields = parse_yaml(content, source)
     if fields is None:
         raise InputError(source, "is empty", "write settings into it, e.g. seed: 0")
     return _read_section(base or TrainConfig(), fields, Location(source))
@@ -156,7 +140,7 @@ def assign(config: Section, assignments: Sequence[str]) -> Section:
         if not (equals and name):
             remedy = "write section.field=value, e.g. optim.epochs=3"
             raise InputError(f"'{assignment}'", "is not a setting", remedy)
-        content = _parse_yaml(text, assignment)
+        content = parse_yaml(text, assignment)
         for part in reversed(name.strip().split(".")):
             content = {part: content}
         config = _read_section(config, content, Location(assignment))
@@ -178,7 +162,7 @@ def parse_words(hint: Any, words: Sequence[str], name: str) -> Any:
     is_text = item in (str, Path) or any(
         isinstance(choice, str) for choice in typing.get_args(item)
     )
-    content = [word if is_text else _parse_yaml(word, name) for word in words]
+    content = [word if is_text else parse_yaml(word, name) for word in words]
     one = len(content) == 1 and item in kinds
     return check_value(hint, content[0] if one else content, Location(name))
 
@@ -358,9 +342,11 @@ def save(path: str | Path, config: TrainConfig) -> None:
     write_text(path, to_yaml(config))
 
 
-def to_yaml(config: TrainConfig) -> str:
-    """`config` as YAML that `parse` reads back to an equal value."""
-    return yaml.dump(to_plain(config), Dumper=_Dumper, sort_keys=False)
+def to_yaml(value: Any) -> str:
+    """Settings, or a mapping of plain values, as YAML that `parse` or `parse_yaml` reads back to an
+    equal value."""
+    plain = to_plain(value)
+    return yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
 
 
 def to_plain(value: Any) -> Any:
@@ -417,7 +403,7 @@ for _tag, _form in {
         _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^({_form})$"), None)
 
 
-def _parse_yaml(content: str, source: str) -> Any:
+def parse_yaml(content: str, source: str) -> Any:
     """The value of a YAML text. Raises `InputError`."""
     try:
         return yaml.load(content, Loader=_Loader)

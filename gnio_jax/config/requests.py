@@ -24,9 +24,10 @@ CalibratedGroup = Literal["measurement", "noise", "start", "window"]
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    workdir: str | None = None
-    """Folder of the run, with its config.yaml and checkpoints; by default the newest below runs/.
-    Results go to its folder eval/."""
+    network: str | None = None
+    """Network: the folder of a run, a package or a name (see gnio weights); by default the newest
+    run below runs/. Results go to the folder eval/ of a run, and to evaluations/NAME of a published
+    network."""
     dataset: str | None = None
     """Dataset to evaluate on; by default the run's own. If the run has learnt from several, name
     one."""
@@ -54,7 +55,7 @@ class EvaluateConfig:
     """How an estimate is aligned with the reference before absolute errors are computed: by
     position and yaw at the start, not at all, or by least squares."""
     checkpoint: Literal["best", "latest"] = "best"
-    """Which checkpoint of the run."""
+    """Weights of a run: its best ones, or those of its latest checkpoint."""
     batch_size: Annotated[Count, FILE_ONLY] = 16
     """Recordings estimated side by side."""
     plots: bool = True
@@ -70,10 +71,12 @@ class EvaluateConfig:
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    workdir: str | None = None
-    """Folder of the run; by default the newest below runs/."""
+    network: str | None = None
+    """Network: the folder of a run, a package or a name (see gnio weights); by default the newest
+    run below runs/."""
     out: str | None = None
-    """Folder of the calibrated run; by default the run's folder with _calibrated after its name."""
+    """Folder of the calibrated run; by default the network's folder with _calibrated after its
+    name, or runs/NAME_calibrated for a published network."""
     data_root: tuple[str, ...] = ()
     """Folder of the run's dataset, or one for each of several; by default the run's,
     $GNIO_DATA/<dataset>, or data/<dataset>."""
@@ -82,7 +85,7 @@ class CalibrateConfig:
     split. Other splits are refused, because a filter must not be tested on recordings to which it
     was fitted."""
     out_of_fold: tuple[str, ...] = ()
-    """Folders of runs, one for each fold: gnio train --data.train-split train-0of4, then train-1of4
+    """Runs, one for each fold: gnio train --data.train-split train-0of4, then train-1of4
     and so on. The filter is then fitted to the training split, and each session is predicted by the
     network that was trained without it."""
     fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
@@ -124,15 +127,19 @@ class TablesConfig:
 
 @dataclass(frozen=True)
 class CompareConfig:
-    rows: Annotated[tuple[str, ...], Words("RUNS", named=False)]
-    """Runs; the others are compared with the first. A name without its seed stands for all seeds:
-    runs/gnio for runs/gnio_s0, runs/gnio_s1, ... The folder of an evaluation is one row."""
+    rows: Annotated[tuple[str, ...], Words("NETWORKS", named=False)]
+    """Networks: folders of runs, packages or names; the others are compared with the first. A name
+    without its seed stands for all seeds: runs/gnio for runs/gnio_s0, runs/gnio_s1, ... The folder
+    of an evaluation is one row."""
+    dataset: str | None = None
+    """Dataset whose evaluations are compared; by default that of each run. If a network has learnt
+    from several, name one."""
     split: str = "test"
     """Split whose evaluations are compared."""
     estimator: Literal["ekf", "integrate", "imu_only"] = "ekf"
     """Estimator whose evaluations are compared."""
     data_root: str | None = None
-    """Folder of the dataset, for runs that are not evaluated yet; by default the run's,
+    """Folder of the dataset, for networks that are not evaluated yet; by default the run's,
     $GNIO_DATA/<dataset>, or data/<dataset>."""
     metrics: tuple[str, ...] | None = None
     """Metrics to compare, by their names in metrics.json; by default those of ate, rpe_1s,

@@ -142,8 +142,9 @@ class DataConfig:
     of them, drawn again in every epoch; with 2 it visits all of them twice. The default is 1 for
     each (ours)."""
     poses_by: Annotated[str | None, FILE_ONLY] = None
-    """Calibrated run, or package of weights (see gnio weights). From its displacements the smoother
-    makes poses for walks with waypoints; by default these poses are interpolated (ours)."""
+    """Calibrated network: the folder of a run, a package or a name (see gnio weights). From its
+    displacements the smoother makes poses for walks with waypoints; by default these poses are
+    interpolated (ours)."""
 
     @property
     def window(self) -> int:
@@ -540,9 +541,9 @@ class TrainConfig:
     workdir: str | None = None
     """Folder for checkpoints and logs; by default runs/<dataset>_<model>."""
     init_from: str | None = None
-    """Run, or package of weights (see gnio weights), of the same network; training starts from its
-    best weights, by default from random ones. Through the filter, `gnio train` also begins with its
-    filter options."""
+    """Network of the same kind: the folder of a run, a package or a name (see gnio weights).
+    Training starts from its weights, by default from random ones. Through the filter, `gnio train`
+    also begins with its filter options."""
     seed: Seed = 0
     """Seed of the initial parameters, the shuffling and the augmentation."""
     data: DataConfig = field(default_factory=DataConfig)

@@ -30,15 +30,23 @@ def load(
     workers: int = 1,
     progress: Progress = silent,
 ) -> list[Sequence]:
-    """The sequences of a split of a dataset, validated and self-checked, at its native rate
-    (`resample` changes that), in the order of its recordings. A split may be a fold, or all but a
-    fold (see `splits.Fold`).
+    """The sequences of a split of a dataset, validated and self-checked, at its native rate, in the
+    order of its recordings. `resample` changes the rate.
 
     Recordings that cannot be used, or that fail the physical self-check, are left out with a
-    warning. With `workers` > 1 that many processes read the recordings that are slow to read and
-    not in the cache yet. Sequences, warnings and errors do not depend on their number. `progress`
-    gets the finished share of these recordings. Raises `InputError` on an unknown name or split, a
-    missing folder, a damaged file, two sequences of one name, or a split without a sequence.
+    warning. Sequences, warnings and errors do not depend on the number of workers.
+
+    Args:
+        name: The dataset, one of `names()`.
+        root: Its folder; None: `find_root` looks for it.
+        split: A split, a fold of one, or all but a fold (`splits.Fold`).
+        workers: Number of processes that read the recordings that are slow to read and not in the
+            cache yet.
+        progress: A function that gets the finished share of these recordings.
+
+    Raises:
+        InputError: The name or the split is unknown, the folder is missing, a file is damaged, two
+            sequences have one name, or the split has no sequence.
     """
     return list(load_each(name, root, split, workers, progress))
 
@@ -50,7 +58,15 @@ def load_each(
     workers: int = 1,
     progress: Progress = silent,
 ) -> Iterator[Sequence]:
-    """The sequences of `load` one after another, if together they do not fit into memory."""
+    """The sequences of `load` one after another, if together they do not fit into memory.
+
+    Args:
+        name: The dataset, one of `names()`.
+        root: Its folder; None: `find_root` looks for it.
+        split: A split, a fold of one, or all but a fold.
+        workers: Number of processes that read.
+        progress: A function that gets the finished share.
+    """
     if fold := parse_fold(split):
         return iter(fold.select(load_each(name, root, fold.split, workers, progress)))
     dataset = get(name)

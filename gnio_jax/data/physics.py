@@ -38,6 +38,8 @@ SHORTEST, SHORT = 5.0, 8.0
 """Durations of a recording below which nothing is warned of, or proven, s."""
 CLOCKS = (1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3)
 """Wrong clocks: true seconds in a second of the stamps."""
+NEAR_CLOCKS, CLEARLY = (0.2, 0.4, 0.5, 2.0, 2.5, 5.0), 0.7
+"""Clocks for which a counter may be taken, likewise, and the share of the error that decides."""
 SCALES = {"deg/s": DEGREE, "rad/s": 1 / DEGREE}
 """Units for which another one may have been taken, relative to it."""
 COUNTS_OF_DEGREE = (131.0, 65.5, 32.8, 16.4)
@@ -89,6 +91,14 @@ def agreement(imu: ImuSamples, scale: float = 1.0, clock: float = 1.0) -> tuple[
 def is_supported(error: float, contrast: float) -> bool:
     """Whether an agreement shows that the gyro explains the turning of gravity."""
     return bool(error < 1.0 and contrast > LEAST_CONTRAST)
+
+
+def is_clock_supported(imu: ImuSamples) -> bool:
+    """Whether the gyro explains the turning of gravity, and no clock of `NEAR_CLOCKS` does so
+    clearly better: a test for clocks that are in doubt anyway, which fails for some good ones."""
+    error, contrast = agreement(imu)
+    others = [agreement(imu, clock=clock)[0] for clock in NEAR_CLOCKS]
+    return is_supported(error, contrast) and min(others) > CLEARLY * error
 
 
 def contradiction(imu: ImuSamples) -> tuple[float, str, str] | None:

@@ -103,12 +103,17 @@ def estimate(
     batch_size: int = 16,
     progress: Progress = silent,
 ) -> list[SequenceEstimate]:
-    """Trajectories of the recordings, by the filter, or by the sum of displacements if `ekf` is
-    None.
+    """Trajectories of the recordings, by the filter or by the sum of displacements.
 
-    `source` is the network, which then runs inside the filter, or the displacements of each
-    recording. The filter runs over `batch_size` recordings side by side; other batch sizes give the
-    same trajectories to rounding.
+    Args:
+        recordings: Recordings of any lengths.
+        source: The network, which then runs inside the filter, or the displacements of each
+            recording.
+        windows: Rate, window and stride.
+        ekf: The filter; None: the displacements are summed.
+        batch_size: Number of recordings that the filter runs over side by side. Other numbers give
+            the same trajectories to rounding.
+        progress: A function that gets the finished share.
     """
     if ekf is None:
         assert not isinstance(source, Network)

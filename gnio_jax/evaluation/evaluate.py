@@ -1,4 +1,4 @@
-"""One evaluation, from a run and its options to a folder of results.
+"""One evaluation, from a network and its options to a folder of results.
 
     prepare → infer → estimate → score → report
 
@@ -39,6 +39,8 @@ from gnio_jax.evaluation.report import DEFINITIONS, Report
 from gnio_jax.evaluation.trajectory import Alignment, Undefined, pair, read_tum
 from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
+from gnio_jax.networks import TrainedNetwork, find_network, newest_run, read_network
+from gnio_jax.networks.folder import evaluations_folder, training_recordings
 from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
 
@@ -71,27 +73,33 @@ def evaluate(
     reporter: Reporter = SILENCE,
     workers: int = 1,
     command: str = "",
-    run: Any = None,
 ) -> Evaluation:
-    """Estimate every sequence of a split with the network of a run, measure the errors, and write
-    the results to a folder of the run.
+    """Estimate every sequence of a split with a trained network, measure the errors, and write the
+    results to a folder of the network.
 
     The folder is written whole or not at all, and replaces that of an earlier evaluation with the
-    same options. `workers` processes read recordings that are slow to read; `command` is the
-    command line, for the page; `run` is the `training.checkpoint.Run` of `config`, if it is loaded
-    already. Raises `InputError` for options that do not fit together, a run without the checkpoint,
-    missing data, and a split of which no sequence can be estimated.
+    same options.
+
+    Args:
+        config: The options of `gnio evaluate`.
+        reporter: It gets progress and lines of text.
+        workers: Number of processes that read recordings that are slow to read.
+        command: The command line, for the page.
+
+    Raises:
+        InputError: Options do not fit together, the network cannot be loaded, data are missing, or
+            no sequence of the split can be estimated.
     """
     _check(config)
-    from gnio_jax.training.checkpoint import (  # Orbax takes seconds to import
-        load_run,
-        training_recordings,
-    )
+    path = find_network(config.network or newest_run())
+    if config.checkpoint == "latest":
+        from gnio_jax.training.checkpoint import load_latest  # Orbax takes half a second to import
 
-    workdir = Path(config.workdir or configuration.newest_run())
-    run = run or load_run(workdir, config.checkpoint)
-    config = resolve(config, run.config)
-    windows, ekf = run.config.data, make_filter(run.config.data, config.filter)
+        trained = load_latest(path)
+    else:
+        trained = read_network(path)
+    config = resolve(config, trained.config)
+    windows, ekf = trained.config.data, make_filter(trained.config.data, config.filter)
 
     def stage(name: str) -> Progress:
         return functools.partial(reporter.progress, name)
@@ -102,7 +110,7 @@ def evaluate(
             problem = f"has waypoints, and no --alignment {config.alignment}"
             remedy = "leave it out: one turn about z and one shift are fitted"
             raise InputError(sequence.name, problem, remedy)
-    learnt = training_recordings(workdir, run.config, config.dataset)
+    learnt = training_recordings(path, trained.config, config.dataset)
     if overlap := [sequence.name for sequence in sequences if sequence.name in learnt]:
         count = f"{len(overlap)} of {len(sequences)} recordings, e.g. {overlap[0]}"
         reporter.line(f"warning: the network has learnt from {count}: its errors there are smaller")
@@ -119,7 +127,7 @@ def evaluate(
         problem = f"no sequence of split '{config.split}' can be estimated ({name}: {reason})"
         raise InputError(f"dataset {config.dataset}", problem)
 
-    network = Network.of(run.model, run.variables)
+    network = Network.of(trained.model, trained.variables)
     if _infers(config):
         least_std = math.exp(ekf.config.log_std_min) if config.estimator == "ekf" else 0.0
         source = infer(network, recordings, windows, stage("inferring"), least_std=least_std)
@@ -137,7 +145,7 @@ def evaluate(
     compared = {"never_moves": never_moves(estimates), "perfect_displacements": floor}
 
     report = Report(
-        {**_describe_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
+        _describe_settings(config, trained, sequences),
         score(estimates, config.alignment),
         {row: score(of, config.alignment) for row, of in compared.items() if of},
         {recording.name: recording.group for recording in recordings},
@@ -145,8 +153,8 @@ def evaluate(
         left_out,
         {recording.name: recording.placement for recording in recordings if recording.placement},
     )
-    folder = folder_of(workdir, config, run.config)
-    write(folder, report, estimates, run.config, command, config.plots, stage("drawing"))
+    folder = folder_of(path, config, trained.config)
+    write(folder, report, estimates, trained.config, command, config.plots, stage("drawing"))
     return Evaluation(report, estimates, recordings, folder)
 
 
@@ -192,7 +200,7 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
     if config.dataset is None and len(run.datasets) > 1:
         remedy = f"give --dataset, e.g. {dataset}"
         raise InputError(
-            config.workdir or "the run", f"has learnt from {', '.join(run.datasets)}", remedy
+            config.network or "the run", f"has learnt from {', '.join(run.datasets)}", remedy
         )
     if data.get(dataset).needs_root:
         data_root = config.data_root or (run.data_root if dataset in run.datasets else None)
@@ -218,12 +226,12 @@ def _default_orientation(config: EvaluateConfig) -> Orientation:
     return "reference" if _infers(config) else "filter"
 
 
-def folder_of(workdir: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
-    """The folder of a run for the results of a resolved `config`.
+def folder_of(path: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
+    """The folder of a network for the results of a resolved `config`.
 
     If it already holds the results of another `data_root`, they stay: from then on the folder of
     this data root has a suffix of its name and a digest of its path."""
-    folder = workdir / "eval" / folder_name(config, run)
+    folder = evaluations_folder(path) / folder_name(config, run)
     if config.data_root is None:
         return folder
     root = Path(config.data_root)
@@ -254,7 +262,7 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
 
 
 def _describe_settings(
-    config: EvaluateConfig, run: TrainConfig, sequences: list[Sequence]
+    config: EvaluateConfig, trained: TrainedNetwork, sequences: list[Sequence]
 ) -> dict[str, Any]:
     """The settings that define the meaning of the figures and their subject."""
     compensated = {str(sequence.attributes.get("imu_compensated", "no")) for sequence in sequences}
@@ -274,12 +282,16 @@ def _describe_settings(
         "gyro_bias": config.gyro_bias,
         "imu_compensated": " and ".join(sorted(compensated)),
         "alignment": config.alignment,
-        "model": run.model.name,
+        "network": trained.name,
+        "model": trained.config.model.name,
         "checkpoint": config.checkpoint,
-        **{name: getattr(run.data, name) for name in WINDOWS},
+        "weights": trained.digest or None,
+        **{name: getattr(trained.config.data, name) for name in WINDOWS},
         "filter": configuration.to_plain(config.filter),
         "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,
         "definitions": DEFINITIONS,
         "device": jax.devices()[0].device_kind,
         "version": version("gnio-jax"),
+        "epoch": trained.epoch,
+        "step": trained.step,
     }

@@ -59,11 +59,17 @@ def infer(
     least_std: float = 0.0,
 ) -> list[Displacements]:
     """The network's predictions for every window of the recordings, in large batches over all of
-    them. `PreparedRecording.attitude` turns the windows. The results are float64 on the host.
+    them. They are float64 on the host. A window that touches a sample which was not measured has no
+    displacement.
 
-    A window that touches a sample which was not measured has no displacement. `diagnostics` names
-    those that are stored, if the network has them. `least_std` is the smallest standard deviation
-    that the estimator uses, m (`FilterConfig.log_std_min`).
+    Args:
+        network: The network.
+        recordings: Recordings with an `attitude`, which turns the windows.
+        windows: Rate, window and stride.
+        progress: A function that gets the finished share.
+        diagnostics: Names of the diagnostics that are stored, if the network has them.
+        least_std: Smallest standard deviation that the estimator uses, m
+            (`FilterConfig.log_std_min` is its logarithm).
     """
     parts, starts, turns = [], [], []
     for recording in recordings:

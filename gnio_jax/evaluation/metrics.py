@@ -103,13 +103,23 @@ def rpe(
     dims: int = 3,
     full: bool = False,
 ) -> float:
-    """Relative pose error: RMS of R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i) over pairs `seconds` apart,
-    from every row, m (TLIO).
+    """Relative pose error, m: RMS of R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i) over pairs of rows i, j,
+    from every row i (TLIO).
 
     ψ is the yaw error at the start (`relative_yaw`), so a wrong heading of the whole trajectory
-    adds no error. With `full` the whole attitude at the start is aligned, by R_i R̂_iᵀ in the place
-    of R_z (the translation part of TUM and evo). With `dims` 2 it is the error of the horizontal
-    part.
+    adds no error.
+
+    Args:
+        estimate: The estimated poses.
+        reference: The true poses at the same stamps.
+        step: Time between two rows, s.
+        seconds: Time between the rows of a pair, s.
+        dims: 3, or 2 for the horizontal part of the error.
+        full: Whether the whole attitude at the start is aligned, by R_i R̂_iᵀ in the place of R_z
+            (the translation part of TUM and evo).
+
+    Raises:
+        Undefined: No pair is known.
     """
     if full:
         ours, true = (matrix_from_quaternion(path.orientation) for path in (estimate, reference))
@@ -463,14 +473,23 @@ def measure(
     filtered: Filtered | None = None,
     waypoints: Waypoints | None = None,
 ) -> Measures:
-    """Every metric of one sequence. `reference` has the estimate's stamps. With `waypoints` there
-    is no other reference, and the metrics are those of `OF_WAYPOINTS` and of the filter.
+    """Every metric of one sequence.
 
     `ate*`, `rte*`, `drift` and `yaw_rmse` use the estimate with `alignment`, which is fitted in 3-D
     for the horizontal metrics too. NEES uses alignment at the start, because the filter's
     covariance is relative to its start. An estimate with a row that is not finite has diverged:
-    every metric that a finite one would have is infinite, and the shares are 0. Raises `ValueError`
-    for a reference with other stamps.
+    every metric that a finite one would have is infinite, and the shares are 0.
+
+    Args:
+        estimate: The estimated poses.
+        reference: The true poses at the same stamps; NaN where they are not known.
+        alignment: The rigid motion that is fitted before errors are computed (`align`).
+        filtered: Covariances, innovations and gate of the filter, for its metrics.
+        waypoints: The only reference of a sequence without poses. The metrics are then those of
+            `OF_WAYPOINTS` and of the filter.
+
+    Raises:
+        ValueError: The reference has other stamps.
     """
     stamps = (estimate.time, reference.time)
     if waypoints is None and (

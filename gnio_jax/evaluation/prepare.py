@@ -130,14 +130,26 @@ def prepare(
 ) -> tuple[list[PreparedRecording], dict[str, str]]:
     """Recordings to estimate, and the names of the sequences that are left out with the reason.
 
-    A recording begins at the first sample with a trusted reference. With `from_first`, or without a
-    reference, it begins at its first sample. `ekf` has the uncertainty of the start; None: the
-    defaults. A static start replaces the standard deviations of tilt and velocity. A sequence with
-    waypoints has no pose to start from, so its start is always static. `ekf.raw_gyro_bias` replaces
-    the standard deviation of the level components of the gyro's bias if neither the phone nor a
-    rest gives a first estimate of it: if `imu_compensated` is "no" and the bias starts from zero.
-    `orientation` is the source of `PreparedRecording.attitude`; None: there is none. Raises
-    `InputError` for a sequence that lacks what these choices need.
+    A recording begins at the first sample with a trusted reference, or without a reference at its
+    first sample. A sequence with waypoints has no pose to start from, so its start is always
+    static.
+
+    Args:
+        sequences: The sequences, at any rate.
+        windows: Rate, window and stride.
+        ekf: The filter, for the uncertainty of the start; None: the defaults. A static start
+            replaces the standard deviations of tilt and velocity. `ekf.raw_gyro_bias` replaces that
+            of the level components of the gyro's bias if neither the phone nor a rest gives a first
+            estimate of it: if `imu_compensated` is "no" and the bias starts from zero.
+        init: "reference" takes pose and velocity of the reference. "static" takes the tilt from
+            gravity, and yaw, position and velocity are zero.
+        gyro_bias: The source of the first estimate of the gyro's bias, "zero", "rest" or
+            "reference".
+        orientation: The source of `PreparedRecording.attitude`; None: there is none.
+        from_first: Whether recordings begin at their first sample, whatever the reference.
+
+    Raises:
+        InputError: A sequence lacks what these choices need.
     """
     ekf = ekf or make_filter(windows, FilterSettings())
     recordings, left_out = [], {}

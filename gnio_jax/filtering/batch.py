@@ -43,7 +43,7 @@ def batches(intervals: Sequence[int], size: int, padded: Callable[[int], int]) -
 
 
 def padded_signals(
-    recordings: Iterable[tuple[Float[Array, "m 3"], Float[Array, "m 3"]]], samples: int
+    recordings: Iterable[tuple[Float[Array, "_ 3"], Float[Array, "_ 3"]]], samples: int
 ) -> tuple[Float[np.ndarray, "b n 3"], Float[np.ndarray, "b n 3"]]:
     """Gyro and accel of recordings, each with `samples` rows.
 

@@ -135,20 +135,27 @@ def fixes_on_intervals(
     time_std: Any = 0.0,
     threshold: float | None = None,
 ) -> Fix:
-    """f fixes in any order, each in the row of the clone interval whose end is nearest.
+    """Fixes of position, each in the row of the clone interval whose end is nearest.
 
-    time (f,) s, on the clock on which `start` is the stamp of the first IMU sample; position (f, m)
-    m in the world frame, m = 2 or 3; covariance (f, m, m) m²; intervals K; time_std s, one or (f,);
-    threshold of the χ² test, by default 99 %. A fix during the samples that follow the K intervals,
-    which are less than another one, is in the last row.
+    A fix without any component is ignored. Several fixes in one row become their mean, component by
+    component over those that have it, with the covariance of this mean; their time is their mean
+    time. The weights are the inverses of their mean variances.
 
-    A component that is NaN is missing, with its rows and columns of the covariance; a fix without
-    any component is ignored. Several fixes in one row become their mean, component by component
-    over those that have it, with the covariance of this mean; their time is their mean time. The
-    weights are the inverses of their mean variances.
+    Args:
+        time: (f,) stamps in any order, s, on the clock of `start`.
+        position: (f, m) positions in the world, m, with m = 2 (horizontal) or 3. A component that
+            is NaN is missing, with its rows and columns of the covariance.
+        covariance: (f, m, m) covariances, m².
+        intervals: Number K of clone intervals. A fix during the samples that follow them, which are
+            less than another one, is in the last row.
+        config: The settings of the filter, for the length of an interval.
+        start: Stamp of the first IMU sample, s.
+        time_std: Standard deviation of the stamps, s, one number or (f,).
+        threshold: Largest χ² of a fix that is used; None: the quantile of 99 %.
 
-    Raises `InputError` for another shape, for a covariance that is not symmetric and positive
-    definite, for a time_std below 0, and for a fix outside of the recording.
+    Raises:
+        InputError: A shape differs, a covariance is not symmetric and positive definite, a
+            `time_std` is below 0, or a fix is outside of the recording.
     """
     time, position, covariance = (np.asarray(x, np.float64) for x in (time, position, covariance))
     count, axes = position.shape if position.ndim == 2 else (-1, 0)

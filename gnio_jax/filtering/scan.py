@@ -56,27 +56,35 @@ def run_filter(
 ) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals of n IMU samples with given displacements (paper §III-G).
 
-    - ekf: the filter (`Filter`, `make_filter`).
-    - state: the start (`initial_state`, `level_state`), or what an earlier run returned.
-    - gyro, accel: (K·n, 3) rad/s and m/s², raw, in the body frame; the filter subtracts its biases.
-    - displacement, covariance: (K, 3) m and (K, 3, 3) m², before the scaling of `ekf.noise`. Row k
-      is from clone k − W to clone k, expressed in the yaw frame of clone k − W (`displacements`
-      makes such rows from a known trajectory). A row with a NaN, or before there are W + 1 clones,
-      is no measurement.
-    - imu_valid: (K·n,) booleans, False where an IMU sample is missing. Missing samples are bridged
-      (see `gaps`), and if there is a mask also those that are not finite. None: the stream is
-      complete.
-    - frame: the attitude that defines this yaw frame: "given" is another one than the filter's,
-      "own" is the filter's, as for the displacements of `FilterHistory.given`, which repeat a run
-      of `run_odometry` without its network.
-    - measurements: measurements with a row for each interval, the leading axis K of their arrays.
-      They are taken after the displacement and after those of `ekf`, in their order (see `update`).
+    It works under `jax.jit`, `jax.vmap` and `jax.grad`.
 
-    Returns the final state, from which a later call continues (and continues the clone numbers k),
-    and the history. Works under `jax.jit`, `jax.vmap` and `jax.grad`. Raises `ValueError` naming an
-    argument of wrong shape or precision, with values that are not finite, or a covariance that is
-    not positive definite. Inside `jit` values are not known; `FilterHistory.healthy` reports bad
-    ones.
+    Args:
+        ekf: The filter (`Filter`, `make_filter`).
+        state: The start (`initial_state`, `level_state`), or the final state of an earlier run.
+        gyro: (K·n, 3) angular rate, body frame, rad/s, raw: the filter subtracts its bias.
+        accel: (K·n, 3) specific force, body frame, m/s², raw.
+        displacement: (K, 3) m. Row k is from clone k − W to clone k, expressed in the yaw frame of
+            clone k − W (`displacements` makes such rows from a known trajectory). A row with a NaN,
+            or before there are W + 1 clones, is no measurement.
+        covariance: (K, 3, 3) m², before the scaling of `ekf.noise`.
+        imu_valid: (K·n,) booleans, False where an IMU sample is missing. Missing samples are
+            bridged (`filtering/gaps.py`), and if there is a mask also those that are not finite.
+            None: the stream is complete.
+        frame: The attitude that defines this yaw frame. "given" is another one than the filter's.
+            "own" is the filter's, as for the displacements of `FilterHistory.given`, which repeat a
+            run of `run_odometry` without its network.
+        measurements: Measurements with a row for each interval, the leading axis K of their arrays.
+            They are taken in their order, after the displacement and after those of `ekf`
+            (`update.Measurement`).
+
+    Returns:
+        The final state, from which a later call continues (and continues the clone numbers k), and
+        the history.
+
+    Raises:
+        ValueError: An argument has the wrong shape or precision, values that are not finite, or a
+            covariance that is not positive definite. Inside `jit` values are not known, and
+            `FilterHistory.healthy` reports bad ones.
     """
     check_frame(frame)
     inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
@@ -103,19 +111,34 @@ def run_odometry(
     """Filter K clone intervals with the network in the loop (paper fig. 2): its windows are cut
     with the filter's own state.
 
-    predict maps windows (1, C + N, 6) float32, N = n·W, channels [accel m/s², gyro rad/s], to a
-    `Prediction` with the same leading axis. A window spans the samples between its two clones i and
-    j, and before them come the C samples of its context (`FilterConfig.context_samples`). The
-    filter's present biases are subtracted and the samples rotated by R_γ(R_i)ᵀ R_m, R_m being the
-    present estimate of clone i advanced by integrating gyro − b_g (paper eq. 1; backwards through
-    the context), unless `FilterConfig.window_rotation` says otherwise. The displacement is
-    expressed in the filter's own yaw frame and linearised accordingly
-    (`displacement.linearise_displacement`), except with "tlio". Its covariance is diag(exp 2u), u
-    raised to `log_std_min`. The network is not called in the first `FilterConfig.first_measured`
-    intervals after the start, which have no whole window, and a window in which the filter coasted
-    through a gap is no measurement. Everything else is as in `run_filter`. Jit it from outside. It
-    is also differentiable in the values that `predict` closes over. Raises `ValueError` as
-    `run_filter` does, or for a `predict` that returns something else.
+    A window spans the samples between its two clones i and j, and before them come the C samples of
+    its context (`FilterConfig.context_samples`). The filter's present biases are subtracted and the
+    samples rotated by R_γ(R_i)ᵀ R_m, R_m being the present estimate of clone i advanced by
+    integrating gyro − b_g (paper eq. 1; backwards through the context), unless
+    `FilterConfig.window_rotation` says otherwise. The displacement is expressed in the filter's own
+    yaw frame and linearised accordingly (`displacement.linearise_displacement`), except with
+    "tlio". Its covariance is diag(exp 2u), u raised to `log_std_min`. The network is not called in
+    the first `FilterConfig.first_measured` intervals after the start, which have no whole window. A
+    window in which the filter coasted through a gap is no measurement.
+
+    Jit it from outside. It is also differentiable in the values that `predict` closes over.
+
+    Args:
+        predict: A function from windows (1, C + N, 6) float32, N = n·W, channels [accel m/s², gyro
+            rad/s], to a `Prediction` with the same leading axis.
+        ekf: The filter (`Filter`, `make_filter`).
+        state: The start (`initial_state`, `level_state`), or the final state of an earlier run.
+        gyro: (K·n, 3) angular rate, body frame, rad/s, raw: the filter subtracts its bias.
+        accel: (K·n, 3) specific force, body frame, m/s², raw.
+        imu_valid: (K·n,) booleans, False where an IMU sample is missing, as in `run_filter`; None:
+            the stream is complete.
+        measurements: Measurements with a row for each interval, as in `run_filter`.
+
+    Returns:
+        The final state and the history, as `run_filter` does.
+
+    Raises:
+        ValueError: As `run_filter`, or `predict` returns something else.
     """
     inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
     config, begun = ekf.config, inputs.state.window is not None

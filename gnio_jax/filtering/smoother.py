@@ -91,20 +91,34 @@ def smooth(
     """Filter K clone intervals as `run_filter` does, then smooth: each row is the estimate given
     all measurements of the K intervals.
 
-    Arguments and `ValueError`s are those of `run_filter`, whose updates are smoothed exactly as
-    they were made. A run of `run_odometry` that returned `history` is smoothed without its network
-    by `smooth(ekf, state, gyro, accel, *history.given(ekf.noise),
-    frame=ekf.config.displacement_frame)`. `state` is the prior, and earlier measurements are not
-    smoothed. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
+    The updates of `run_filter` are smoothed exactly as they were made. A run of `run_odometry` that
+    returned `history` is smoothed without its network by `smooth(ekf, state, gyro, accel,
+    *history.given(ekf.noise), frame=ekf.config.displacement_frame)`. `state` is the prior, and
+    earlier measurements are not smoothed. It works under `jax.jit`, `jax.vmap` and `jax.grad`.
 
     Smoothing trusts the IMU as far as `ekf.noise` says. Where the IMU is sampled too slowly for the
     motion, as on a swinging leg at 100 Hz, its integration errs by more than that, and the smoothed
-    positions can be worse than those of the filter. With 200 Hz, or with a larger
-    `accel_density` (0.03 there), they are better.
+    positions can be worse than those of the filter. With 200 Hz, or with a larger `accel_density`
+    (0.03 there), they are better.
 
     Memory: about K · (18 m + 500) numbers, m = 21 + 6 (W + 1): 25 kB for each interval at W = 20,
     in float64. Smoothed variances are differences. In float32 a variance that becomes smaller by
     many orders of magnitude, as at the start, keeps few digits and can become negative.
+
+    Args:
+        ekf: The filter (`Filter`, `make_filter`).
+        state: The start (`initial_state`, `level_state`), or the final state of an earlier run.
+        gyro: (K·n, 3) angular rate, body frame, rad/s, raw: the filter subtracts its bias.
+        accel: (K·n, 3) specific force, body frame, m/s², raw.
+        displacement: (K, 3) m, as in `run_filter`.
+        covariance: (K, 3, 3) m², as in `run_filter`.
+        imu_valid: (K·n,) booleans, False where an IMU sample is missing; None: the stream is
+            complete.
+        frame: The attitude that defines the frame of the displacements, "given" or "own".
+        measurements: Measurements with a row for each interval.
+
+    Raises:
+        ValueError: As `run_filter`.
     """
     check_frame(frame)
     inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)

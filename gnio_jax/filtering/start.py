@@ -69,16 +69,23 @@ def initial_state(
 ) -> FilterState:
     """Start of the filter from a known pose, without clones.
 
-    rotation (3, 3) body → world; velocity (3,) m/s and position (3,) m in the world frame;
-    gyro_bias rad/s and accel_bias m/s², each (3,) or one number for all axes. `ekf.start` has the
-    standard deviations of their errors, which are independent. Raises `ValueError` naming an
-    argument of wrong shape or precision.
+    Gravity shows the level components of a gyro bias to the filter. Without a rest and without
+    fixes, only the displacements show the vertical one, and their errors are temporally correlated:
+    a filter that learns it from them loses the yaw.
 
-    level_gyro_bias, rad/s, is the standard deviation of the two components of the gyro bias that
-    are level at the start, if it is not ekf.start.gyro_bias (ours, for a raw gyro). Gravity shows
-    these components to the filter. Without a rest and without fixes, only the displacements show
-    the vertical one, and their errors are temporally correlated: a filter that learns it from them
-    loses the yaw.
+    Args:
+        ekf: The filter. `ekf.start` has the standard deviations of the errors of all values here,
+            which are independent.
+        rotation: (3, 3) body → world.
+        velocity: (3,) world frame, m/s.
+        position: (3,) world frame, m.
+        gyro_bias: (3,) body frame, rad/s, or one number for all axes.
+        accel_bias: (3,) body frame, m/s², or one number for all axes.
+        level_gyro_bias: Standard deviation of the two components of the gyro bias that are level at
+            the start, rad/s (ours, for a raw gyro); None: `ekf.start.gyro_bias`.
+
+    Raises:
+        ValueError: An argument has the wrong shape or precision.
     """
     check_filter(ekf)
     config = ekf.config

@@ -105,23 +105,29 @@ class Core(NamedTuple):
 class Tracker:
     """The filter with the network in the loop, fed sample by sample.
 
-    - predict, ekf: as `run_odometry` takes them, with the measurements of the filter. The consider
-      covariance of `ekf.considered` is added to that of the poses; a tracker takes no gyro as raw,
-      so `raw_gyro_bias` has no effect.
-    - state: the start, at the time of the first sample (`initial_state`, `level_state`, or the
-      final state of a run). None: it is made of the first `rest_seconds`, in which the device must
-      be still (`level_state`). Until then there is no pose; afterwards these samples are filtered
-      too. A sample that is missing, or without any acceleration, begins the rest anew.
-    - rest_seconds: length of that rest, s.
-    - hole: samples further apart than this leave the grid samples between them missing, s; None:
-      1.5 dt. A slower IMU needs a larger value.
-    - imu_rate: Hz, nominal, of the samples that will come; None: 1/dt. A faster IMU is band-limited
-      as in `data.resample`, and poses come later by `delay`. The rate could be estimated from the
-      stamps, but then there would be no pose before, and the delay would depend on jitter.
-
     The constructor compiles everything, so that no sample waits for a compiler. Poses are new
     arrays, which later samples do not change. A tracker must not be used by several threads at
-    once. Raises `ValueError` naming an argument that makes no sense.
+    once.
+
+    Args:
+        predict: The network, as in `run_odometry`.
+        ekf: The filter, with its measurements. The consider covariance of `ekf.considered` is added
+            to that of the poses. A tracker takes no gyro as raw, so `raw_gyro_bias` has no effect.
+        state: The start, at the time of the first sample (`initial_state`, `level_state`, or the
+            final state of a run). None: it is made of the first `rest_seconds`, in which the device
+            must be still (`level_state`). Until then there is no pose; afterwards these samples are
+            filtered too. A sample that is missing, or without any acceleration, begins the rest
+            anew.
+        rest_seconds: Length of that rest, s.
+        hole: Samples further apart than this leave the grid samples between them missing, s; None:
+            1.5 dt. A slower IMU needs a larger value.
+        imu_rate: Nominal rate of the samples that will come, Hz; None: 1/dt. A faster IMU is
+            band-limited as in `data.resample`, and poses come later by `delay`. The rate could be
+            estimated from the stamps, but then there would be no pose before, and the delay would
+            depend on jitter.
+
+    Raises:
+        ValueError: An argument makes no sense.
     """
 
     def __init__(

@@ -218,12 +218,23 @@ def measure(
     threshold: Array | float = math.inf,
     frame: MeasuredFrame = "carrier",
 ) -> tuple[FilterState, Outcome, Correction]:
-    """One EKF update. A residual or covariance with a NaN means that there is no measurement, and
-    so does a measurement from the oldest clone before there are W + 1 of them. A measurement whose
-    rᵀ S⁻¹ r is above a finite `threshold` is refused (e.g. a quantile of χ² with m degrees of
-    freedom). If S is not positive definite, the state becomes NaN, which
-    `FilterHistory.healthy` reports. `frame` is that of the measured quantity: a position in the
-    world that is measured with "carrier" would show a yaw that nobody measured."""
+    """One EKF update.
+
+    Args:
+        state: The state at the end of the interval.
+        linear: Residual, blocks of the Jacobian, and covariance. A residual or covariance with a
+            NaN means that there is no measurement, and so does a measurement from the oldest clone
+            before there are W + 1 of them.
+        step: The clone interval.
+        threshold: Largest rᵀ S⁻¹ r of a measurement that is used, e.g. a quantile of χ² with m
+            degrees of freedom.
+        frame: The frame to which the measured quantity is fixed, "carrier" or "world". A position
+            in the world that is measured with "carrier" would show a yaw that nobody measured.
+
+    Returns:
+        The updated state, the outcome, and the correction. If S is not positive definite, the state
+        becomes NaN, which `FilterHistory.healthy` reports.
+    """
     outcome, correction = project(state, linear, step)
     tested = outcome.present & jnp.isfinite(threshold)
     accepted = outcome.present & ~(outcome.nis > threshold)

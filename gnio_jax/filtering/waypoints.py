@@ -97,14 +97,20 @@ def waypoint_poses(
 ) -> WaypointPoses:
     """Poses of a walk with waypoints.
 
-    predict: the displacements, as in `run_odometry`; ekf: the filter, at the rate of `sequence`;
-    place_std m, time_std s: the standard deviations of a waypoint. Programs are compiled for each
-    `predict` and for a few lengths.
+    Programs are compiled for each `predict` and for a few lengths.
 
-    Raises `InputError` for a sequence of another rate, with samples that are not finite, or without
-    `START_SECONDS` and a window that were measured; for waypoints that have a `Waypoints.problem`,
-    or do not show the yaw; and where the filter fails, or most waypoints are far from the smoothed
-    path.
+    Args:
+        sequence: The walk, at the filter's rate.
+        predict: The network, as in `run_odometry`.
+        ekf: The filter.
+        place_std: Standard deviation of the place of a waypoint, m.
+        time_std: Standard deviation of its stamp, s.
+
+    Raises:
+        InputError: The sequence has another rate, samples that are not finite, or lacks
+            `START_SECONDS` and a window that were measured; its waypoints have a
+            `Waypoints.problem`, or do not show the yaw; the filter fails, or most waypoints are far
+            from the smoothed path.
     """
     config = dataclasses.replace(ekf.config, history="core")
     ekf = dataclasses.replace(ekf, config=config)

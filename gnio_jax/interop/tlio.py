@@ -21,6 +21,7 @@ from gnio_jax import models
 from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.files import replacing_folder
+from gnio_jax.networks import TrainedNetwork, write_network
 
 _CHANNELS = np.array([3, 4, 5, 0, 1, 2])
 """Index of each of our channels, [accel, gyro], among TLIO's, [gyro, accel]."""
@@ -151,16 +152,14 @@ def _torch(path: Path) -> Any:
 
 
 def write_run(weights: Path, workdir: Path, data: DataConfig, dataset: str = "tlio") -> None:
-    """Make a run of TLIO's weights that `evaluate` reads: config.yaml and checkpoints/best. The
-    folder appears whole or not at all.
+    """Make a run of TLIO's weights that all commands read: config.yaml and weights.safetensors.
+    The folder appears whole or not at all.
 
     `data` gives rate, window and stride that the network was trained with. Raises `InputError` for
     weights that do not fit them, or a folder that is there already.
     """
-    from gnio_jax.training import checkpoint  # Orbax takes longer to import than all else
-
-    network, settings = ModelConfig(name="tlio"), FilterSettings(window_rotation="tlio")
-    config = TrainConfig(dataset=dataset, data=data, model=network, filter=settings)
+    model, settings = ModelConfig(name="tlio"), FilterSettings(window_rotation="tlio")
+    config = TrainConfig(dataset=dataset, data=data, model=model, filter=settings)
     configuration.validate(config, "gnio interop")
     if workdir.exists():
         raise InputError(workdir, "is there already", "name another folder")
@@ -170,7 +169,6 @@ def write_run(weights: Path, workdir: Path, data: DataConfig, dataset: str = "tl
         samples = f"{32 * features - 31} to {32 * features} samples"
         remedy = "give the --rate and --window-seconds that it was trained with"
         raise InputError(weights, f"is for windows of {samples}, not {data.window}", remedy)
-    run = checkpoint.Run(config, models.create("tlio"), variables, epoch=0, step=0)
+    network = TrainedNetwork(config, models.create("tlio"), variables, epoch=0, step=0)
     with replacing_folder(workdir) as new:
-        configuration.save(new / "config.yaml", config)
-        checkpoint.write_best(new, run)
+        write_network(new, network)

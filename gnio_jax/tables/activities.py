@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from gnio_jax import data, evaluation
 from gnio_jax.evaluation import tabulate
 from gnio_jax.models import Network
-from gnio_jax.training import checkpoint
+from gnio_jax.networks import read_network
 
 ACTIVITIES = ("standing", "slow", "walking", "running", "stairs")
 STANDING, SLOW, RUNNING, CLIMBING = 0.05, 0.8, 1.9, 0.12
@@ -40,8 +40,8 @@ class PredictedWindows(NamedTuple):
 
 
 def predict_split(workdir: Path, split: str) -> PredictedWindows:
-    """The predictions of the best checkpoint of a run for the windows of a split of its dataset."""
-    run = checkpoint.load_run(workdir)
+    """The predictions of the network of a run for the windows of a split of its dataset."""
+    run = read_network(workdir)
     config = run.config.data
     sequences = data.load(run.config.datasets[0], run.config.data_root, split)
     recordings, _ = evaluation.prepare(sequences, config, orientation="reference")

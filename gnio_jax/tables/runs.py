@@ -16,6 +16,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import reuse
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Scores
+from gnio_jax.networks.folder import read_settings
 from gnio_jax.reporting import Reporter
 from gnio_jax.tables.experiments import TableRow
 from gnio_jax.training import loop, run_folder
@@ -107,14 +108,10 @@ def _state(config: TrainConfig) -> str:
 
 
 def calibrate_run(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
-    """The run's best checkpoint with its filter fitted to its validation split: the existing
-    calibrated run if it is of that checkpoint, else a new one."""
-
-    def best(run: Path) -> list[str]:
-        return sorted(step.name for step in (run / "checkpoints" / "best").glob("[0-9]*"))
-
+    """The run's best weights with the filter fitted to its validation split: the existing
+    calibrated run if it has these weights, else a new one."""
     folder = workdir.with_name(f"{workdir.name}_calibrated")
-    if folder.exists() and best(folder) == best(workdir):
+    if folder.exists() and read_settings(folder).digest == read_settings(workdir).digest:
         return folder
     reporter.line(f"calibrating {workdir.name}")
     shutil.rmtree(folder, ignore_errors=True)

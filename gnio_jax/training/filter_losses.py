@@ -66,10 +66,16 @@ def filter_losses(
 ) -> FilterLosses:
     """All losses of a segment, and their sum with the weights.
 
-    `estimate` begins with the filter's start; `history` has the whole core covariance. The
-    reference of a recording with waypoints is interpolated, and the network must not learn from it:
-    the error at the waypoints replaces all losses that need poses, with the weight of
+    The reference of a recording with waypoints is interpolated, and the network must not learn from
+    it: the error at the waypoints replaces all losses that need poses, with the weight of
     displacements.
+
+    Args:
+        estimate: The filter's motion, K + 1 rows that begin with its start.
+        segment: The samples and the reference.
+        history: The K rows of the run, with the whole core covariance.
+        config: The settings of the filter, for the length of an interval.
+        weights: The weight of each loss.
     """
     truth = segment.truth
     intervals = len(truth.position) - 1

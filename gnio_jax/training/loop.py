@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -20,10 +20,12 @@ from gnio_jax import config as configuration
 from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.networks import TrainedNetwork
 from gnio_jax.reporting import Lines, Reporter, Silence
 from gnio_jax.training import checkpoint, optimizer, run_folder
-from gnio_jax.training.checkpoint import Run, RunPosition, load_run
+from gnio_jax.training.checkpoint import RunPosition
 from gnio_jax.training.filter_task import FilterTask
+from gnio_jax.training.initial import load_initial_network
 from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.run_folder import Log
 from gnio_jax.training.task import DispatchSums, Row, Task
@@ -71,20 +73,25 @@ def train_all(
     reporter: Reporter | None = None,
     workers: int = 1,
     devices: int | None = None,
-    load: Callable[[str], Run] = load_run,
 ) -> list[TrainingResult]:
     """`train` for experiments that differ only in their seeds and folders (`config.with_seeds`),
     one after the other. Recordings are read once and steps are compiled once.
 
-    With `resume` finished runs are skipped, begun ones continue from their latest checkpoint, and
-    missing ones start. A signal ends the run that it interrupts. The runs after it do not begin and
-    have no outcome. `workers` processes read recordings that are slow to read. A batch of windows
-    is divided among `devices` devices of each process (`parallel.sharing`); their number changes
-    the results only by rounding, even in a run that is resumed. `load` reads what
-    `config.init_from` and `config.data.poses_by` name, by default the folder of a run;
-    `gnio_jax.load_pretrained` also takes packages of weights. Raises `InputError` where the initial
-    run is not of the same network, for settings that do not fit together, for a folder that holds
-    another run, and where the devices cannot share a batch evenly.
+    A signal ends the run that it interrupts. The runs after it do not begin and have no outcome.
+
+    Args:
+        configs: The experiments.
+        resume: Whether finished runs are skipped and begun ones continue from their latest
+            checkpoint. Missing ones start.
+        reporter: It gets progress and lines of text.
+        workers: Number of processes that read recordings that are slow to read.
+        devices: Number of devices of each process among which a batch of windows is divided
+            (`parallel.sharing`); None: all of them, and on a CPU one. It changes the results only
+            by rounding, even in a run that is resumed.
+
+    Raises:
+        InputError: The initial network is not of the same network, settings do not fit together, a
+            folder holds another run, or the devices cannot share a batch evenly.
     """
     reporter = (reporter or Lines()) if parallel.is_first() else Silence()
     folders = map(configuration.default_workdir, configs)
@@ -106,9 +113,9 @@ def train_all(
     sharing = parallel.sharing(1 if through_filter else devices)
     with jax.enable_x64(through_filter), sharing, _record_signals() as signals:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
-        start = None if resumed else checkpoint.load_initial_network(configs[0], load)
+        start = None if resumed else load_initial_network(configs[0])
         task_type = FilterTask if through_filter else WindowTask
-        task, data = set_up(task_type, configs[0], reporter, workers, load)
+        task, data = set_up(task_type, configs[0], reporter, workers)
         for config, resume in zip(configs, resumes, strict=True):
             results.append(_train(task, data, config, start, resume, signals, reporter))
             (signum,) = parallel.largest(max(signals))
@@ -122,7 +129,7 @@ def _train(
     task: Task,
     data: TrainingData,
     config: TrainConfig,
-    start: Run | None,
+    start: TrainedNetwork | None,
     resume: bool,
     signals: list[int],
     reporter: Reporter,
@@ -167,7 +174,7 @@ def _train(
                     remark = _describe_progress(position, task, rate)
                     reporter.progress("training", position.step / (epochs * steps), remark)
                     if position.step < end and (due or signum):
-                        checkpoint.save(workdir, "latest", with_statistics(state), position)
+                        checkpoint.save(workdir, with_statistics(state), position)
                         saved = clock
                         if signum:
                             return TrainingResult(workdir, position.best, signum)
@@ -178,8 +185,9 @@ def _train(
                 log.add(row)
                 for line in describe_epoch(row, improved, task):
                     reporter.line(line)
-                for which in ("best", "latest") if improved else ("latest",):
-                    checkpoint.save(workdir, which, state, position)
+                if improved:
+                    checkpoint.save_best(workdir, config, state, position)
+                checkpoint.save(workdir, state, position)
                 (signum,) = parallel.largest(max(signals))
                 if signum and epoch + 1 < epochs:
                     return TrainingResult(workdir, position.best, signum)

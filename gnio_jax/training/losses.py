@@ -66,10 +66,17 @@ def loss_stage(config: LossConfig, step: Int[jax.Array, ""] | int, steps_per_epo
 def losses(
     prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage, axes: int = 3
 ) -> Losses:
-    """The losses of a batch, over the first `axes` axes: 2 for a network without the vertical.
+    """The losses of a batch.
 
-    Raises `ValueError` if the loss needs more than the network predicts (a velocity for every
-    sample).
+    Args:
+        prediction: The network's output for b windows.
+        windows: The b windows with their true displacements.
+        config: The loss and its weights.
+        stage: The parts of the loss that take effect at this step (`loss_stage`).
+        axes: Number of axes, 3, or 2 for a network without the vertical.
+
+    Raises:
+        ValueError: The loss needs more than the network predicts (a velocity for every sample).
     """
     vectors = (prediction.displacement, prediction.log_std, windows.displacement)
     chex.assert_equal_shape(vectors)

@@ -17,10 +17,8 @@ from gnio_jax import data, models, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Reporter
-from gnio_jax.training.checkpoint import load_run
 from gnio_jax.training.task import Task, visit_count
 from gnio_jax.training.waypoint_poses import (
-    Load,
     PoseNetwork,
     add_smoothed_poses,
     load_pose_network,
@@ -46,14 +44,12 @@ def set_up(
     config: TrainConfig,
     reporter: Reporter,
     workers: int = 1,
-    load: Load = load_run,
 ) -> tuple[Task, TrainingData]:
     """Load the recordings and find the windows or segments in them.
 
     Raises `InputError` for options that the network does not have, missing data, recordings that
     are too short, a batch that is larger than the split, and one that the devices cannot share
-    evenly. `workers` processes read recordings that are slow to read, and make smoothed poses with
-    the run that `load` reads.
+    evenly. `workers` processes read recordings that are slow to read, and make smoothed poses.
     """
     model = models.from_config(config.model)  # finds mistakes in its options before reading data
     size, devices = config.optim.batch_size, parallel.count()
@@ -62,7 +58,7 @@ def set_up(
         remedy = f"make it a multiple of {devices}, or use fewer --devices"
         raise InputError("optim.batch_size", problem, remedy)
     train, val = config.data.train_split, config.data.val_split
-    names, pose_network = config.datasets, load_pose_network(config, reporter, load)
+    names, pose_network = config.datasets, load_pose_network(config, reporter)
     reporter.line(f"reading {', '.join(names)}: {train} and {val}")
     sources, held_out, splits = [], {}, {}
     for split, training in ((train, True), (val, False)):

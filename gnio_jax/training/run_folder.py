@@ -24,7 +24,7 @@ from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
-from gnio_jax.training.checkpoint import recordings_by_name
+from gnio_jax.networks.folder import CONFIG, SPLITS, has_card, recordings_by_name
 from gnio_jax.training.recordings import TrainingData
 from gnio_jax.training.task import Row
 
@@ -43,9 +43,11 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     none, or one with other settings. Of several processes only the first one checks this.
     """
     workdir = configuration.default_workdir(config)
-    file = workdir / "config.yaml"
+    file = workdir / CONFIG
     if not parallel.is_first():
         return workdir
+    if has_card(workdir):
+        raise InputError(workdir, "holds a published network", "choose another --workdir")
     if not resume:
         if workdir.is_file():
             raise InputError(workdir, "is a file", "name a folder with --workdir")
@@ -91,8 +93,8 @@ def open_run(
             raise InputError(workdir, problem, "choose another --workdir") from None
         refuse_other_run(config, resume)  # another run may have begun while the data were read
         if not resume:
-            configuration.save(workdir / "config.yaml", config)
-        path = workdir / "splits.yaml"
+            configuration.save(workdir / CONFIG, config)
+        path = workdir / SPLITS
         if path.exists():
             _refuse_other_recordings(path, data.splits)
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,48 +13,45 @@ import jax
 import numpy as np
 
 from gnio_jax import config as configuration
-from gnio_jax import data, filtering
+from gnio_jax import data, filtering, networks
 from gnio_jax.config import NoiseModel, TrainConfig
 from gnio_jax.data.hdf5 import Reading, cache_entry, read_reading, write_reading
 from gnio_jax.data.workers import FEW, in_processes
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.network import Predict
 from gnio_jax.models import Network
+from gnio_jax.networks import TrainedNetwork
 from gnio_jax.reporting import Reporter
-from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import Sequence
-
-Load = Callable[[str], Run]
-"""A function that reads the run, or the package of weights, of this name. It must be a function of
-a module, because other processes call it too."""
 
 
 class PoseNetwork(NamedTuple):
     """The network that makes poses of walks with waypoints."""
 
-    run: str
-    load: Load
+    name: str
+    """Name, folder or zip of the network."""
     digest: str
     """Digest of its weights and settings."""
 
 
-def load_pose_network(config: TrainConfig, reporter: Reporter, load: Load) -> PoseNetwork | None:
+def load_pose_network(config: TrainConfig, reporter: Reporter) -> PoseNetwork | None:
     """The network that `data.poses_by` names. Raises `InputError` if its rate is lower than that of
     the trained network, because its poses come with the IMU at its own rate."""
     name = config.data.poses_by
     if name is None:
         return None
-    run = load(name)
-    if run.config.data.rate < config.data.rate:
-        problem = f"names a network of {run.config.data.rate:g} Hz, slower than data.rate"
+    network = networks.load(name)
+    rate = network.config.data.rate
+    if rate < config.data.rate:
+        problem = f"names a network of {rate:g} Hz, slower than data.rate"
         remedy = f"name one of {config.data.rate:g} Hz or more"
         raise InputError("data.poses_by", problem, remedy)
-    if run.config.filter.noise == NoiseModel():
+    if network.config.filter.noise == NoiseModel():
         reporter.line(
             f"warning: {name}: its filter is not calibrated, and smooths worse than interpolation; "
             "calibrate it with gnio calibrate"
         )
-    return PoseNetwork(name, load, digest_network(run))
+    return PoseNetwork(name, digest_network(network))
 
 
 def add_smoothed_poses(
@@ -119,20 +116,20 @@ def smooth_poses(walk: Sequence, pose_network: PoseNetwork) -> Reading:
 def _load_smoother(pose_network: PoseNetwork) -> tuple[float, Predict, filtering.Filter]:
     """A network's rate (Hz), the network and its filter. They are made once, because programs are
     compiled for each network object. Raises `InputError` if the run has changed."""
-    run = pose_network.load(pose_network.run)
-    if digest_network(run) != pose_network.digest:
+    trained = networks.load(pose_network.name)
+    if digest_network(trained) != pose_network.digest:
         raise InputError(
-            pose_network.run, "has changed while it made poses", "begin the training anew"
+            pose_network.name, "has changed while it made poses", "begin the training anew"
         )
-    network, windows = Network.of(run.model, run.variables), run.config.data
+    network, windows = Network.of(trained.model, trained.variables), trained.config.data
     predict = functools.partial(network.apply, network.variables)
-    return windows.rate, predict, filtering.make_filter(windows, run.config.filter)
+    return windows.rate, predict, filtering.make_filter(windows, trained.config.filter)
 
 
-def digest_network(run: Run) -> str:
-    """Digest of the settings, without the places of folders, and of the weights of a run."""
-    settings = configuration.flatten(configuration.without_paths(run.config))
-    return _digest(sorted(settings.items()), run.variables)
+def digest_network(network: TrainedNetwork) -> str:
+    """Digest of the settings, without the paths of folders, and of the weights of a network."""
+    settings = configuration.flatten(configuration.without_paths(network.config))
+    return _digest(sorted(settings.items()), network.variables)
 
 
 def _cache_entry(walk: Sequence, pose_network: PoseNetwork) -> Path:

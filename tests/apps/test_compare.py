@@ -10,7 +10,7 @@ from gnio_jax.apps import compare as comparison
 from gnio_jax.config import CompareConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import reuse, tabulate
-from tests.support.reports import LOST, report_of, write_report, write_run
+from tests.support.reports import LOST, digest, report_of, write_report, write_run
 
 GROUPS = {"a": "ann", "b": "ann", "c": "bob"}
 FILTER = configuration.to_plain(TrainConfig().filter)
@@ -18,8 +18,8 @@ FILTER = configuration.to_plain(TrainConfig().filter)
 
 def write(run, ates, name="synthetic_test_ekf", drop=(), groups=GROUPS, more=None, **settings):
     """An evaluation of a run; `ates`, `groups`, `more` and `drop` as in `report_of`."""
-    made = report_of(ates, groups, more, drop, **{"filter": FILTER, **settings})
-    return write_report(write_run(run) / "eval" / name, made)
+    settings = {"filter": FILTER, "weights": digest(write_run(run)), **settings}
+    return write_report(run / "eval" / name, report_of(ates, groups, more, drop, **settings))
 
 
 def compare(*words, metrics=("ate",), **options):
@@ -131,13 +131,13 @@ def test_runs_are_evaluated_where_they_are_not_yet_and_read_once(runs, monkeypat
     made, looked, look = [], [], reuse.find_existing
 
     def evaluate(config, progress, workers, **_):
-        made.append((config.workdir, config.split, config.estimator, workers))
-        name = config.workdir.removeprefix(f"{runs}/")
+        made.append((config.network, config.split, config.estimator, workers))
+        name = config.network.removeprefix(f"{runs}/")
         write(runs / name, {"a": 4.0}, "synthetic_val_ekf", split="val")
 
     monkeypatch.setattr(reuse, "evaluate", evaluate)
     monkeypatch.setattr(
-        reuse, "find_existing", lambda asked: looked.append(asked.workdir) or look(asked)
+        reuse, "find_existing", lambda asked: looked.append(asked.network) or look(asked)
     )
     config = CompareConfig((f"{runs}/plain", f"{runs}/new"), split="val", metrics=("ate",))
     found = comparison.compare(config, workers=3)
@@ -188,7 +188,7 @@ def test_refusals(runs):
     (runs / "untrained").mkdir()
     (runs / "untrained" / "config.yaml").write_text("dataset: synthetic\n")
     write(runs / "old", {"a": 1.0}, definitions=1)
-    write(runs / "left", {"a": 1.0}, step=6)
+    write(runs / "left", {"a": 1.0}, weights="0" * 64)
     for words, problem in (
         (("plain",), "needs two or more"),
         (("plain", "gone"), "is not there"),
@@ -200,9 +200,9 @@ def test_refusals(runs):
         (("mix", "new"), f"mix_s1/{own}: sequence a takes 600 s here"),
         (("linked", "plain"), "linked_s1: is the same evaluation as"),
         (("plain", "new_s0/eval/aligned"), "is of alignment se3, the first row of origin"),
-        (("untrained", "plain"), "checkpoints/best: holds no checkpoint"),
+        (("untrained", "plain"), "untrained: holds no weights"),
         (("plain", f"old/{own}"), "another version"),
-        (("plain", f"left/{own}"), "of a checkpoint that the run has no more"),
+        (("plain", f"left/{own}"), "of weights that the network has no more"),
         (("plain", "new_s0/eval"), "neither a run nor an evaluation"),
     ):
         assert problem in refused(*words)

@@ -11,7 +11,8 @@ import weakref
 import numpy as np
 import pytest
 
-from gnio_jax.apps import live, packages, rerun
+from gnio_jax import networks
+from gnio_jax.apps import live, rerun
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
@@ -83,7 +84,7 @@ def recorded():
 @pytest.fixture
 def follow(gnio, run):
     """What `gnio live` prints of lines on standard input."""
-    return lambda lines, *words: gnio("live", *words, "--weights", run, lines=lines)
+    return lambda lines, *words: gnio("live", *words, "--network", run, lines=lines)
 
 
 def as_lines(recorded):
@@ -105,7 +106,7 @@ def test_a_stream_gives_the_trackers_poses(follow, run, recorded, monkeypatch, t
     # A line a second, the last one repeated at the end.
     assert sum(line.lstrip()[0].isdigit() for line in told.splitlines()) == 6
 
-    tracker, expected = live.create_tracker(packages.load_pretrained(run), RATE), []
+    tracker, expected = live.create_tracker(networks.load(run), RATE), []
     for sample in zip(*recorded, strict=True):
         pose = tracker.push(*sample)
         expected += [] if pose is None else [pose]
@@ -130,7 +131,7 @@ def test_a_stream_gives_the_trackers_poses(follow, run, recorded, monkeypatch, t
 
 def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monkeypatch):
     options = changed(considered={"scale": 0.1, "heading": np.pi / 2})
-    found = packages.load_pretrained(run)
+    found = networks.load(run)
     calibrated = found._replace(config=dataclasses.replace(found.config, filter=options))
     passed = []
 
@@ -266,7 +267,7 @@ SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 2]
 def test_mistakes_are_one_line(mistake, run, monkeypatch, tmp_path, lines, arguments, problem):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
-    told = mistake("live", *arguments, "--weights", run, lines=lines)
+    told = mistake("live", *arguments, "--network", run, lines=lines)
     assert problem in told and ("standard input" in told) == (not arguments)
 
 
@@ -287,7 +288,7 @@ def test_a_recording_played_gives_the_track_of_it(
     given = ("--gyro-unit", "rad/s")
     told = follow([], walk, "--speed", "0", "--out", tmp_path / "live.txt", *given)
     monkeypatch.chdir(tmp_path)
-    gnio("track", walk, "--out", "track", "--weights", run, *given)
+    gnio("track", walk, "--out", "track", "--network", run, *given)
     followed, tracked = read_tum(tmp_path / "live.txt"), read_tum(tmp_path / "track/trajectory.txt")
     assert told.startswith(f"following {walk} with run") and "walked" in told
     assert "lacks samples 1 times" in told and "in the quietest second" in told
@@ -323,7 +324,7 @@ def test_a_signal_ends_the_stream_and_nothing_is_lost(
         assert list(tmp_path.iterdir()) == []
         monkeypatch.setattr(sys, "stdin", stream())
         with pytest.raises(SystemExit, match=str(status)):
-            console.run(lambda: app.main(["live", "--weights", str(run), "--out", str(out)]))
+            console.run(lambda: app.main(["live", "--network", str(run), "--out", str(out)]))
         assert capsys.readouterr().err == said
     # 31 whole intervals of 0.1 s; the first pose is that of the end of the rest.
     time = read_tum(out).time
@@ -415,7 +416,7 @@ def test_what_came_before_counts_where_it_rests(run, port, turns):
     lines = [f"{t},{turns * np.sin(9 * t)},0,0,{turns * np.sin(9 * t)},0,9.81" for t in stamps]
     listening = datagrams(port)
     send(port, [line.encode() for line in lines])
-    at_rest = live.begins_at_rest(packages.load_pretrained(run))
+    at_rest = live.begins_at_rest(networks.load(run))
     source = listening.source(silence=0.2, say=said.append, at_rest=at_rest)
     send(port, [b"2.0,0,0,0,0,0,9.81"])
     assert len(list(source.samples)) == (1 if turns else 101)

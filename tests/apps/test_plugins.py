@@ -116,7 +116,7 @@ def test_the_commands_use_what_an_installed_package_registers(gnio, package, tmp
     gnio("train", *names, *options, "--workdir", run, "--set", "model.options.features=6")
     path_lengths = []
     for settings in ((), slow):
-        gnio("evaluate", "--workdir", run, "--no-plots", *settings)
+        gnio("evaluate", "--network", run, "--no-plots", *settings)
         folder = max((run / "eval").iterdir(), key=lambda path: path.stat().st_mtime_ns)
         positions = np.loadtxt(folder / "trajectories" / "w3.txt")[:, 1:3]
         path_lengths.append(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
@@ -126,7 +126,7 @@ def test_the_commands_use_what_an_installed_package_registers(gnio, package, tmp
     rows = np.column_stack([walk.time, walk.gyro, walk.accel])
     np.savetxt(tmp_path / "walk.csv", rows, delimiter=",", header=header, comments="")
     file, units = tmp_path / "walk.csv", ("--gyro-unit", "rad/s", "--accel-unit", "m/s2")
-    told = gnio("track", file, *units, "--weights", run, "--out", tmp_path / "track")
+    told = gnio("track", file, *units, "--network", run, "--out", tmp_path / "track")
     assert "results: " in told
 
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.apps import packages
 from gnio_jax.apps.importing import Imported, import_recording
 from gnio_jax.apps.track import Summary, _warnings, track
 from gnio_jax.config import DataConfig, EvaluateConfig, ModelConfig, TrainConfig
@@ -20,6 +19,7 @@ from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation import evaluate
 from gnio_jax.evaluation.trajectory import read_tum
+from gnio_jax.networks import read_network
 from gnio_jax.types import Sequence, Waypoints
 from tests.support import bag_files, known_walk, logger_files, tiny_run
 from tests.support.filter_settings import changed
@@ -66,7 +66,7 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     entries = imu + bag_files.poses(make, "Odometry", one, child="imu_link")
     walk = bag_files.write(tmp_path, "mcap", entries)
     out = tmp_path / "track"
-    given = ["track", walk, "--weights", runs / "walker", "--out", out, "--format", "csv"]
+    given = ["track", walk, "--network", runs / "walker", "--out", out, "--format", "csv"]
     rerun = tmp_path / "walk.rrd"
     if importlib.util.find_spec("rerun"):
         given += ["--rerun", rerun]
@@ -106,7 +106,7 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     assert f"{ate:.2f} m" in told and "against the reference" in told
     limits = next(line for line in told.splitlines() if line.startswith("limits:"))
     assert limits == summary["limits"]
-    for words in (f"{length:.1f} m in 6 s", "the real error", "weights walker;"):
+    for words in (f"{length:.1f} m in 6 s", "the real error", "network walker;"):
         assert words in limits
     assert "IMU /imu/data" in told and f"results: {out}" in told
 
@@ -121,7 +121,7 @@ def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
     rows = np.delete(np.arange(600), np.s_[560:580])
     table = csv(tmp_path / "table.csv", time[rows], gyro[rows], accel[rows])
     out = tmp_path / "track"
-    told = gnio("track", table, "--weights", runs / "mute", "--out", out, "--gyro-unit", "rad/s")
+    told = gnio("track", table, "--network", runs / "mute", "--out", out, "--gyro-unit", "rad/s")
     path = read_tum(out / "trajectory.txt")
     assert np.linalg.norm(path.position, axis=1).max() < 0.05
     turned = Rotation.from_quat(path.orientation[-1], scalar_first=True).magnitude()
@@ -134,10 +134,10 @@ def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
 def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_path, monkeypatch):
     time = np.delete(np.arange(120), np.s_[60:70]) / 20
     slow = csv(tmp_path / "slow.csv", time)
-    monkeypatch.setattr("gnio_jax.apps.packages.SHIPPED", tmp_path)
+    monkeypatch.setattr("gnio_jax.networks.find.SHIPPED", tmp_path)
     told = gnio("track", slow)
     folder = runs.parent / "tracks" / "slow"
-    assert summary_of(folder)["weights"] == "walker"
+    assert summary_of(folder)["network"] == "walker"
     assert "lacks samples 1 times, for up to 0.55 s" in told and "warning: gaps:" in told
     rate = "rate: recorded at 20 Hz, the network was trained at 50 Hz: the content above 10 Hz"
     assert f"warning: {rate}" in told
@@ -158,7 +158,7 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_
 def test_what_is_refused(mistake, runs, tmp_path, monkeypatch):
     """Also what cannot be written, stamps that ROS cannot hold among it: before the work."""
     monkeypatch.setattr("gnio_jax.apps.track.prepare", lambda *_, **__: pytest.fail("too late"))
-    weights = ("--weights", runs / "walker")
+    weights = ("--network", runs / "walker")
     time = np.arange(300) / 100
     for start, words in ((-5.0, "stamps begin at -5 s"), (3e9, "ROS counts seconds in 32 bits")):
         odd = csv(tmp_path / "odd.csv", time, start=start)
@@ -176,7 +176,7 @@ def test_what_is_refused(mistake, runs, tmp_path, monkeypatch):
     assert "is not an earlier track" in mistake(*given, "--out", thesis)
     assert thesis.read_text() == "mine"
     assert f"{walk}: " in mistake(*given, "--out", walk / "track")
-    assert "no such weights" in mistake("track", walk, "--weights", "walkr2")
+    assert "no such network" in mistake("track", walk, "--network", "walkr2")
     del members["TotalAcceleration.csv"], members["Accelerometer.csv"]
     del members["AccelerometerUncalibrated.csv"], members["Gravity.csv"]
     deaf = logger_files.zipped(tmp_path / "deaf.zip", members)
@@ -193,7 +193,7 @@ def without_poses(name, time):
 
 def test_our_own_file_with_holes(gnio, undrawn, mistake, runs, tmp_path):
     """It comes to the tracker as it is: nobody has looked for holes yet."""
-    given = ("track", tmp_path / "walk.h5", "--weights", runs / "walker")
+    given = ("track", tmp_path / "walk.h5", "--network", runs / "walker")
     for lost, name in ((70, "../../walk"), (320, "walk")):
         time = np.delete(np.arange(900), np.s_[200 : 200 + lost])[:530] / 100
         sequence = without_poses(name, time)
@@ -216,7 +216,7 @@ def test_a_recording_with_waypoints_is_compared_with_them(gnio, runs, tmp_path):
     time = np.delete(np.arange(620), np.s_[560:580]) / 100
     taps = Waypoints(time[[0, 200, 400, 599]], known_walk.position(time[[0, 200, 400, 599]])[:, :2])
     write_hdf5(tmp_path / "mall.h5", without_poses("mall", time)._replace(waypoints=taps))
-    given = ("--weights", runs / "walker", "--out", tmp_path / "t")
+    given = ("--network", runs / "walker", "--out", tmp_path / "t")
     told = gnio("track", tmp_path / "mall.h5", *given)
     errors = summary_of(tmp_path / "t")["errors"]
     # By hand: the lengths of the legs do not depend on the alignment.
@@ -248,7 +248,7 @@ def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, m
     shaken = walk.accel * (1 + 0.9 * np.sin(18.0 * time) * (time > 1.0))[:, None]
     walk = walk._replace(accel=shaken, attributes={"imu_compensated": "no"})
     write_hdf5(tmp_path / "part.h5", walk)
-    given = ("--weights", runs / "walker", "--out", tmp_path / "t")
+    given = ("--network", runs / "walker", "--out", tmp_path / "t")
     told = gnio("track", tmp_path / "part.h5", *given)
     assert "warning: gyro: raw, and without a rest that shows its bias" in told
     assert "warning: running: in 80% of the seconds it is shaken as in a run" in told
@@ -268,13 +268,12 @@ def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monk
         raise InterruptedError
 
     monkeypatch.setattr("gnio_jax.apps.track.prepare", prepare)
-    weights = packages.choose(runs / "walker")
+    network = read_network(runs / "walker")
     own = dataclasses.replace(changed(start={"velocity": 0.7}), raw_gyro_bias=0.02)
-    config = dataclasses.replace(weights.run.config, filter=own)
-    weights = weights._replace(run=weights.run._replace(config=config))
+    network = network._replace(config=dataclasses.replace(network.config, filter=own))
     walk = Imported(without_poses("walk", np.arange(620) / 100), (), ())
     with pytest.raises(InterruptedError):
-        track(walk, weights, tmp_path / "t")
+        track(walk, network, tmp_path / "t")
     assert filters[0].start.velocity == 0.7 and filters[0].raw_gyro_bias == 0.02
 
 
@@ -315,9 +314,9 @@ def test_evaluation_and_track_of_one_walk_are_equal_to_the_bit(runs, tmp_path, n
     rows = np.column_stack([*columns, known_walk.position(time)])
     np.savetxt(folder / "walk.csv", rows, delimiter=",", header=names, comments="", fmt="%.9f")
     walk = import_recording(folder / "walk.csv")
-    tracked = track(walk, packages.choose(runs / network), tmp_path / "t").estimate
+    tracked = track(walk, read_network(runs / network), tmp_path / "t").estimate
     config = EvaluateConfig(
-        workdir=str(runs / network),
+        network=str(runs / network),
         dataset="csv",
         data_root=str(folder),
         init="static",

@@ -40,7 +40,7 @@ from gnio_jax.evaluation.estimate import BatchInputs
 from gnio_jax.evaluation.prepare import Start, prepare
 from gnio_jax.filtering.settings import free_parameters
 from gnio_jax.filtering.state import GYRO_BIAS
-from gnio_jax.training import checkpoint
+from gnio_jax.networks import load
 from tests.support import tiny_run
 from tests.support.filter_settings import changed
 from tests.support.walks import simulate, with_correlated_errors
@@ -77,15 +77,15 @@ def test_the_calibrated_run_differs_only_in_its_filter_and_average(
     run, out = shutil.copytree(run, tmp_path / "run"), tmp_path / "calibrated"
     for name in ("splits.yaml", "metrics.jsonl"):
         (run / name).write_text(f"{name} of the run")
-    words = ["calibrate", "--workdir", str(run), "--out", str(out), "--average-headings"]
+    words = ["calibrate", "--network", str(run), "--out", str(out), "--average-headings"]
     app.main([*words, "--fit", "measurement", "noise", "window"])
     output, warned = capsys.readouterr()
     assert "warning: the fit stopped after 2 steps" in warned
     assert f"warning: only {WALKS} recordings without a raw gyro: fewer than 5" in warned
     assert f"recordings: 0 with a raw gyro, {WALKS} without" in output
-    assert "noise.std_factor" in output and f"gnio evaluate --workdir {out}" in output
+    assert "noise.std_factor" in output and f"gnio evaluate --network {out}" in output
     assert splits_read == ["val"]
-    before, after = (checkpoint.load_run(folder) for folder in (run, out))
+    before, after = (load(folder) for folder in (run, out))
     assert after.config.model.equivariance == "four_headings"
     same = {name: getattr(before.config, name) for name in ("workdir", "filter", "model")}
     assert dataclasses.replace(after.config, **same) == before.config
@@ -110,8 +110,8 @@ def test_the_calibrated_run_differs_only_in_its_filter_and_average(
 
 
 def test_a_network_is_averaged_over_four_headings(run):
-    loaded = checkpoint.load_run(run)
-    averaged = checkpoint.average_over_headings(loaded, "the run")
+    loaded = load(run)
+    averaged = predictions.average_over_headings(loaded, "the run")
     assert averaged.config.model.equivariance == "four_headings"
     assert averaged.model == models.from_config(averaged.config.model) != loaded.model
 
@@ -144,7 +144,7 @@ def test_the_factors_are_those_of_the_errors():
 @pytest.fixture(scope="module")
 def fold_runs(run, tmp_path_factory):
     """Copies of the run as the folds of one experiment, whose networks differ by a factor."""
-    folders, loaded, parent = [], checkpoint.load_run(run), tmp_path_factory.mktemp("folds")
+    folders, loaded, parent = [], load(run), tmp_path_factory.mktemp("folds")
     for fold in (0, 1):
         windows = dataclasses.replace(loaded.config.data, train_split=f"train-{fold}of2")
         config = dataclasses.replace(loaded.config, data=windows, workdir=None)
@@ -159,22 +159,22 @@ def test_each_session_has_the_predictions_of_the_network_that_left_it_out(
         return [(recording.name, network.variables) for recording in prepared]
 
     monkeypatch.setattr(predictions, "estimate", asked_about)
-    loaded = checkpoint.load_run(run)
-    config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
+    loaded = load(run)
+    config = CalibrateConfig(network=str(run), out_of_fold=tuple(fold_runs))
     split, networks = predictions.choose_networks(loaded, config)
     result = predictions.predict(split, networks, config, loaded.config.filter, lambda *_: None, 1)
     assert splits_read == ["train"] and len(result.estimates) == WALKS
     fold_of = data.folds(data.load("synthetic", None, "train"), 2)
     assert sorted(set(fold_of.values())) == [0, 1]
     for recording, (name, variables) in zip(*result, strict=True):
-        of_fold = checkpoint.load_run(fold_runs[fold_of[recording.group]])
+        of_fold = load(fold_runs[fold_of[recording.group]])
         network = models.Network.of(of_fold.model, of_fold.variables)
         assert recording.name == name and tiny_run.same(variables, network.variables)
 
 
-def test_the_network_of_every_fold_is_average_over_headings(run, fold_runs):
+def test_the_network_of_every_fold_is_averaged_over_headings(run, fold_runs):
     config = CalibrateConfig(str(run), out_of_fold=tuple(fold_runs), average_headings=True)
-    _, networks = predictions.choose_networks(predictions.load_run(run, config), config)
+    _, networks = predictions.choose_networks(predictions.load_network(run, config), config)
     for source in networks:
         assert source.run.config.model.equivariance == "four_headings"
 
@@ -187,7 +187,7 @@ def test_walks_without_a_reference_are_left_out_and_raw_gyros_have_a_wide_start(
     walks[1] = walks[1]._replace(attributes=raw)
     monkeypatch.setattr(data, "load", lambda *_: walks)
     monkeypatch.setattr(predictions, "estimate", lambda prepared, *_, **__: prepared)
-    loaded, config = checkpoint.load_run(run), CalibrateConfig(str(run))
+    loaded, config = load(run), CalibrateConfig(str(run))
     settings = dataclasses.replace(loaded.config.filter, raw_gyro_bias=0.05)
     split, networks = predictions.choose_networks(loaded, config)
     recordings, _ = predictions.predict(split, networks, config, settings, lambda *_: None, 1)
@@ -409,7 +409,7 @@ def test_the_padding_of_a_walk_has_no_effect():
             walks._replace(
                 gyro=np.where(after, 0.0, walks.gyro),
                 accel=np.where(after, force, walks.accel),
-                given=rows,
+                displacements=rows,
             ),
             TRUE,
             most_steps=1,
@@ -537,25 +537,25 @@ def runs(run, fold_runs, splits_read, tmp_path):
 
 
 def calibrate(runs, **options):
-    return calibration.calibrate(CalibrateConfig(**{"workdir": str(runs.run)} | options))
+    return calibration.calibrate(CalibrateConfig(**{"network": str(runs.run)} | options))
 
 
 def calibrate_again(runs):
     folder = shutil.copytree(runs.run, runs.folder / "run")
     (folder / "calibration.json").write_text("{}")
-    return calibrate(runs, workdir=str(folder))
+    return calibrate(runs, network=str(folder))
 
 
 def average(runs, model=None, augment=None):
-    loaded = checkpoint.load_run(runs.run)
+    loaded = load(runs.run)
     model = dataclasses.replace(loaded.config.model, **(model or {}))
     augment = dataclasses.replace(loaded.config.augment, **(augment or {}))
     config = dataclasses.replace(loaded.config, model=model, augment=augment)
-    return checkpoint.average_over_headings(loaded._replace(config=config), "the run")
+    return predictions.average_over_headings(loaded._replace(config=config), "the run")
 
 
 def compare_with_another_model(runs):
-    loaded = checkpoint.load_run(runs.run)
+    loaded = load(runs.run)
     model = dataclasses.replace(loaded.config.model, width=5)
     run = loaded._replace(config=dataclasses.replace(loaded.config, model=model))
     return predictions.choose_networks(run, CalibrateConfig(str(runs.run), out_of_fold=runs.folds))

@@ -41,7 +41,7 @@ def test_what_is_found_fits_a_screen_and_says_what_is_wrong(home, capsys, monkey
     there = {"dataset oxiod": "oxiod", "dataset tlio": "tlio_layout"}
     there = {name: str(home / "recordings" / place) for name, place in there.items()}
     assert places == computed | there
-    assert found["recordings read"] == str(home / "kept") and "pedestrian" in found["weights"]
+    assert found["recordings read"] == str(home / "kept") and "pedestrian" in found["networks"]
     assert found["newest run"].startswith("none: runs: holds no run; train one with gnio train")
     monkeypatch.setenv("GNIO_WEIGHTS", str(home / "nowhere"))
     (home / "runs" / "mine").mkdir(parents=True)
@@ -49,5 +49,5 @@ def test_what_is_found_fits_a_screen_and_says_what_is_wrong(home, capsys, monkey
     run("doctor")
     text = capsys.readouterr().out
     assert len(text.splitlines()) <= 45 and "\x1b" not in text and "runs/mine" in text
-    (line,) = [line for line in text.splitlines() if line.startswith("weights")]
+    (line,) = [line for line in text.splitlines() if line.startswith("networks")]
     assert "$GNIO_WEIGHTS" in line and "is not a folder" in line

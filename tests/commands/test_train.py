@@ -1,7 +1,6 @@
 """`gnio train`: one line on stderr and status 2 for every mistake, nothing left behind."""
 
 import dataclasses
-import os
 import shutil
 import sys
 from pathlib import Path
@@ -15,7 +14,6 @@ from gnio_jax.commands.options import Call, read
 from gnio_jax.commands.train import experiment
 from gnio_jax.commands.train import train as command
 from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.errors import InputError
 from gnio_jax.training import optimizer
 from tests.support import tiny_run
 from tests.support.filter_settings import changed
@@ -123,18 +121,3 @@ def test_training_through_the_filter_begins_with_the_filter_of_the_run(tmp_path)
     assert asked("--config", str(file), "--seeds", "1", "2").workdir == str(workdir)
     by_name = asked("--set", f"workdir={workdir}", "--resume")
     assert (by_name.workdir, by_name.filter) == (str(workdir), wanted)
-
-
-def test_the_newest_run_is_the_one_trained_last(tmp_path):
-    with pytest.raises(InputError, match="holds no run; train one with gnio train, or name its fo"):
-        configuration.newest_run(tmp_path)
-    for age, name in [(30, "old"), (10, "new")]:
-        configuration.save(tmp_path / name / "config.yaml", TrainConfig())
-        (tmp_path / name / "metrics.jsonl").write_text("")
-        for path in (tmp_path / name).iterdir():
-            os.utime(path, (1e9 - age, 1e9 - age))
-    assert configuration.newest_run(tmp_path).name == "new"
-    os.utime(tmp_path / "old" / "metrics.jsonl")  # trained on
-    assert configuration.newest_run(tmp_path).name == "old"
-    (tmp_path / "old" / "calibration.json").write_text("{}")  # a calibrated copy
-    assert configuration.newest_run(tmp_path).name == "new"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data import loading, physics
+from gnio_jax.data import conversion, physics
 from gnio_jax.data.physics import ImuSamples
 from gnio_jax.errors import InputError
 from tests.support import known_walk
@@ -98,7 +98,7 @@ def test_the_check_of_own_recordings_asks_the_same(tmp_path):
 
     def reason(spoil):
         write_native(tmp_path / "walk.csv", TIME, reference=False, spoil=spoil)
-        (row,), _ = loading.check(data.get("csv"), tmp_path)
+        (row,), _ = conversion.check(data.get("csv"), tmp_path)
         return row.reason
 
     def negated(columns):

@@ -53,7 +53,7 @@ def evaluate_run(workdir, **options):
 
 
 def test_end_to_end(workdir, command, capsys, tmp_path):
-    command("--workdir", workdir)
+    command("--network", workdir)
     printed = capsys.readouterr()
     folder = workdir / "eval" / "synthetic_test_ekf"
     assert "\x1b" not in printed.out and printed.err == ""
@@ -74,14 +74,14 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     assert len(np.loadtxt(folder / "trajectories" / "synthetic_1_handheld.txt")) == 150
     assert len(list((folder / "plots").iterdir())) == 3
     page = (folder / "report.html").read_text(encoding="utf-8")
-    assert f"<code>python evaluate.py --workdir {workdir}</code>" in page
+    assert f"<code>python evaluate.py --network {workdir}</code>" in page
     assert f"page: {folder / 'report.html'}" in printed.out
-    command("--workdir", workdir, "--estimator", "integrate", "--no-plots")
+    command("--network", workdir, "--estimator", "integrate", "--no-plots")
     rerun = ["--rerun", tmp_path / "w.rrd"] if importlib.util.find_spec("rerun") else []
     imu_only = ("--estimator", "imu_only", "--init", "static", "--no-plots", *rerun)
     assert "has learnt from" not in "".join(capsys.readouterr())
     (workdir / "splits.yaml").write_text("train: {synthetic_2_handheld: 1500, other: 1}")
-    command("--workdir", workdir, *imu_only)
+    command("--network", workdir, *imu_only)
     output = "".join(capsys.readouterr())
     assert "the network has learnt from 1 of 3 recordings, e.g. synthetic_2_handheld" in output
     assert (tmp_path / "w.rrd").exists() == bool(rerun)
@@ -208,10 +208,10 @@ def test_mistakes_are_one_line_and_leave_nothing(workdir, command, capsys):
         (["--set", "workdir=B"], "--set workdir=B: is no setting of the filter; write"),
         (["--orientation", "device"], "leave it out"),
         (["--checkpoint", "latest"], "holds no checkpoint"),
-        (["--workdir", "/"], "holds no run"),
+        (["--network", "/"], "holds no network"),
     ):
         with pytest.raises(SystemExit) as leaving:
-            command("--workdir", workdir, *arguments)
+            command("--network", workdir, *arguments)
         printed = capsys.readouterr()
         assert leaving.value.code == 2 and printed.out == ""
         assert printed.err.count("\n") == 1 and words in printed.err

@@ -39,7 +39,7 @@ def runs(walks):
         )
         for e in walks
     ]
-    ours = run_of(walks, "gnio evaluate --workdir 'a b'", "seed: 3")
+    ours = run_of(walks, "gnio evaluate --network 'a b'", "seed: 3")
     return [ours, run_of(summed, name="summed")]
 
 
@@ -98,7 +98,7 @@ def test_the_page_is_one_file_that_loads_nothing(written, runs):
     assert "b" not in loads.tags and "alert('x')</script>" not in text
     assert not re.search(r"@import|url\(\s*['\"]?https?:", text.partition("<body>")[0])
     assert "default-src 'none'" in text and len(text) < 3e6
-    assert "gnio evaluate --workdir &#39;a b&#39;" in text and "seed: 3" in text
+    assert "gnio evaluate --network &#39;a b&#39;" in text and "seed: 3" in text
     assert "walk: start: rough" in text
     shown = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "|", text.replace("<wbr>", "")))
     for run in runs:  # the table

@@ -8,11 +8,10 @@ from gnio_jax import config as configuration
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.evaluation import report, reuse
 from gnio_jax.evaluation.folder import read
+from gnio_jax.networks.folder import write_weights
 from gnio_jax.reporting import Lines
-from gnio_jax.training import checkpoint
-from gnio_jax.training.checkpoint import Run
 from tests.support.filter_settings import changed
-from tests.support.reports import BASE, report_of, write_report, write_run
+from tests.support.reports import BASE, digest, report_of, write_report, write_run
 
 
 @pytest.fixture
@@ -30,7 +29,7 @@ def evaluation(run, **settings):
     all_settings = {
         "dataset": "tlio",
         "data_root": str(run.parent / "data"),
-        "step": 7,
+        "weights": digest(run),
         "filter": configuration.to_plain(BASE.filter),
         **settings,
     }
@@ -54,7 +53,8 @@ def test_existing_figures_are_used(run, monkeypatch):
     "settings, problem",
     [
         ({"definitions": report.DEFINITIONS - 1}, "another version"),
-        ({"step": 6}, "of a checkpoint that the run has no more"),
+        ({"weights": "0" * 64}, "of weights that the network has no more"),
+        ({"weights": None}, "of weights that the network has no more"),
         ({"filter": {**configuration.to_plain(BASE.filter), "gravity": 9.0}}, "of another filter"),
         ({"alignment": "se3"}, "of alignment se3"),
     ],
@@ -92,24 +92,14 @@ def test_figures_of_another_folder_are_never_used(run, tmp_path):
     assert find(run, estimator="integrate").problem == ""
 
 
-def test_a_run_with_a_trained_filter_is_loaded_once(run, monkeypatch):
-    config = configuration.load(run / "config.yaml")
-    through = dataclasses.replace(config.through_filter, learn=("noise",))
-    configuration.save(
-        run / "config.yaml", dataclasses.replace(config, through_filter=through, init_from="walks")
-    )
-    trained = Run(
-        dataclasses.replace(config, filter=changed(noise={"gyro_density": 0.5})), *[None] * 4
-    )
-    restored, calls = [], []
-    monkeypatch.setattr(checkpoint, "load_run", lambda *asked: restored.append(asked) or trained)
+def test_a_filter_that_was_trained_is_that_of_the_weights(run, monkeypatch):
+    trained, requests = changed(noise={"gyro_density": 0.5}), []
+    write_weights(run, {}, 1, 7, trained)
 
-    def evaluate(config, progress, workers, run):
-        calls.append((config.filter, run))
-        evaluation(folder, filter=configuration.to_plain(trained.config.filter))
+    def evaluate(config, progress, workers):
+        requests.append(config.filter)
+        evaluation(run, filter=configuration.to_plain(trained))
 
-    folder = run
     monkeypatch.setattr(reuse, "evaluate", evaluate)
     reuse.load_or_evaluate(find(run), Lines())
-    assert calls == [(trained.config.filter, trained)] and restored == [(run, "best")]
-    assert find(run).run is None  # the figures exist
+    assert requests == [trained] and find(run).problem == ""

@@ -55,10 +55,14 @@ def wrong():
     yield "covariance: 1 of 60 rows", {"covariance": put(COVARIANCE, (10, 0, 1), 1.0)}
     yield "imu_valid: must be booleans", {"imu_valid": np.ones(SAMPLES, int)}
     yield "imu_valid: the shape", {"imu_valid": np.ones(3, bool)}
-    yield "noise.accel_density", {"noise": NOISE._replace(accel_density=-1.0)}
-    yield "noise.gyro_density", {"noise": NOISE._replace(gyro_density=np.zeros(3))}
-    yield "noise.measurement_scale", {"noise": NOISE._replace(measurement_scale=0.0)}
-    yield "noise.std_factor", {"noise": NOISE._replace(std_factor=(1.0, 0.0, 1.0))}
+    for field, number in (
+        ("accel_density", -1.0),
+        ("gyro_density", np.zeros(3)),
+        ("measurement_scale", 0.0),
+        ("std_factor", (1.0, 0.0, 1.0)),
+    ):
+        noise = NOISE._replace(**{field: number})
+        yield f"ekf.noise.{field}", {"ekf": filtering.Filter(CONFIG, noise)}
     other = filtering.initial_state(filtering.Filter(filtering.FilterConfig(DT, N, 3)), *POSE)
     yield r"state.clone_rotation: the shape must be \(5, 3, 3\)", {"state": other}
     less = state.core_covariance - jnp.eye(21)

@@ -232,8 +232,12 @@ def test_numbers_of_measurements_in_settings():
         assert parse(text) == config and text.index("height") < text.index("zero_velocity")
         changed = configuration.assign(config, ["filter.measurements.height=null"])
         changed = configuration.assign(changed, ["filter.measurements.zero_velocity.std=0.5"])
-        (rest,) = filtering.make_filter(config.data, changed.filter).measurements
-        assert rest == filtering.ZeroVelocity(0.5)
+        (steady,) = filtering.make_filter(config.data, changed.filter).measurements
+        assert steady == filtering.ZeroVelocity(0.5)
+        other = type("Other", (SteadyHeight,), {})
+        filtering.register(other)  # in the place of the first
+        replaced = filtering.make_filter(config.data, config.filter).measurements
+        assert [type(one) for one in replaced] == [other, filtering.ZeroVelocity]
         for numbers, words in (
             ("{heigth: {std: 1}}", "'measurements.heigth' is not known; did you mean 'height'"),
             ("{height: {}}", "'measurements.height.std' is missing; write std: NUMBER"),

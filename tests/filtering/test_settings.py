@@ -35,6 +35,16 @@ def test_free_parameters_and_back():
     np.testing.assert_allclose(slope(np.log(1 / 3)), 0.25 * 0.75)
 
 
+def test_what_a_filter_does_not_have_is_left_out():
+    """Errors without a size, and measurements without numbers."""
+    ekf = filtering.make_filter(DataConfig(), FilterSettings(measurements={"zero_velocity": None}))
+    assert ekf.considered is None and ekf.measurements == ()
+    settings = changed(considered={"slope": 0.1})
+    assert filtering.make_filter(DataConfig(), settings).considered == filtering.ConsideredStd(
+        slope=0.1
+    )
+
+
 def test_a_section_is_named_whole():
     """And not by the beginning of a name."""
     settings = FilterSettings()

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import filtering, geometry
-from gnio_jax.apps import packages
+from gnio_jax import filtering, geometry, networks
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.simulated import walks as simulated
@@ -474,12 +473,12 @@ def test_the_rate_is_measured_as_long_as_the_stream_lasts(tracker, kind):
 def test_the_example_replays_a_recording(tmp_path, monkeypatch, capsys):
     """examples/replay_csv.py, through the low-pass of a faster IMU, with an empty row and a hole;
     with the network of gnio-jax, else the newest run, as by every command."""
-    examples, asked, load = Path(__file__).parents[2] / "examples", [], packages.load_pretrained
+    examples, asked, load = Path(__file__).parents[2] / "examples", [], networks.load
     with tiny_run.known():
         config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig("tiny"))
         run = tiny_run.save(tmp_path / "run", config)
         answer = lambda which: asked.append(which) or load(run)  # noqa: E731
-        monkeypatch.setattr(packages, "load_pretrained", answer)
+        monkeypatch.setattr(networks, "load", answer)
         lines = (examples / "walk.csv").read_text().splitlines()[:601]
         lines[150] = f"{lines[150].partition(',')[0]},,,,,,"
         (tmp_path / "walk.csv").write_text("\n".join(lines[:170] + lines[173:]) + "\n")

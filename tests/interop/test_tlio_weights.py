@@ -13,7 +13,7 @@ from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import make_filter
-from gnio_jax.training import checkpoint
+from gnio_jax.networks import folder, read_network
 from tests.support import tlio_weights
 
 WEIGHTS = tlio_weights.weights()
@@ -159,8 +159,8 @@ def command(monkeypatch, *arguments):
 
 def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     command(monkeypatch, file, tmp_path / "run", "--stride-seconds", "0.1")
-    assert f"gnio evaluate --workdir {tmp_path / 'run'}" in capsys.readouterr().out
-    run = checkpoint.load_run(tmp_path / "run")
+    assert f"gnio evaluate --network {tmp_path / 'run'}" in capsys.readouterr().out
+    run = read_network(tmp_path / "run")
     assert (run.config.model.name, run.config.dataset) == ("tlio", "tlio")
     of_data = run.config.data
     assert (of_data.rate, of_data.window, of_data.stride) == (200.0, 200, 20)
@@ -180,12 +180,12 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
 
 
 def test_a_run_appears_whole_or_not_at_all(file, tmp_path, monkeypatch):
-    """The checkpoint fails: no config.yaml without it, and the name is free again."""
+    """The weights fail: no config.yaml without them, and the name is free again."""
 
     def full(*_):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(checkpoint, "write_best", full)
+    monkeypatch.setattr(folder, "write_weights", full)
     with pytest.raises(OSError, match="No space"):
         interop.write_run(file, tmp_path / "run", DataConfig())
     assert not list(tmp_path.iterdir())

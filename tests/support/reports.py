@@ -1,5 +1,6 @@
 """Made-up reports of evaluations, from metrics alone."""
 
+import hashlib
 import json
 
 import numpy as np
@@ -8,6 +9,7 @@ from gnio_jax.config import ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.evaluation import report
 from gnio_jax.evaluation.metrics import Measures
 from gnio_jax.evaluation.report import Report
+from gnio_jax.networks.folder import write_weights
 
 BASE = TrainConfig(dataset="tlio", model=ModelConfig(width=4), optim=OptimConfig(epochs=40))
 LOST = np.inf
@@ -54,7 +56,13 @@ def write_report(folder, report_made):
 
 
 def write_run(folder, text="dataset: synthetic\n", step=7):
-    """A run with a best checkpoint, as far as comparisons look at one."""
-    (folder / "checkpoints" / "best" / str(step)).mkdir(parents=True, exist_ok=True)
+    """A run whose weights have no array, as far as comparisons look at one."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_weights(folder, {}, epoch=1, step=step)
     (folder / "config.yaml").write_text(text)
     return folder
+
+
+def digest(folder):
+    """That of a run's weights, as its evaluations have it."""
+    return hashlib.sha256((folder / "weights.safetensors").read_bytes()).hexdigest()

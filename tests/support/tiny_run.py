@@ -13,6 +13,7 @@ import pytest
 from gnio_jax import data
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.models import registry
+from gnio_jax.networks import read_network
 from gnio_jax.training import checkpoint, loop, windows
 from tests.support import drawn_run
 from tests.support.numpy_layers import batch_norm, float64, linear
@@ -87,7 +88,8 @@ def rows(workdir):
 
 def arrays(workdir, which="latest"):
     """What a run has learnt: its network's variables and its filter's numbers."""
-    run = checkpoint.load_run(Path(workdir), which)
+    load = checkpoint.load_latest if which == "latest" else read_network
+    run = load(Path(workdir))
     numbers = run.config.filter.noise, run.config.filter.start
     return jax.tree.map(np.asarray, (run.variables, numbers))
 

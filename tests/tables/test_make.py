@@ -88,7 +88,7 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
     calibrate = calibration.calibrate
 
     def quickly(config, **more):
-        assert config == CalibrateConfig(config.workdir, config.out)
+        assert config == CalibrateConfig(config.network, config.out)
         return calibrate(dataclasses.replace(config, fit=("measurement",)), **more)
 
     monkeypatch.setattr(calibration, "calibrate", quickly)

@@ -1,6 +1,7 @@
 """Runs that are there already."""
 
 import dataclasses
+import shutil
 from types import SimpleNamespace
 
 import pytest
@@ -10,30 +11,28 @@ from gnio_jax.config import CalibrateConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines
 from gnio_jax.tables import runs
-from tests.support.reports import BASE, write_run
+from tests.support.reports import BASE, digest, write_run
 
 
-def test_a_calibration_is_of_the_best_checkpoint_and_warns(tmp_path, monkeypatch, capsys):
+def test_a_calibration_is_of_the_best_weights_and_warns(tmp_path, monkeypatch, capsys):
     run, made = tmp_path / "gnio_s0", []
 
     def calibrate(config, workers):
         made.append(config)
-        (best,) = (run / "checkpoints" / "best").iterdir()
-        (tmp_path / config.out / "checkpoints" / "best" / best.name).mkdir(parents=True)
+        shutil.copytree(config.network, config.out)
         return SimpleNamespace(warnings=("larger errors",))
 
     monkeypatch.setattr(runs.calibration, "calibrate", calibrate)
-    (run / "checkpoints" / "best" / "7").mkdir(parents=True)
+    write_run(run)
     for _ in range(2):
         assert runs.calibrate_run(run, Lines()) == tmp_path / "gnio_s0_calibrated"
     expected = ["calibrating gnio_s0", "warning: gnio_s0_calibrated: larger errors"]
     assert capsys.readouterr().err.splitlines() == expected
     assert made == [CalibrateConfig(str(run), out=str(tmp_path / "gnio_s0_calibrated"))]
-    # The run goes on and finds a better checkpoint: what was fitted to the old one is replaced.
-    (run / "checkpoints" / "best" / "7").rename(run / "checkpoints" / "best" / "9")
+    # The run goes on and finds better weights: what was fitted to the old ones is replaced.
+    write_run(run, step=9)
     runs.calibrate_run(run, Lines())
-    (kept,) = (tmp_path / "gnio_s0_calibrated" / "checkpoints" / "best").iterdir()
-    assert len(made) == 2 and kept.name == "9"
+    assert len(made) == 2 and digest(tmp_path / "gnio_s0_calibrated") == digest(run)
 
 
 def test_a_run_of_other_recordings_is_refused(tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from gnio_jax.config import CalibrateConfig, DataConfig, EvaluateConfig, TrainCo
 from gnio_jax.data.readers import DATASETS
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import resolve
+from gnio_jax.networks import read_network
 from gnio_jax.training import checkpoint, loop, segments, windows
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.task import TrainState
@@ -72,7 +73,7 @@ def test_a_run_keeps_the_figures_of_each_dataset_and_chooses_by_their_mean(run):
             mean = (row[f"{figure}/tlio"] + row[f"{figure}/other"]) / 2
             assert row[figure] == pytest.approx(mean, rel=1e-6)
     best = min(rows, key=lambda row: row["val_loss"])
-    assert checkpoint.load_run(run, "best").step == best["step"]
+    assert read_network(run).step == best["step"]
     each = len(range(0, 600 - 50, 5))  # windows of a walk of 12 s at 50 Hz, every 0.1 s
     assert rows[0]["step"] == (0.5 * each + 1.5 * each) // 16
     (line,) = loop.describe_epoch(
@@ -82,7 +83,7 @@ def test_a_run_keeps_the_figures_of_each_dataset_and_chooses_by_their_mean(run):
 
 
 def test_each_dataset_is_validated_on_all_of_its_own_windows(run):
-    row, latest = tiny_run.rows(run)[-1], checkpoint.load_run(run, "latest")
+    row, latest = tiny_run.rows(run)[-1], checkpoint.load_latest(run)
     for name in BOTH:
         (walk,) = data.load(name, split="val")
         found = tiny_run.mean_square_error(latest, walk)
@@ -152,7 +153,7 @@ def test_an_evaluation_says_of_which_dataset(run):
 def test_a_calibration_takes_a_folder_for_each_dataset(run, monkeypatch):
     read = []
     monkeypatch.setattr(data, "load", lambda name, root, *_: read.append((name, root)) or [])
-    asked = [predictions.FoldNetwork(checkpoint.load_run(run), None)]
+    asked = [predictions.FoldNetwork(read_network(run), None)]
 
     def gather(*roots):
         config = CalibrateConfig(data_root=roots)

@@ -36,7 +36,7 @@ def files_of_at_most(size):
 
 
 def save(run, step):
-    checkpoint.save(run, "latest", state(step), RunPosition(step=step))
+    checkpoint.save(run, state(step), RunPosition(step=step))
 
 
 @pytest.fixture

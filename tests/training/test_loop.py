@@ -15,6 +15,7 @@ from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.networks import read_network, write_network
 from gnio_jax.training import checkpoint, loop, optimizer, run_folder, task, window_task
 from gnio_jax.training.losses import Losses
 from gnio_jax.training.recordings import TrainingData
@@ -51,27 +52,27 @@ def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished)
     }
     assert list((workdir / "tensorboard").glob("events*"))
     best = min(found, key=lambda row: row["val_loss"])
-    assert checkpoint.load_run(workdir, "best").step == best["step"]
-    assert checkpoint.load_run(workdir, "latest").step == found[-1]["step"]
+    assert read_network(workdir).step == best["step"]
+    assert checkpoint.load_latest(workdir).step == found[-1]["step"]
 
 
 def test_validation_is_the_plain_mean_over_every_window(recording, finished):
     (walk,) = data.load("tlio", recording, "val")
-    found = mean_square_error(checkpoint.load_run(finished[0], "latest"), walk)
+    found = mean_square_error(checkpoint.load_latest(finished[0]), walk)
     assert rows(finished[0])[-1]["val_mse"] == pytest.approx(found, rel=1e-4)
 
 
 def test_stopped_and_killed_and_resumed_gives_the_same_bits(
     recording, finished, tmp_path, monkeypatch
 ):
-    """One run that ends within an epoch, at its end, between the row of the log and the checkpoints
-    of the second epoch, between those two, and once more within one."""
+    """One run that ends within an epoch, at its end, between the row of the log and the weights of
+    the second epoch, between weights and checkpoint, and once more within one."""
     run = config(recording, tmp_path / "run")
 
     def stop(step, resume=True):
         with stopped_at(step):
             assert loop.train(run, resume=resume).stopped_by == signal.SIGTERM
-        assert checkpoint.load_run(tmp_path / "run", "latest").step == step
+        assert checkpoint.load_latest(tmp_path / "run").step == step
 
     def kill_after(owner, name):
         """As the process dies behind the first call."""
@@ -88,7 +89,7 @@ def test_stopped_and_killed_and_resumed_gives_the_same_bits(
     stop(1, resume=False)
     stop(STEPS)
     kill_after(run_folder.Log, "add")  # the log has a row that no checkpoint has
-    kill_after(checkpoint, "save")
+    kill_after(checkpoint, "save_best")
     stop(2 * STEPS + 4)
     assert loop.train(run, resume=True).stopped_by is None
     assert_same_runs(tmp_path / "run", finished[0])
@@ -184,24 +185,35 @@ def test_two_trainings_in_one_folder(recording, tmp_path):
 def test_runs_that_cannot_be_loaded(recording, finished, tmp_path):
     def refused(problem, run):
         with pytest.raises(InputError, match=problem):
-            checkpoint.load_run(run)
+            read_network(run)
 
-    refused(r"holds no run \(config\.yaml is missing\)", tmp_path)
+    refused(r"holds no network \(config\.yaml is missing\)", tmp_path)
     configuration.save(tmp_path / "empty" / "config.yaml", TrainConfig())
-    refused("holds no checkpoint", tmp_path / "empty")
+    refused(r"holds no weights \(weights\.safetensors is missing\)", tmp_path / "empty")
+    with pytest.raises(InputError, match="latest: holds no checkpoint"):
+        checkpoint.load_latest(tmp_path / "empty")
     shutil.copytree(finished[0], tmp_path / "run")
     wider = config(recording, "", model=dataclasses.replace(config("", "").model, width=5))
     configuration.save(tmp_path / "run" / "config.yaml", wider)
-    refused(r"has shape \[.*\] in the checkpoint and \[.*\] in the conf", tmp_path / "run")
+    refused(r"has shape \[.*\], and in the configured network \[.*\]", tmp_path / "run")
+    shapes = r"has shape \[.*\] in the checkpoint and \[.*\] in the conf"
+    with pytest.raises(InputError, match=shapes):
+        checkpoint.load_latest(tmp_path / "run")
     shutil.copy(finished[0] / "config.yaml", tmp_path / "run")
-    for damaged in (tmp_path / "run" / "checkpoints" / "best").glob("*/variables/**/d/*"):
+    weights = tmp_path / "run" / "weights.safetensors"
+    content = weights.read_bytes()
+    for length in (0, 5, 100, len(content) - 1):
+        weights.write_bytes(content[:length])
+        refused("cannot be read", tmp_path / "run")
+    for damaged in (tmp_path / "run" / "checkpoints" / "latest").glob("*/variables/**/d/*"):
         damaged.write_bytes(damaged.read_bytes()[:10])
-    refused("cannot be read", tmp_path / "run")
-    run = checkpoint.load_run(finished[0])
+    with pytest.raises(InputError, match="cannot be read"):
+        checkpoint.load_latest(tmp_path / "run")
+    run = read_network(finished[0])
     run.variables["params"]["head"]["bias"] = jnp.full(3, jnp.nan, jnp.float32)
-    configuration.save(tmp_path / "lost" / "config.yaml", run.config)
-    checkpoint.write_best(tmp_path / "lost", run)
-    refused("best: holds parameters that are not finite", tmp_path / "lost")
+    (tmp_path / "lost").mkdir()
+    write_network(tmp_path / "lost", run)
+    refused("'params/head/bias' holds values that are not finite", tmp_path / "lost")
 
 
 def test_a_head_that_no_gradient_reaches_is_told_of(recording, finished):
@@ -233,8 +245,9 @@ def test_a_step_that_is_not_finite_leaves_the_last_good_checkpoint(
     problem = rf"run: the loss or its gradient is not finite at step {2 * STEPS - 1} \(epoch 1\)"
     with stopped_at(-1), pytest.raises(FloatingPointError, match=problem):
         loop.train(config(recording, tmp_path / "run"))
+    assert checkpoint.load_latest(tmp_path / "run").step == STEPS
+    assert read_network(tmp_path / "run").step == STEPS
     for which in ("latest", "best"):
-        assert checkpoint.load_run(tmp_path / "run", which).step == STEPS
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(arrays(tmp_path / "run", which)))
 
 
@@ -310,7 +323,7 @@ def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(
     figures = [(-100.0, 1.0), (-50.0, 2.0), (7.0, 4.0), (6.0, 5.0)]
     loss = LossConfig(nll_weight=1.0, nll_from_epoch=1.5)
     assert counted(figures, best_by=criterion, loss=loss)[0].best_loss == best
-    assert checkpoint.load_run(tmp_path / "run").epoch == epoch
+    assert read_network(tmp_path / "run").epoch == epoch
 
 
 @pytest.mark.parametrize(
@@ -324,17 +337,17 @@ def test_the_first_whole_epoch_of_what_is_trained_can_be_the_best(
     loss = LossConfig(nll_from_epoch=begin)
     outcome, _ = counted([(value, 1.0) for value in figures], loss=loss)
     assert outcome.best_loss == 1.0
-    assert checkpoint.load_run(tmp_path / "run").epoch == epoch
+    assert read_network(tmp_path / "run").epoch == epoch
 
 
 def test_nan_on_validation_is_never_the_best(counted, tmp_path):
     nan, infinite = float("nan"), float("inf")
     outcome, _ = counted([(nan, nan), (3.0, 3.0), (infinite, 1.0), (2.0, 2.0), (4.0, 4.0)])
     assert outcome.best_loss == 2.0
-    assert checkpoint.load_run(tmp_path / "run").epoch == 4
+    assert read_network(tmp_path / "run").epoch == 4
     assert counted([(nan, nan)], "none")[0].best_loss is None
-    with pytest.raises(InputError, match="best: holds no checkpoint"):
-        checkpoint.load_run(tmp_path / "none")
+    with pytest.raises(InputError, match="none: holds no weights"):
+        read_network(tmp_path / "none")
     config, plateau = OptimConfig(schedule="plateau"), optimizer.Plateau()
     for error in (infinite, 1.0, nan, 0.5):
         plateau = optimizer.update_plateau(plateau, error, config)

@@ -15,9 +15,9 @@ from gnio_jax.config import DataConfig
 from gnio_jax.data import loading
 from gnio_jax.errors import InputError
 from gnio_jax.models import Network
+from gnio_jax.networks import read_network
 from gnio_jax.reporting import Lines, Silence
 from gnio_jax.training import recordings, run_folder, waypoint_poses
-from gnio_jax.training.checkpoint import load_run
 from gnio_jax.training.window_task import WindowTask
 from gnio_jax.types import Waypoints
 from tests.support import drawn_run, tiny_run
@@ -45,7 +45,7 @@ def experiment(run, workdir="", **changes):
 def read(monkeypatch, walks, run, workers=1):
     monkeypatch.setattr(loading, "read_split", lambda *_: iter(walks))
     config, samples = experiment(run), {}
-    poses = waypoint_poses.load_pose_network(config, Lines(), load_run)
+    poses = waypoint_poses.load_pose_network(config, Lines())
     given = config, "synthetic", "train", Lines(), workers, samples, poses
     found = list(recordings.read_split(*given))
     assert samples == {each.name: len(each.time) for each in found}
@@ -56,7 +56,7 @@ def read(monkeypatch, walks, run, workers=1):
 def smoothed(earlier, monkeypatch):
     """A smoother that is known: it moves each interpolated position a metre up, and knows nothing
     of the last three seconds. The walks that it was asked for."""
-    asked, run = [], load_run(earlier)
+    asked, run = [], read_network(earlier)
     network = Network.of(run.model, run.variables)
     wanted = filtering.make_filter(run.config.data, run.config.filter)
 
@@ -126,9 +126,9 @@ def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypat
     monkeypatch.setattr(
         waypoint_poses, "cache_entry", lambda name, files: sources.append(files) or Path(name)
     )
-    walk, run = tapped(0), load_run(earlier)
+    walk, run = tapped(0), read_network(earlier)
     digest = waypoint_poses.digest_network(run)
-    by = waypoint_poses.PoseNetwork(str(earlier), load_run, digest)
+    by = waypoint_poses.PoseNetwork(str(earlier), digest)
     assert walk.waypoints is not None
     time, place = walk.waypoints
     others = [
@@ -155,10 +155,10 @@ def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypat
 
 
 def test_a_run_that_changes_at_its_place_makes_its_own_poses(earlier, smoothed, monkeypatch):
-    config = load_run(earlier).config
+    config = read_network(earlier).config
     read(monkeypatch, [tapped(0)], earlier)
     old = waypoint_poses.PoseNetwork(
-        str(earlier), load_run, waypoint_poses.digest_network(load_run(earlier))
+        str(earlier), waypoint_poses.digest_network(read_network(earlier))
     )
     tiny_run.save(earlier, dataclasses.replace(config, filter=changed(SETTINGS)), size=0.3)
     read(monkeypatch, [tapped(0)], earlier)
@@ -174,7 +174,7 @@ def unread():
 
 
 def test_a_run_that_cannot_make_poses_is_told_before_anything_is_read(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="gone: holds no run"):
+    with pytest.raises(InputError, match="gone: no such network"):
         read(monkeypatch, unread(), tmp_path / "gone")
     slow = DataConfig(rate=25.0, stride_seconds=0.2, train_stride_seconds=0.2)
     tiny_run.save(tmp_path / "slow", tiny_run.config(None, "", data=slow))
@@ -184,7 +184,7 @@ def test_a_run_that_cannot_make_poses_is_told_before_anything_is_read(tmp_path, 
 
 def test_a_run_that_is_not_calibrated_is_warned_of(tmp_path, capsys):
     run = tiny_run.save(tmp_path / "plain", tiny_run.config(None, "", data=DataConfig(rate=50.0)))
-    assert waypoint_poses.load_pose_network(experiment(run), Lines(), load_run) is not None
+    assert waypoint_poses.load_pose_network(experiment(run), Lines()) is not None
     assert f"warning: {run}: its filter is not calibrated" in capsys.readouterr().err
 
 
@@ -204,9 +204,9 @@ def test_a_resumed_run_takes_the_same_poses_from_another_place(
             return yaml.safe_load((tmp_path / "run" / "splits.yaml").read_text())
 
     kept = opened(earlier, resume=False)
-    assert kept["data.poses_by"] == [waypoint_poses.digest_network(load_run(earlier))]
+    assert kept["data.poses_by"] == [waypoint_poses.digest_network(read_network(earlier))]
     assert opened(shutil.copytree(earlier, tmp_path / "moved")) == kept
-    other = tiny_run.save(tmp_path / "other", load_run(earlier).config, size=0.3)
+    other = tiny_run.save(tmp_path / "other", read_network(earlier).config, size=0.3)
     with pytest.raises(InputError, match=r"begun with other recordings in split 'data\.poses_by'"):
         opened(other)
     assert len(smoothed) == 4
@@ -217,7 +217,7 @@ def test_a_resumed_run_takes_the_same_poses_from_another_place(
 @pytest.mark.slow
 def test_processes_make_the_poses_that_one_makes(earlier, monkeypatch):
     """By a network that has learnt only that people walk at 1.1 m/s where the phone points."""
-    config = load_run(earlier).config
+    config = read_network(earlier).config
     model = dataclasses.replace(config.model, name="tlio", width=2, uncertainty=None)
     config = dataclasses.replace(config, model=model, data=DataConfig(rate=50.0))
     outputs = iter(([0.0, 1.1, 0.0], [-1.5, -1.5, -1.5]))  # m, and logarithms of m

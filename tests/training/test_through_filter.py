@@ -29,10 +29,12 @@ from gnio_jax.config import (
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import resolve
 from gnio_jax.filtering.settings import with_free_parameters
+from gnio_jax.networks import read_network, write_network
 from gnio_jax.reporting import Silence
 from gnio_jax.training import checkpoint, filter_task, loop, optimizer, task
 from gnio_jax.training.filter_losses import FilterLosses
 from gnio_jax.training.filter_task import FilterTask
+from gnio_jax.training.initial import load_initial_network
 from gnio_jax.training.recordings import set_up
 from gnio_jax.training.task import TrainState
 from gnio_jax.training.window_task import WindowTask
@@ -113,8 +115,8 @@ def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished)
 
 
 def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
-    before = checkpoint.load_run(recording / "initial")
-    after = checkpoint.load_run(finished, "latest")
+    before = read_network(recording / "initial")
+    after = checkpoint.load_latest(finished)
     for module, parameters in before.variables["params"].items():
         assert same(parameters, after.variables["params"][module]) == (module != "head"), module
     statistics = after.variables["batch_stats"]
@@ -140,15 +142,14 @@ def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path):
 
 def test_a_copy_with_other_options_has_them(finished, tmp_path):
     """As calibration writes it: what had learnt does not come back."""
-    run = checkpoint.load_run(finished)
+    run = read_network(finished)
     options = changed(
         run.config.filter,
         noise={"gyro_density": 0.5, "correlation": CorrelatedError(0.9, 0.5)},
     )
     config = dataclasses.replace(run.config, filter=options)
-    configuration.save(tmp_path / "config.yaml", config)
-    checkpoint.write_best(tmp_path, run._replace(config=config))
-    found = checkpoint.load_run(tmp_path)
+    write_network(tmp_path, run._replace(config=config))
+    found = read_network(tmp_path)
     assert found.config.filter == options and same(found.variables, run.variables)
     assert (found.step, found.epoch) == (run.step, run.epoch)
 
@@ -162,7 +163,7 @@ def training(recording):
 
 @pytest.fixture(scope="module")
 def start(recording):
-    return checkpoint.load_run(recording / "initial").variables
+    return read_network(recording / "initial").variables
 
 
 def oracle(state):
@@ -418,7 +419,7 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
     """The command makes the filter of that run the default; what it asks for wins."""
     words = ["--init-from", str(finished), "--through-filter.learn", *THROUGH.learn]
     asked_for = tiny(recording, "unused", init_from=str(finished))
-    run = checkpoint.load_initial_network(asked_for, checkpoint.load_run)
+    run = load_initial_network(asked_for)
     call = Call("gnio train", words)
     begins = experiment(read(train, call), call).filter
     assert begins == run.config.filter != OPTIONS
@@ -439,12 +440,12 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
         model = dataclasses.replace(config.model, equivariance=equivariance)
         other = dataclasses.replace(config, model=model)
         with nullcontext() if fits else pytest.raises(InputError, match="canonical_frame"):
-            assert checkpoint.load_initial_network(other, checkpoint.load_run) is not None
+            assert load_initial_network(other) is not None
     with jax.enable_x64(False):
-        start = checkpoint.load_initial_network(config, checkpoint.load_run)
+        start = load_initial_network(config)
         training, _ = set_up(WindowTask, config, Silence())
         state = training.initial_state(KEY, start.variables)
-    theirs = checkpoint.load_run(recording / "initial").variables
+    theirs = read_network(recording / "initial").variables
     assert same(state.variables["params"], theirs["params"])
     statistics = state.variables["batch_stats"]
     assert same(statistics["norm"], theirs["batch_stats"]["norm"])

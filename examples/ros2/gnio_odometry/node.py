@@ -11,7 +11,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 from tf2_ros import TransformBroadcaster
 
-from gnio_jax.apps import live, packages
+from gnio_jax import networks
+from gnio_jax.apps import live
 from gnio_odometry.bridge import Bridge
 
 SENSOR_DATA = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -20,25 +21,25 @@ step takes longer than those, and every message that is lost is a hole."""
 
 
 class GnioOdometry(Node):
-    """Parameters: weights (name, package or run folder), imu_rate (Hz; 0: the network's),
+    """Parameters: network (name, package or run folder), imu_rate (Hz; 0: the network's),
     rest_seconds (the device lies still so long at the start), odom_frame, imu_frame (of messages
     that name none), publish_tf (odom -> the IMU's frame; off where that frame has a parent)."""
 
     def __init__(self):
         super().__init__("gnio_odometry")
-        weights = self.declare_parameter("weights", "pedestrian").value
+        network = self.declare_parameter("network", "pedestrian").value
         rate = self.declare_parameter("imu_rate", 0.0).value
         rest_seconds = self.declare_parameter("rest_seconds", 1.0).value
         self._odom = self.declare_parameter("odom_frame", "odom").value
         self._imu = self.declare_parameter("imu_frame", "imu_link").value
         publish_tf = self.declare_parameter("publish_tf", True).value
-        run = packages.load_pretrained(weights)
+        run = networks.load(network)
         self._bridge = Bridge(live.create_tracker(run, rate or None, rest_seconds))
         self._publisher = self.create_publisher(Odometry, "odometry", 10)
         self._transforms = TransformBroadcaster(self) if publish_tf else None
         self.create_subscription(Imu, "imu", self._take, SENSOR_DATA)
         self.get_logger().info(
-            f"ready with {weights}; keep the device still for {rest_seconds:g} s"
+            f"ready with {network}; keep the device still for {rest_seconds:g} s"
         )
 
     def _take(self, message: Imu) -> None:

@@ -1,4 +1,4 @@
-"""ros2 launch gnio_odometry gnio.launch.py imu:=/camera/imu weights:=pedestrian"""
+"""ros2 launch gnio_odometry gnio.launch.py imu:=/camera/imu network:=pedestrian"""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
@@ -17,7 +17,7 @@ def generate_launch_description():
     return LaunchDescription(
         [
             DeclareLaunchArgument("imu", default_value="/imu"),
-            DeclareLaunchArgument("weights", default_value="pedestrian"),
+            DeclareLaunchArgument("network", default_value="pedestrian"),
             DeclareLaunchArgument("imu_rate", default_value="0.0"),
             DeclareLaunchArgument("publish_tf", default_value="true"),
             Node(
@@ -26,7 +26,7 @@ def generate_launch_description():
                 remappings=[("imu", LaunchConfiguration("imu"))],
                 parameters=[
                     {
-                        "weights": typed("weights", str),
+                        "network": typed("network", str),
                         "imu_rate": typed("imu_rate", float),
                         "publish_tf": typed("publish_tf", bool),
                     }

@@ -145,9 +145,8 @@ def clocked(sensor: Sensor, unit: str | None, notes: list[str], warnings: list[s
         problem = f"all {len(stamps)} rows of field '{name}' have the same stamp {stamps[0]:.6g}"
         remedy = "a spreadsheet may have cut its digits: take the file as the logger wrote it"
         raise InputError(file, problem, remedy)
-    is_doubtful, second = False, unit or sensor.second
-    if second is None:
-        second, is_doubtful = _detected_unit(sensor, remarks)
+    stated = unit or sensor.second
+    second, is_doubtful = (stated, False) if stated else _detected_unit(sensor, remarks)
     rate = 1.0 / (usual_step(stamps) * float(parsing.seconds_of(second)))
     if not parsing.is_rate(rate):
         problem = f"field 'time' makes {name} run at {rate:.3g} Hz with the unit {second}"

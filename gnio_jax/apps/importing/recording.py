@@ -127,8 +127,7 @@ def _in_si(
     scale, slowness = units.gyro_scale(imu, unit, gyro.file, notes)
     imu = imu._replace(gyro=imu.gyro * scale)
     warnings += doubts + slowness + physics.check_turning(imu, gyro.file)
-    is_doubtful = gyro.is_doubtful or accel.is_doubtful
-    if is_doubtful and not physics.is_supported(*physics.agreement(imu)):
+    if (gyro.is_doubtful or accel.is_doubtful) and not physics.is_clock_supported(imu):
         problem = f"field 'time' makes it run at {rounded_rate(imu.time):g} Hz, which may be wrong"
         remedy = "if that is right, state its unit by --time-unit, or give --sample-rate (Hz)"
         raise InputError(gyro.file, problem, remedy)

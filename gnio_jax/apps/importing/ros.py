@@ -28,7 +28,7 @@ from jaxtyping import Float, Int
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.config import ImportOptions
-from gnio_jax.data.parsing.stamps import seconds
+from gnio_jax.data.parsing.stamps import FEW_SHARE, seconds
 from gnio_jax.data.parsing.tables import parsed_as, shortened
 from gnio_jax.data.readers.euroc import SensorPose, moved_to
 from gnio_jax.data.reference import SHORTEST_RUN, Poses
@@ -68,7 +68,7 @@ def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
         problem = f"topics {imu.name} and {other.name} are stamped by different clocks"
         raise InputError(path, problem, "name other topics")
     clock = "headers" if of_gyro.by_headers else "bag: its headers have no time"
-    if not of_gyro.by_headers and of_gyro.headers.all():
+    if of_gyro.has_headers and not of_gyro.by_headers:
         clock, problem = "bag", f"the headers of {imu.name} run {of_gyro.pace:.3g} times as fast as"
         warnings.append(f"clock: {path.name}: {problem} the bag's clock, whose stamps are taken")
     topic = f"{imu.name} ({imu.count} messages)"
@@ -284,11 +284,16 @@ class _Imu(NamedTuple):
         return float(spans[0] / max(spans[1], 1.0))
 
     @property
+    def has_headers(self) -> bool:
+        """Whether the headers have stamps, all but a few."""
+        return bool((self.headers == 0).mean() <= FEW_SHARE)
+
+    @property
     def by_headers(self) -> bool:
         """Whether the headers have stamps that run as the bag's; otherwise these are used."""
-        drift = abs(self.pace - 1.0)
-        is_same = drift < SAME_PACE or drift * np.ptp(self.logged) / 1e9 < DELAY
-        return bool(self.headers.all() and is_same)
+        drift, burst = abs(self.pace - 1.0), np.diff(np.unique(self.logged)).max(initial=0)
+        is_same = drift < SAME_PACE or drift * np.ptp(self.logged) < DELAY * 1e9 + burst
+        return bool(self.has_headers and is_same)
 
     def sensor(self, name: str, topic: str, path: Path) -> Sensor:
         """The gyro or accel, which the topic must have."""
@@ -312,10 +317,8 @@ def _collected(
     """The IMU topics, the poses of the reference, and the static transforms."""
     static = {name for name in bag.topics if name.endswith("tf_static")}
     of_poses = set() if reference is None else {reference.name}
-    first: dict[str, Any] = {}
-    rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in imus}
-    poses: list[_Pose] = []
-    mounts: _Mounts = {}
+    first, rows = dict[str, Any](), {name: list[tuple[Any, ...]]() for name in imus}
+    poses, mounts = list[_Pose](), _Mounts()
     for topic, logged, message in bag.messages(imus | static | of_poses):
         if topic in imus:
             first.setdefault(topic, message)
@@ -339,9 +342,8 @@ def _collected(
 
 
 def _stamp(message: Any) -> int:
-    if not hasattr(message, "header"):
-        return 0
-    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+    stamp = message.header.stamp if hasattr(message, "header") else None
+    return stamp.sec * 10**9 + stamp.nanosec if stamp else 0
 
 
 def _poses(message: Any, logged: int) -> Iterator[_Pose]:

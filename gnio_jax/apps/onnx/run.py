@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gnio_jax.apps import packages
 from gnio_jax.apps.onnx import conversion, driver
 from gnio_jax.apps.onnx.driver import WalkResult
 from gnio_jax.apps.onnx.programs import programs, start_arrays
@@ -27,6 +26,7 @@ from gnio_jax.evaluation.metrics import ate
 from gnio_jax.files import fingerprint, replacing_folder
 from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.models import Network
+from gnio_jax.networks import load
 
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
 SECONDS = 60.0
@@ -72,19 +72,18 @@ class ExportResult(NamedTuple):
 
 
 def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> ExportResult:
-    """Export the network and the filter of a run or package into the folder `out`.
+    """Export a network and its filter into the folder `out`.
 
     The filter is that of `gnio track`. The models are then run over a simulated walk of this
     duration, and `export.json` records their deviation from the package, with the tensors, size and
     SHA-256 of each model. The folder is written whole or not at all. JAX's x64 must be on. Raises
-    `InputError` for a run without a checkpoint, a folder that exists already, a missing Python
+    `InputError` for a network that cannot be loaded, a folder that exists already, a missing Python
     package, or a conversion with a large deviation.
     """
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(out, "is there already", "name another --out, or remove it")
     require_packages("gnio export", "onnx", *PACKAGES)
-    source = packages.find(which)
-    run = packages.load_pretrained(source)
+    run = load(which)
     network = Network.of(run.model, run.variables)
     ekf = make_filter(run.config.data, run.config.filter)
     with replacing_folder(out) as folder, ExitStack() as at_end:
@@ -107,13 +106,13 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
         without = dataclasses.replace(ekf, considered=None)
         (package_estimate,) = estimate([walk], network, windows, without)
         deviation = deviation_of(result, package_estimate)
-        check(deviation, source.name)
+        check(deviation, run.name)
         manifest = {
             "format": FORMAT,
             "version": VERSION,
             "made_by": f"gnio-jax {version('gnio-jax')}",
             "conventions": CONVENTIONS,
-            "run": source.name,
+            "run": run.name,
             "network": run.config.model.name,
             "epoch": run.epoch,
             "step": run.step,

@@ -14,8 +14,8 @@ from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.models import Network
+from gnio_jax.networks import read_network
 from gnio_jax.numerics import matrix_from_quaternion
-from gnio_jax.training.checkpoint import load_run
 from gnio_jax.types import GRAVITY
 from tests.support import drawn_run
 from tests.support.filter_settings import changed
@@ -59,7 +59,7 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="package")
 def package(run):
     """The odometry of the package over the walk, from a state made of its ekf."""
-    loaded = load_run(run)
+    loaded = read_network(run)
     ekf = filtering.make_filter(loaded.config.data, loaded.config.filter)
     network = Network.of(loaded.model, loaded.variables)
 

@@ -18,7 +18,7 @@ from gnio_jax.apps.onnx import driver
 from gnio_jax.apps.onnx.programs import start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check
 from gnio_jax.commands import app, console
-from gnio_jax.training.checkpoint import load_run
+from gnio_jax.networks import read_network
 from tests.apps.onnx.conftest import BIAS, CONFIG, SECONDS
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "onnx"
@@ -68,7 +68,7 @@ def test_the_start_has_the_bias_of_a_gyro_at_rest(run, models, walked):
     """So have the starts of `gnio track` and `gnio live`, which those arrays equal."""
     rest = {"gyro": walked.gyro[:REST], "accel": walked.accel[:REST]}
     arrays = driver.run(driver.open_models(models[0]).start, rest)
-    loaded = load_run(run).config
+    loaded = read_network(run).config
     ekf = filtering.make_filter(loaded.data, loaded.filter)
     wanted = start_arrays(from_rest(ekf, walked), ekf)
     assert arrays.keys() == wanted.keys()
@@ -108,7 +108,7 @@ def test_the_filter_is_in_float64_and_every_tensor_is_described(models):
     ("arguments", "words"),
     [
         (["untrained", "--out", "taken"], "taken: is there already"),
-        (["untrained"], "untrained/checkpoints/best: holds no checkpoint"),
+        (["untrained"], "untrained: holds no weights"),
         (None, "gnio export: needs the package jax2onnx; pip install 'gnio-jax[onnx]'"),
     ],
 )

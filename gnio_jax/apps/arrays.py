@@ -1,0 +1,146 @@
+"""The trajectory of samples that are arrays in memory (`gnio_jax.track`).
+
+arrays → check → one clock, as of every recording → the start and the filter of `gnio track`
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax import networks
+from gnio_jax.apps.importing import units
+from gnio_jax.apps.importing.clocks import Sensor
+from gnio_jax.apps.importing.recording import RawRecording, as_sequence
+from gnio_jax.apps.track import estimate_recording, summarise
+from gnio_jax.config import ImportOptions
+from gnio_jax.data import physics
+from gnio_jax.data.parsing.stamps import check_seconds, first_stamp
+from gnio_jax.data.validation import check_accel
+from gnio_jax.errors import InputError
+
+SOURCE = "samples"
+"""Name of the arrays in messages and notes."""
+
+
+class Odometry(NamedTuple):
+    """Poses of an IMU, its velocity, and the uncertainty of its position, at k moments.
+
+    The world is z-up. It begins where the IMU begins, with yaw zero. Rows from a divergence of the
+    filter on are NaN, and a note says why.
+    """
+
+    time: Float[np.ndarray, "k"]
+    """Stamps on the clock of the samples, s: the first sample, and the end of each stride."""
+    position: Float[np.ndarray, "k 3"]
+    """m."""
+    orientation: Float[np.ndarray, "k 4"]
+    """Body→world, unit quaternions wxyz."""
+    velocity: Float[np.ndarray, "k 3"]
+    """m/s."""
+    covariance: Float[np.ndarray, "k 3 3"]
+    """Covariance of the error of `position`, m²."""
+    notes: tuple[str, ...]
+    """Warnings, and what was found out about the samples and the start, one sentence each."""
+
+
+def track(time: Any, gyro: Any, accel: Any, network: str | Path = "pedestrian") -> Odometry:
+    """The trajectory of a phone that somebody carries, from arrays of its IMU's samples.
+
+    Start, filter and result are those of `gnio track` for a file with these samples. Stand still
+    for a second at the beginning: the first second gives the tilt, and a rest gives the gyro's
+    bias. Rows may be out of order, holes of up to a second are bridged, and the rate is that of the
+    samples, 10 to 2000 Hz. The filter runs in float64, whatever JAX is set to.
+
+    Args:
+        time: (n,) stamps, s, from any origin.
+        gyro: (n, 3) angular rate, body frame, rad/s.
+        accel: (n, 3) specific force, body frame, m/s², with gravity in it: the axis that points up
+            reads +9.81 at rest, as on Android.
+        network: Name of a trained network, or its folder or zip.
+
+    Raises:
+        InputError: An array has the wrong shape, a value that is not finite, or another unit; the
+            samples last less than two seconds or so; there is no such network. It is a
+            `ValueError`.
+    """
+    time, gyro, accel = _checked_samples(time, gyro, accel)
+    recording = RawRecording(
+        Path(SOURCE),
+        Sensor("gyro", Path(SOURCE), time, gyro, second="s", unit="rad/s"),
+        Sensor("accel", Path(SOURCE), time, accel, second="s", unit="m/s2"),
+        notes=[],
+        warnings=[],
+        sign="android",
+    )
+    chosen = networks.load(network)
+    with jax.enable_x64(True):  # for the filter; the network states its float32
+        imported = as_sequence(recording, ImportOptions(), None, SOURCE)
+        estimate, ready, ekf = estimate_recording(imported.sequence, chosen)
+        summary = summarise(estimate, {}, ready, imported, chosen, ekf)
+    path, filtered, states = estimate.trajectory, estimate.filtered, estimate.states
+    assert filtered is not None and states is not None
+    return Odometry(
+        path.time + summary.start_time,
+        path.position,
+        path.orientation,
+        np.where(path.known[:, None], states.velocity, np.nan),
+        np.where(path.known[:, None, None], filtered.covariance, np.nan),
+        (*summary.warnings, *summary.notes),
+    )
+
+
+def _checked_samples(time: Any, gyro: Any, accel: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The samples as float64 arrays in SI units. Raises `InputError` naming the argument, what it
+    is and what is expected."""
+    stamps = _checked_array("time", time, None)
+    rate = _checked_array("gyro", gyro, len(stamps))
+    force = _checked_array("accel", accel, len(stamps))
+    check_seconds(stamps, SOURCE)
+    check_accel(force, SOURCE)
+    first = first_stamp(stamps, "s", SOURCE)
+    rows = np.unique(stamps, return_index=True)[1]
+    imu = physics.ImuSamples(stamps[rows] - first, rate[rows], force[rows])
+    peak = float(np.percentile(np.linalg.norm(rate, axis=1), 99.9))
+    reason = f"it reaches {peak:.3g}, and no phone measures more than {units.PHONE_RANGE:g} rad/s"
+    reason = reason if peak > units.PHONE_RANGE else ""
+    stated, *others = (
+        physics.agreement(imu, scale) for scale in (1.0, physics.DEGREE, 1 / physics.DEGREE)
+    )
+    if not physics.is_supported(*stated):
+        by_gravity = "by the turning of gravity"
+        in_degrees, in_radians_twice = (physics.is_supported(*other) for other in others)
+        if in_radians_twice:
+            problem = f"is too small to be in rad/s ({by_gravity})"
+            raise InputError("gyro", problem, "give rad/s, and convert from deg/s only once")
+        reason = by_gravity if in_degrees else reason
+    if reason:
+        problem = f"looks like deg/s ({reason}), expected rad/s"
+        raise InputError("gyro", problem, "convert it: numpy.radians(gyro)")
+    return stamps, rate, force
+
+
+def _checked_array(name: str, values: Any, count: int | None) -> np.ndarray:
+    """One argument as a finite float64 array, (n,) if `count` is None and else (`count`, 3)."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(name, f"is no array of numbers ({error})") from None
+    if count is None and (array.ndim != 1 or len(array) < 2):
+        problem = f"has shape {array.shape}, expected (n,): a stamp in s for each sample"
+        raise InputError(name, problem)
+    if count is not None and array.shape != (count, 3):
+        problem = f"has shape {array.shape}, expected {(count, 3)}: x, y, z for each of the stamps"
+        transposed = array.ndim == 2 and array.T.shape == (count, 3)
+        raise InputError(name, problem, f"give {name}.T" if transposed else "")
+    if not (finite := np.isfinite(array)).all():
+        rows = ~finite.reshape(len(array), -1).all(axis=1)
+        problem = f"is NaN or infinite in {rows.sum()} of {len(array)} rows, the first is row "
+        problem += f"{rows.argmax()} (counted from 0)"
+        remedy = "leave these rows out of time, gyro and accel: holes of up to a second are bridged"
+        raise InputError(name, problem, remedy)
+    return array

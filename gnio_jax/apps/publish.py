@@ -1,0 +1,214 @@
+"""Publishing: a trained network with a card for people who do not have its data."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from importlib.metadata import version
+from pathlib import Path
+
+from gnio_jax import networks
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import folder as results
+from gnio_jax.evaluation import tabulate
+from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation.statistics import summarise
+from gnio_jax.files import file_stem
+from gnio_jax.networks import Card, TrainedNetwork
+from gnio_jax.networks.folder import evaluations_folder, has_card, write_published
+
+SHOWN = ("ate_2d", "rte_60s_2d", "path_length_ratio_2d", "yaw_rmse", "nees_coverage_2d")
+"""Metrics of the card. Lists of networks show the first."""
+AT_WAYPOINTS = ("leg_ratio", "waypoint_rms")
+"""Further metrics, of evaluations of walks with waypoints."""
+
+
+def publish(
+    network: str | Path,
+    out: Path,
+    name: str,
+    data: str,
+    license: str,
+    fails: tuple[str, ...] = (),
+) -> Card:
+    """Publish a network at `out`: a zip if its name ends with .zip, else a folder. It replaces an
+    older one. It is written whole or not at all, and its settings do not contain folders of this
+    machine.
+
+    Args:
+        network: The folder of a network, a published one, or a name.
+        out: The place of the published network.
+        name: Its name, a file name.
+        data: The data on which it was trained: recordings, devices, people, ways of carrying.
+        license: The terms under which the data may be used and the weights passed on.
+        fails: The cases in which it fails, one sentence each.
+
+    Raises:
+        InputError: The network cannot be loaded, the name is no file name, a text is empty, or
+            something at `out` is no published network.
+    """
+    if name != file_stem(name):
+        remedy = "use letters, digits, '.', '_', '+' and '-'"
+        raise InputError("--name", f"'{name}' is no name of a folder", remedy)
+    for option, text in (("--data", data), ("--license", license)):
+        if not text.strip():
+            remedy = "describe it in a sentence, because other people rely on it"
+            raise InputError(option, "is empty", remedy)
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())) and not has_card(out):
+        raise InputError(out, "is there already and is no published network", "name another --out")
+    trained = networks.load(network)
+    figures = _read_figures(trained.path)
+    card = Card(
+        name,
+        trained.config.model.name,
+        data,
+        license,
+        trained.epoch,
+        trained.step,
+        _describe_error(figures, trained.config.datasets),
+        f"gnio-jax {version('gnio-jax')}",
+        {},
+    )
+    return write_published(out, trained, card, _write_text(card, fails, trained, figures))
+
+
+def describe_data(network: TrainedNetwork) -> str:
+    """The training data of a network in words, with its measured error if there is one."""
+    if network.card is not None:
+        data, error = network.card.data, network.card.measured
+    else:
+        names = ", ".join(network.config.datasets)
+        data, error = f"dataset {names}, split {network.config.data.train_split}", ""
+        try:
+            error = _describe_error(_read_figures(network.path), network.config.datasets)
+        except InputError:
+            pass  # a damaged evaluation must not prevent tracking
+    return f"{data}, whose {error}" if error else data
+
+
+def _read_figures(path: Path | None) -> dict[str, Report]:
+    """Read every evaluation of a network, by its folder's name. Raises `InputError`."""
+    files = () if path is None else evaluations_folder(path).glob("*/metrics.json")
+    folders = sorted(file.parent for file in files)
+    return {folder.name: results.read(folder) for folder in folders}
+
+
+def _describe_error(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
+    """The error that lists of networks show, in words, with that of each way of carrying. It is
+    that of the first evaluation that has it. Evaluations with the filter come first, then those on
+    the run's own datasets, then those on a test split. It is empty if no evaluation has it."""
+
+    def rank(name: str) -> tuple[bool, bool, bool, int, str]:
+        settings = figures[name].settings
+        of_run, tested = settings["dataset"] in datasets, "test" in settings["split"]
+        return settings["estimator"] != "ekf", not of_run, not tested, len(name), name
+
+    for name in sorted(figures, key=rank):
+        if (error := _cell(figures[name], SHOWN[0])) != tabulate.number(None, 0):
+            text = f"{tabulate.column(SHOWN[0]).heading} is {error} m on {name}"
+            by_placement = _by_placement(figures[name])
+            return f"{text} ({'; '.join(by_placement)})" if by_placement else text
+    return ""
+
+
+def _by_placement(figures: Report) -> list[str]:
+    """The mean of this error for each way of carrying, the smallest first, in words."""
+    errors: dict[str, list[float]] = {}
+    for name, placement in figures.placements.items():
+        scores = figures.scores[name]
+        error = scores.values.get(SHOWN[0])
+        if error is not None and math.isfinite(error) and not scores.diverged:
+            errors.setdefault(placement, []).append(error)
+    means = {placement: sum(values) / len(values) for placement, values in errors.items()}
+    return [
+        f"{placement} {means[placement]:.1f}" for placement in sorted(means, key=means.__getitem__)
+    ]
+
+
+def _cell(figures: Report, metric: str) -> str:
+    """The mean over the sequences with its 95 % interval."""
+    summary = summarise([figures.scores], metric, figures.groups)
+    digits = tabulate.column(metric).digits
+    text = tabulate.number(summary.mean, digits)
+    if summary.interval is None:
+        return text
+    low, high = (tabulate.number(bound, digits) for bound in summary.interval)
+    return f"{text} ({low} to {high})"
+
+
+def _shorten(network: str) -> str:
+    """The name of a network, or a run without the folders of this machine."""
+    is_name = network in networks.list_networks() and not Path(network).exists()
+    return shlex.quote(network if is_name else f"runs/{Path(network).name}")
+
+
+def _write_text(
+    card: Card, fails: tuple[str, ...], network: TrainedNetwork, figures: dict[str, Report]
+) -> str:
+    """The text of the card, Markdown."""
+    config, windows, name = network.config, network.config.data, card.name
+    folder = network.path or Path()
+    start = f" --init-from {_shorten(config.init_from)}" if config.init_from else ""
+    if windows.poses_by:
+        start += f" --set data.poses_by={_shorten(windows.poses_by)}"
+    steps, filter_note = [f"gnio train --config config.yaml --workdir runs/{name}{start}"], ""
+    if (folder / "calibration.json").is_file():
+        calibration = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
+        fitted_run = Path(calibration["run"]).name
+        if fitted_run == folder.name.removesuffix("_calibrated"):
+            fitted_run = name
+        headings = " --average-headings" if calibration.get("average_headings") else ""
+        steps.append(f"gnio calibrate --network runs/{fitted_run}{headings}")
+        filter_note = (
+            f" The filter is fitted to split `{calibration['split']}` of run `{fitted_run}`."
+        )
+    recipe = "\n".join(("```", *steps, "```"))
+    considered = [name for name, std in config.filter.considered._asdict().items() if std > 0]
+    has_waypoints = any(AT_WAYPOINTS[0] in evaluation.summary() for evaluation in figures.values())
+    metrics = (*SHOWN, *AT_WAYPOINTS) if has_waypoints else SHOWN
+    header = ["evaluation", "sequences", "groups", *(tabulate.column(x).title for x in metrics)]
+    rows = [
+        [
+            folder,
+            str(len(evaluation.scores)),
+            str(len(set(evaluation.groups.values()))),
+            *(_cell(evaluation, metric) for metric in metrics),
+        ]
+        for folder, evaluation in figures.items()
+    ]
+    means = "Means over sequences, with 95 % intervals over groups (people, sessions)."
+    table = f"{tabulate.markdown(header, rows)}\n{means}"
+    fails = fails or ("Its publisher has not said. Try it on recordings like yours.",)
+    return f"""# {name}
+
+Network `{config.model.name}` for neural inertial odometry by {card.made_by}: windows of \
+{windows.window_seconds:g} s at {windows.rate:g} Hz, a displacement every \
+{windows.stride_seconds:g} s. Epoch {card.epoch}, step {card.step}.
+
+```
+gnio track RECORDING --network {name}
+gnio evaluate --network {name} --dataset NAME
+```
+
+## Data and licence
+
+Trained on: {card.data}
+
+Licence: {card.license}
+
+## Recipe
+
+{recipe}
+
+Dataset `{", ".join(config.datasets)}`, seed {config.seed}. config.yaml beside this card has all \
+settings, those of the filter as they are used. Consider covariance of the filter: \
+{", ".join(considered) or "none"}.{filter_note}
+
+## Figures
+
+{table if figures else "There is no evaluation."}
+
+## Where it fails
+
+{chr(10).join(f"- {sentence}" for sentence in fails)}"""

@@ -1,0 +1,15 @@
+"""Trained networks: their folder on the disk (`folder`), and where they are found (`find`)."""
+
+from gnio_jax.networks.find import find_network, list_networks, load, newest_run
+from gnio_jax.networks.folder import Card, TrainedNetwork, read_network, write_network
+
+__all__ = [
+    "Card",
+    "TrainedNetwork",
+    "find_network",
+    "list_networks",
+    "load",
+    "newest_run",
+    "read_network",
+    "write_network",
+]

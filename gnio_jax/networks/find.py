@@ -1,0 +1,83 @@
+"""Trained networks by their names: those that come with gnio-jax, those in the folders of
+$GNIO_WEIGHTS, and the runs below runs/."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from gnio_jax.errors import InputError, did_you_mean
+from gnio_jax.networks.folder import CONFIG, WEIGHTS, TrainedNetwork, name_of, read_network
+
+SHIPPED = Path(__file__).parents[1] / "weights"
+"""The networks that come with gnio-jax."""
+VARIABLE = "GNIO_WEIGHTS"
+"""Variable with the folders that contain networks, separated as in $PATH."""
+
+
+def is_network(path: Path) -> bool:
+    """Whether a folder or file is meant to be a network; its content is not checked."""
+    return (path.is_file() and path.suffix == ".zip") or (path / CONFIG).is_file()
+
+
+def list_networks() -> dict[str, Path]:
+    """Networks by name (that of the folder, or of the zip without its suffix), those of gnio-jax
+    first. Raises `InputError` for a folder of $GNIO_WEIGHTS that is missing."""
+    folders = [Path(folder) for folder in os.environ.get(VARIABLE, "").split(os.pathsep) if folder]
+    networks: dict[str, Path] = {}
+    for folder in (SHIPPED, *folders):
+        if not folder.is_dir():
+            problem = f"'{folder}' is not a folder"
+            raise InputError(f"${VARIABLE}", problem, "name folders that contain networks")
+        for path in sorted(folder.iterdir()):
+            if is_network(path) and (path.is_file() or (path / WEIGHTS).is_file()):
+                networks.setdefault(name_of(path), path)
+    return networks
+
+
+def find_network(network: str | Path | None = None) -> Path:
+    """The folder or zip of a network: a path, or a name of `list_networks`. None: the first one of
+    gnio-jax, else the newest run below runs/. Raises `InputError` if it is none of these."""
+    networks = list_networks()
+    if network is None:
+        shipped = [path for path in networks.values() if path.parent == SHIPPED]
+        return shipped[0] if shipped else newest_run()
+    path = Path(network)
+    if is_network(path):
+        return path
+    if str(network) in networks:
+        return networks[str(network)]
+    if path.exists():
+        raise InputError(path, f"holds no network ({CONFIG} is missing)", "train one: gnio train")
+    choices = f"known names: {', '.join(networks) or 'none'}; give a folder, a zip or a name"
+    raise InputError(network, "no such network", did_you_mean(str(network), networks) + choices)
+
+
+def load(network: str | Path | None = None) -> TrainedNetwork:
+    """The network of `network` with its variables and configuration.
+
+    Args:
+        network: a folder, a zip, or the name of a network in gnio-jax or in a folder of
+            $GNIO_WEIGHTS; None is the default of `gnio track`.
+
+    `TrainedNetwork.model.apply(variables, windows)` gives a `Prediction` of windows (b, N, 6),
+    float32, [accel m/s², gyro rad/s] in the gravity frame at `config.data.rate`; `config.filter`
+    has the calibrated or trained settings of the filter. Raises `InputError`.
+    """
+    return read_network(find_network(network))
+
+
+def newest_run(folder: str | Path = "runs") -> Path:
+    """The run below `folder` that was trained last; calibrated copies of a run do not count. Raises
+    `InputError` if there is none."""
+    folders = [path.parent for path in Path(folder).glob(f"*/{CONFIG}")]
+    runs = [run for run in folders if not (run / "calibration.json").exists()]
+    if not runs:
+        remedy = "train one with gnio train, or name a network with --network"
+        raise InputError(folder, "holds no run", remedy)
+
+    def last_trained(run: Path) -> float:
+        files = (run / CONFIG, run / "metrics.jsonl")
+        return max(path.stat().st_mtime for path in files if path.exists())
+
+    return max(runs, key=last_trained)

@@ -1,0 +1,150 @@
+"""Publishing a network: its card, and the commands around it."""
+
+import json
+import math
+import os
+import shutil
+
+import pytest
+
+from gnio_jax.apps import publish as publishing
+from gnio_jax.apps.publish import describe_data, publish
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.evaluation import report
+from gnio_jax.evaluation.metrics import Measures
+from gnio_jax.networks import find, read_network
+from gnio_jax.networks.folder import read_card, read_text
+from tests.support import tiny_run
+from tests.support.filter_settings import changed
+from tests.support.reports import write_report
+
+CONFIG = TrainConfig(
+    dataset="synthetic",
+    data_root="/home/somebody/recordings",
+    init_from="runs/earlier",
+    seed=7,
+    data=DataConfig(rate=50.0, poses_by="/home/somebody/runs/first"),
+    model=ModelConfig(name="tiny"),
+    filter=changed(noise={"std_factor": (1.7, 1.0, 1.0)}, considered={"scale": 0.02}),
+)
+SETTINGS = {"dataset": "synthetic", "split": "test", "estimator": "ekf", "alignment": "origin"}
+SETTINGS |= {"recordings": dict.fromkeys("abcd", 60.0), "filter": {}}
+SETTINGS["definitions"] = report.DEFINITIONS
+SCORES = {
+    name: Measures({"ate_2d": error, "yaw_rmse": None}, {"yaw_rmse": "no reference"}, error > 9)
+    for name, error in (("a", 1.2), ("b", 1.3), ("c", 99.0), ("d", math.inf))
+}
+MEASURED = "ATE 2-D is 1.25 (0.61 to 1.89) m on synthetic_test_ekf (in a pocket 1.2; in a hand 1.3)"
+"""12.706 (Student's t, one degree of freedom) times 0.05 m around the mean; two diverged."""
+SAID = ("simulated walks", "CC0", ("Running | jumping.",))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of the smallest network, with the figures of one evaluation."""
+    with tiny_run.known():
+        folder = tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIG)
+        evaluation = folder / "eval" / "synthetic_test_ekf"
+        evaluation.mkdir(parents=True)
+        groups = {"a": "ann", "b": "bob", "c": "ann", "d": "bob"}
+        carried = {"a": "in a pocket", "b": "in a hand", "c": "in a hand", "d": "in a hand"}
+        figures = report.Report(SETTINGS, SCORES, {}, groups, {}, {}, carried)
+        (evaluation / "metrics.json").write_text(json.dumps(report.as_json(figures)))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def published(run, tmp_path_factory):
+    """A folder of published networks: `walk`, and `small.zip`."""
+    folder = tmp_path_factory.mktemp("networks")
+    publish(run, folder / "walk", "walk", *SAID)
+    publish(run, folder / "small.zip", "small", *SAID)
+    return folder
+
+
+def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run, tmp_path):
+    """Also of walks with waypoints, and to what the filter was fitted: by the network itself, or by
+    another one whose filter it has taken over."""
+    card = read_text(published / "walk")
+    for words in (
+        "Trained on: simulated walks",
+        "- Running | jumping.",
+        "gnio train --config config.yaml --workdir runs/walk --init-from runs/earlier "
+        "--set data.poses_by=runs/first",
+        "covariance of the filter: scale.",
+        "| synthetic_test_ekf | 4 | 2 | 1.25 (0.61 to 1.89)",
+    ):
+        assert words in card
+    assert "calibrate" not in card and "fitted" not in card
+    assert publishing._shorten("/home/some body/first run") == "'runs/first run'"
+    own = shutil.copytree(run, tmp_path / "walk_calibrated")
+    legs = [{"leg_ratio": ratio, "waypoint_rms": 2.0} for ratio in (0.75, 0.85)]
+    scores = {name: Measures(each, {}, False) for name, each in zip("ab", legs, strict=True)}
+    figures = report.Report(SETTINGS, scores, {}, {"a": "F1", "b": "F2"}, {}, {})
+    write_report(own / "eval" / "mall_test_ekf", figures)
+    for calibrated, shown in (("runs/half", "half"), ("walk", "walk"), ("other/run", "run")):
+        (own / "calibration.json").write_text(json.dumps({"run": calibrated, "split": "val"}))
+        publish(own, tmp_path / "package", "walk", *SAID)
+        card = read_text(tmp_path / "package")
+        assert f"gnio calibrate --network runs/{shown}\n" in card
+        assert f"The filter is fitted to split `val` of run `{shown}`." in card
+    (line,) = (each for each in card.splitlines() if each.startswith("| mall_test_ekf"))
+    assert line.endswith("| – | – | 0.80 (0.16 to 1.44) | 2.00 (2.00 to 2.00) |")
+
+
+def test_networks_are_listed(published, run, monkeypatch, tmp_path, gnio, mistake):
+    """Also runs, which have no card."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(find, "SHIPPED", tmp_path)
+    assert "no networks found" in gnio("weights")
+    monkeypatch.setenv("GNIO_WEIGHTS", os.pathsep.join(map(str, (published, run.parent))))
+    assert publishing._shorten("walk") == "walk"
+    shutil.copytree(run, tmp_path / "other" / "trained")
+    monkeypatch.setenv("GNIO_WEIGHTS", os.pathsep.join(map(str, (published, tmp_path / "other"))))
+    listed = " ".join(gnio("weights").split())
+    for words in ("walk", "small", "simulated walks", "CC0", "1.25 (0.61", "MB", "trained"):
+        assert words in listed
+    assert "has no card" in mistake("weights", "trained")
+    (tmp_path / "other" / "trained" / "config.yaml").write_text("seed: one")
+    assert "'seed' must be a whole number" in gnio("weights")
+
+
+def test_the_data_of_a_network_in_words(published, run, tmp_path):
+    """And what was measured of it."""
+    assert describe_data(read_network(published / "walk")) == f"simulated walks, whose {MEASURED}"
+    copy = shutil.copytree(run, tmp_path / "walk")
+    data = "dataset synthetic, split train"
+    assert describe_data(read_network(copy)) == f"{data}, whose {MEASURED}"
+    (copy / "eval" / "synthetic_test_ekf" / "metrics.json").write_text("{")
+    assert describe_data(read_network(copy)) == data  # and it tracks
+
+
+def test_a_published_network_is_published_again(published, monkeypatch, tmp_path):
+    """With the figures of its own evaluations."""
+    monkeypatch.chdir(tmp_path)
+    figures = report.Report(SETTINGS, SCORES, {}, dict.fromkeys("abcd", "ann"), {}, {})
+    write_report(tmp_path / "evaluations" / "walk" / "tyrex_test_ekf", figures)
+    card = publish(published / "walk", tmp_path / "again.zip", "again", *SAID)
+    assert (card.name, card.measured) == ("again", "ATE 2-D is 1.25 m on tyrex_test_ekf")
+    first, second = map(read_network, (published / "walk", tmp_path / "again.zip"))
+    assert first.config == second.config and first.digest == second.digest
+
+
+def test_the_command(run, tmp_path, gnio, mistake):
+    out = tmp_path / "mine.zip"
+    given = ["publish", run, "--out", out, "--data", "walks \x1b[2J", "--license", "CC0"]
+    told = gnio(*given, "--fails", "Running.", "Cars.")
+    assert f"{out}: mine, network tiny" in told and "gnio track RECORDING --network" in told
+    assert read_card(out).license == "CC0"
+    assert "\x1b" not in gnio("weights", out)  # of a stranger's card nothing reaches the terminal
+    gnio(*given)  # in the place of the first
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.txt").write_text("mine")
+    (tmp_path / "other" / "README.md").write_text("---\ntitle: mine\n---\n")
+    for wrong, words in (
+        (["--out", tmp_path / "other"], "is no published network"),
+        (["--name", "a/b"], "no name of a folder"),
+        (["--license", " "], "--license: is empty"),
+    ):
+        assert words in mistake(*given, *wrong)
+    assert (tmp_path / "other" / "thesis.txt").read_text() == "mine"

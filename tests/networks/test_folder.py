@@ -1,0 +1,220 @@
+"""A network on the disk: what goes in comes out, and what was changed on the way is refused."""
+
+import dataclasses
+import hashlib
+import json
+import math
+import shutil
+import struct
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+import yaml
+
+from gnio_jax import networks
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.networks import Card, folder, read_network, write_network
+from gnio_jax.networks.folder import CARD, CONFIG, WEIGHTS
+from tests.support import tiny_run
+from tests.support.filter_settings import changed
+
+CONFIGURED = TrainConfig(
+    dataset="synthetic",
+    data_root="/home/somebody/recordings",
+    init_from="runs/earlier",
+    seed=7,
+    data=DataConfig(rate=50.0, poses_by="/home/somebody/runs/first"),
+    model=ModelConfig(name="tiny"),
+    filter=changed(noise={"std_factor": (1.7, 1.0, 1.0)}, considered={"scale": 0.02}),
+)
+FACTS = Card("walk", "tiny", "simulated walks", "CC0", 1, 0, "", "a test", {})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of the smallest network."""
+    with tiny_run.known():
+        yield tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIGURED)
+
+
+@pytest.fixture(scope="module")
+def published(run, tmp_path_factory):
+    """The same network, published: `walk`, and `small.zip`."""
+    parent = tmp_path_factory.mktemp("published")
+    folder.write_published(parent / "walk", read_network(run), FACTS, "# walk")
+    folder.write_published(parent / "small.zip", read_network(run), FACTS, "# walk")
+    return parent
+
+
+@pytest.fixture
+def package(published, tmp_path):
+    return shutil.copytree(published / "walk", tmp_path / "walk")
+
+
+def refused(path, *words):
+    with pytest.raises(InputError) as mistake:
+        read_network(path)
+    text = str(mistake.value)
+    assert "\n" not in text and all(word in text for word in words), text
+
+
+def facts_of(package):
+    _, head, _ = (package / CARD).read_text(encoding="utf-8").split("---\n", 2)
+    return yaml.safe_load(head)
+
+
+def with_facts(package, **changes):
+    """The card changed by one who knows how its digest is made."""
+    facts = {**facts_of(package), **changes}
+    rest = {name: value for name, value in facts.items() if name != "sha256"}
+    digest = hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+    head = yaml.safe_dump({**rest, "sha256": digest}, sort_keys=False)
+    (package / CARD).write_text(f"---\n{head}---\n\n# walk\n", encoding="utf-8")
+
+
+def with_file(package, name, content):
+    """Another file, which the card describes."""
+    (package / name).write_bytes(content)
+    entry = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    with_facts(package, files=facts_of(package)["files"] | {name: entry})
+
+
+@pytest.mark.parametrize("name", ["walk", "small.zip"])
+def test_a_published_network_is_the_run_without_its_folders(run, published, name):
+    network, copy = read_network(run), read_network(published / name)
+    nowhere = {"data_root": None, "init_from": None, "data": DataConfig(rate=50.0)}
+    assert network.config == CONFIGURED and network.card is None
+    assert copy.config == dataclasses.replace(CONFIGURED, **nowhere)
+    jax.tree.map(np.testing.assert_array_equal, copy.variables, network.variables)
+    assert copy.model == network.model and (copy.epoch, copy.step) == (1, 0)
+    assert (network.name, copy.name) == ("walk", "walk") and copy.card.license == "CC0"
+
+
+def test_other_programs_read_the_files(run, published):
+    """The weights by the format's own description: a length, a header of JSON, the bytes."""
+    package = published / "walk"
+    assert sorted(path.name for path in package.iterdir()) == sorted((CARD, CONFIG, WEIGHTS))
+    content = (package / WEIGHTS).read_bytes()
+    (length,) = struct.unpack("<Q", content[:8])
+    entry = json.loads(content[8 : 8 + length])["params/encoder/kernel"]
+    assert entry["dtype"] == "F32"
+    kernel = np.frombuffer(content[8 + length :][slice(*entry["data_offsets"])], np.float32)
+    own = read_network(run).variables["params"]["encoder"]["kernel"]
+    np.testing.assert_array_equal(kernel.reshape(entry["shape"]), own)
+    files = facts_of(package)["files"]
+    for name in (CONFIG, WEIGHTS):
+        content = (package / name).read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        assert files[name] == {"bytes": len(content), "sha256": digest}
+    assert "somebody" not in (package / CONFIG).read_text() + (package / CARD).read_text()
+    with zipfile.ZipFile(published / "small.zip") as archive:
+        assert {name: archive.read(name) for name in archive.namelist()} == {
+            path.name: path.read_bytes() for path in package.iterdir()
+        }
+
+
+def test_a_run_has_its_position_and_the_filter_that_was_trained(run, tmp_path):
+    """config.yaml has the filter from which the training began."""
+    network = read_network(run)
+    write_network(tmp_path, network._replace(epoch=3, step=41))
+    assert (read_network(tmp_path).epoch, read_network(tmp_path).step) == (3, 41)
+    first = (tmp_path / WEIGHTS).read_bytes()
+    trained = changed(noise={"gyro_density": 0.5, "correlation": None}, start={"velocity": 0.3})
+    folder.write_weights(tmp_path, network.variables, 4, 52, trained)
+    found = read_network(tmp_path)
+    assert found.config == dataclasses.replace(CONFIGURED, filter=trained)
+    assert (found.epoch, found.step) == (4, 52)
+    jax.tree.map(np.testing.assert_array_equal, found.variables, network.variables)
+    assert folder.read_settings(tmp_path).config == found.config
+    folder.write_weights(tmp_path, network.variables, 3, 41)
+    assert (tmp_path / WEIGHTS).read_bytes() == first  # the same network has the same digest
+
+
+def test_damaged_files_are_refused(package, tmp_path, monkeypatch):
+    """Weights that are too large are not read: a zip of megabytes may unpack to any size."""
+    for name, word, problem in (
+        (WEIGHTS, b"F32", f"'{WEIGHTS}' is not the file"),
+        (CONFIG, b"seed: 7", f"'{CONFIG}' is not the file"),
+        (CARD, b"simulated", "its facts were changed"),
+    ):
+        content = (package / name).read_bytes()
+        assert word in content
+        (package / name).write_bytes(content.replace(word, word[::-1], 1))
+        refused(package, problem, "SHA-256", "damaged")
+        (package / name).write_bytes(content)
+    good = (package / CARD).read_bytes()
+    for changes, words in (
+        ({"version": 3}, ("format version 3", "publish its run again")),
+        ({"license": None}, ("no 'license'",)),
+        ({"files": {}}, ("does not describe",)),
+        *(({"step": step}, ("no 'step'",)) for step in (-5, "../..", True)),
+    ):
+        with_facts(package, **changes)
+        refused(package, *words)
+        (package / CARD).write_bytes(good)
+    for text in ("[" * 100_000, "a: [", "a"):
+        (package / CARD).write_text(f"---\nformat: gnio-network\n{text}\n---\n")
+        refused(package, "is not YAML")
+    (package / CARD).write_text("---\nformat: gnio-network\n")
+    refused(package, "does not begin with the facts")
+    (package / CARD).write_bytes(good)
+    with monkeypatch.context() as patch:
+        patch.setitem(folder.LARGEST, CARD, 100)
+        refused(package, f"'{CARD}' is larger than 100 bytes")
+    (package / WEIGHTS).unlink()
+    refused(package, f"'{WEIGHTS}' is missing")
+    with_file(package, WEIGHTS, b"")
+    refused(package, "weights.safetensors: cannot be read")
+    with_file(package, CONFIG, b"seed: one")
+    refused(package, "config.yaml", "'seed' must be a whole number")
+    (tmp_path / "broken.zip").write_bytes(b"PK no zip")
+    refused(tmp_path / "broken.zip", "cannot be read")
+
+
+def test_weights_of_another_network_are_refused(package):
+    head = {"params": {"head": {"kernel": np.zeros((4, 3), np.float32)}}}
+    with_file(package, WEIGHTS, folder.to_bytes(head))
+    refused(package, "'batch_stats/norm/mean' has shape None", "[4]")
+
+
+def test_the_text_of_a_card_may_be_edited(package, run):
+    text = (package / CARD).read_text(encoding="utf-8")
+    (package / CARD).write_text(f"{text}\nA picture.\n", encoding="utf-8")
+    assert read_network(package).card.name == "walk"
+    assert folder.read_text(package) == "# walk\n\n\nA picture.".replace("\n\n\n", "\n\n")
+    with pytest.raises(InputError, match="has no card; gnio publish"):
+        folder.read_text(run)
+
+
+def test_notes_of_ones_own_are_no_card(run, tmp_path):
+    copy = shutil.copytree(run, tmp_path / "walk")
+    for notes in ("# notes\n", "---\ntitle: notes\n---\n"):
+        (copy / CARD).write_text(notes)
+        assert read_network(copy).card is None and not folder.has_card(copy)
+
+
+@pytest.mark.parametrize("text", ["{}", '{"epoch": "x"}', "[]", "5", '{"filter": 3}', "no JSON"])
+def test_any_header_is_read_or_refused_in_one_line(run, tmp_path, text):
+    copy = shutil.copytree(run, tmp_path / "walk")
+    variables = read_network(run).variables
+    (copy / WEIGHTS).write_bytes(folder.to_bytes(variables, {folder.HEADER: text}))
+    if text == "{}":
+        assert (read_network(copy).epoch, read_network(copy).step) == (0, 0)
+    else:
+        refused(copy, WEIGHTS)
+
+
+def test_evaluations_are_beside_a_run_and_apart_from_a_published_network(run, published):
+    assert folder.evaluations_folder(run) == run / "eval"
+    for name in ("walk", "small.zip"):
+        path = folder.evaluations_folder(published / name)
+        assert path.as_posix() == f"evaluations/{name.removesuffix('.zip')}"
+
+
+def test_published_bytes_are_the_same_each_time(run, published, tmp_path):
+    folder.write_published(tmp_path / "small.zip", read_network(run), FACTS, "# walk")
+    assert (tmp_path / "small.zip").read_bytes() == (published / "small.zip").read_bytes()
+    assert math.isfinite(networks.read_network(tmp_path / "small.zip").epoch)
