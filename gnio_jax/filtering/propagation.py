@@ -89,7 +89,7 @@ def integrate(start: Mean, imu: Imu, noise: NoiseModel, dt: float) -> Interval:
     # to the velocity and the position.
     later = jnp.pad(by_tilt[:, :, :, 1:], ((0, 0), (0, 0), (0, 0), (0, 1)))
     right_jacobians = jax.vmap(geometry.right_jacobian, out_axes=2)(turns)
-    # A sum as a reduction is computed once, not in everything that reads it.
+    # A reduction is computed once; a sum that is written out, again in everything that reads it.
     theta = dt * geometry.contract_right(after, right_jacobians)
     of_gyro = [theta, matmul(later[:, :, 0], theta), matmul(later[:, :, 1], theta)]
     velocity = dt * before
@@ -167,13 +167,13 @@ def core_transition(
 ) -> Transition:
     """F over an interval that starts from the anchor, with o = 0, where the anchor has just
     moved. It takes errors ξ of a core that updates have moved by `shift` to errors δ."""
-    of_offset = np.eye(LOCAL.stop, dtype=interval.transition.dtype)[OFFSET]
-    kept = 1 - anchored * jnp.sum(of_offset, axis=0)
-    motion = jnp.concatenate([interval.transition * kept[None], anchored * of_offset])
+    to_anchor = anchored * np.eye(LOCAL.stop, dtype=interval.transition.dtype)[OFFSET]
+    motion = interval.transition * (1 - jnp.sum(to_anchor, axis=0))[None]
+    motion = jnp.concatenate([motion, to_anchor])
     if shift is not None:
-        of_velocity, of_offset = motion[:, VELOCITY], motion[:, OFFSET]
-        by_theta = matmul(of_velocity, hat(shift.velocity)) + matmul(of_offset, hat(shift.position))
-        motion = jnp.concatenate([motion[:, THETA] - by_theta, motion[:, THETA.stop :]], axis=1)
+        by_turn = matmul(motion[:, VELOCITY], hat(shift.velocity))
+        by_turn += matmul(motion[:, OFFSET], hat(shift.position))
+        motion = jnp.concatenate([motion[:, THETA] - by_turn, motion[:, THETA.stop :]], axis=1)
     return Transition(motion, decay, anchored)
 
 

@@ -56,6 +56,7 @@ from gnio_jax.filtering.state import (
     THETA,
     FilterState,
     Mean,
+    additive_core,
     arc_covariance,
     first_order_covariance,
     with_position,
@@ -148,7 +149,7 @@ def _smooth(
 
     def keep(slot: Array, state: FilterState, record: StepRecord, trace: StepTrace) -> _ForwardStep:
         whole = jnp.concatenate([state.core_covariance, state.cross_covariance], axis=1)
-        cross = with_position(whole) if state.shift is None else state.shift(with_position(whole))
+        cross = additive_core(state, with_position(whole))
         return _ForwardStep(slot, record.mean, first_order_covariance(state), cross, trace)
 
     state, steps, _ = clone_steps(take_row, inputs, rows, keep)

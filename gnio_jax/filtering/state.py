@@ -11,11 +11,11 @@ of a velocity or a position, but that of
 
     ξ = δx + hat(x − c) θ,
 
-with the θ of the same pose. c is fixed: the estimate x when the pose was propagated or cloned, from
-which updates have moved it by its shift x − c since. A turn of the world changes ξ by e_z × c,
-whatever the estimate is, so no update has to express the covariance at its new estimate (see
-`update`). The next propagation takes up the shift of the core (`propagation.core_transition`).
-Between runs all errors are additive (`invariant_errors`, `unroll_clones`).
+with the θ of the same pose (that of a position is held by its offset o). c is fixed: the estimate x
+when the pose was propagated or cloned, which updates have moved by its shift x − c since. A turn of
+the world changes ξ by e_z × c, whatever x is, so no update has to express the covariance at its new
+estimate (see `update`). The next propagation takes up the core's shift (`core_transition`). Between
+runs all errors are additive (`invariant_errors`, `unroll_clones`).
 
 Positions are held as offsets o = p − a from an anchor a, a past position that moves up to the
 present once in a window; s is its last move. The offset of a clone refers to the anchor at the time
@@ -101,13 +101,6 @@ class Shift(NamedTuple):
     """m/s"""
     position: Float[Array, "3"]
     """m"""
-
-    def __call__(self, rows: Float[Array, "n k"]) -> Float[Array, "n k"]:
-        """δ from ξ: δx = ξ − hat(x − c) θ. The rows are those of the core's error, or of θ, v, p,
-        b_g, b_a."""
-        change = jnp.concatenate([turned(rows[THETA], lever) for lever in self])
-        head, moved, tail = jnp.split(rows, (VELOCITY.start, OFFSET.stop))
-        return jnp.concatenate([head, moved - change, tail])
 
 
 class FilterState(NamedTuple):
@@ -263,8 +256,8 @@ def core_covariance(state: FilterState, config: FilterConfig) -> Float[Array, "1
 
 def first_order_covariance(state: FilterState) -> Float[Array, "15 15"]:
     """Covariance of the errors δ of θ, v, p, b_g, b_a."""
-    plain = with_position(with_position(state.core_covariance).T).T
-    return plain if state.shift is None else state.shift(state.shift(plain).T)
+    covariance = with_position(with_position(state.core_covariance).T)
+    return additive_core(state, additive_core(state, covariance).T)
 
 
 def arc_covariance(covariance: Float[Array, "15 15"]) -> Float[Array, "15 15"]:
@@ -286,11 +279,6 @@ def arc_covariance(covariance: Float[Array, "15 15"]) -> Float[Array, "15 15"]:
 # ------------------------------------------------------------------------------------------------
 
 
-def turned(theta: Float[Array, "3 k"], lever: Float[Array, "3"]) -> Float[Array, "3 k"]:
-    """hat(lever) θ for every column θ."""
-    return matmul(hat(lever), theta)
-
-
 def invariant_errors(state: FilterState, config: FilterConfig) -> FilterState:
     """The state at the start of a run, with errors in the form of `config`: the additive errors are
     the invariant ones about the present estimate. `unroll_clones` is the way back."""
@@ -303,23 +291,33 @@ def additive_errors(state: FilterState) -> FilterState:
     """The state with the errors δ in the place of ξ."""
     if state.shift is None:
         return state
-    core = state.shift(state.shift(state.core_covariance).T)
-    cross = _additive_rows(state.shift(state.cross_covariance).T, state.clone_shift).T
-    clones = _additive_rows(state.clone_covariance, state.clone_shift).T
-    clones = _additive_rows(clones, state.clone_shift)
+    core = additive_core(state, additive_core(state, state.core_covariance).T)
+    cross = additive_core(state, state.cross_covariance)
+    clones = _additive_clones(state, _additive_clones(state, state.clone_covariance).T)
     return state._replace(
         core_covariance=0.5 * (core + core.T),
-        cross_covariance=cross,
+        cross_covariance=_additive_clones(state, cross.T).T,
         clone_covariance=0.5 * (clones + clones.T),
         clone_shift=jnp.zeros_like(state.clone_shift),
         shift=None,
     )
 
 
-def _additive_rows(rows: Float[Array, "m k"], shift: Float[Array, "c 3"]) -> Float[Array, "m k"]:
-    """Rows of the clones' θ_i, δ_i from those of θ_i, ξ_i."""
+def additive_core(state: FilterState, rows: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    """Rows of the core's errors δx = ξ − hat(x − c) θ from those of ξ; or rows of the errors of θ,
+    v, p, b_g, b_a."""
+    if state.shift is None:
+        return rows
+    theta, velocity, offset, others = jnp.split(rows, [THETA.stop, VELOCITY.stop, OFFSET.stop])
+    velocity = velocity - matmul(hat(state.shift.velocity), theta)
+    offset = offset - matmul(hat(state.shift.position), theta)
+    return jnp.concatenate([theta, velocity, offset, others])
+
+
+def _additive_clones(state: FilterState, rows: Float[Array, "m k"]) -> Float[Array, "m k"]:
+    """The same for the clones' errors."""
     theta, offset = jnp.split(rows.reshape(-1, CLONE, rows.shape[1]), 2, axis=1)
-    offset = offset - jax.vmap(turned)(theta, shift)
+    offset = offset - jax.vmap(matmul)(jax.vmap(hat)(state.clone_shift), theta)
     return jnp.concatenate([theta, offset], axis=1).reshape(rows.shape)
 
 

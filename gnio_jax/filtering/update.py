@@ -9,12 +9,12 @@ of the error (`PARTS`), so H P needs few rows of P. With S = H P Hᵀ + R = L L�
 gain is Yᵀ L⁻¹, the correction of the error is Yᵀ L⁻¹ r, and P ← P − Yᵀ Y is symmetric to the last
 bit.
 
-An additive error δx of a velocity or a position turns with the world, e_z × x, so its covariance
-belongs to one estimate x. After an update that moves the mean, the next displacement would take the
-difference for a measurement of the yaw. So P is that of the errors ξ (see `state`), over which H is
-taken (`with_turns`), and the mean moves on the group (`retract`). This is the right-invariant EKF
-on SE_2(3) (Barrau and Bonnabel 2017); `FilterConfig.error` switches it off. docs/filter.md has the
-derivation.
+A turn of the world changes the additive error δx of a velocity or a position by e_z × x, which
+depends on the estimate x. An update moves x, and the next displacement would take the difference
+for a measurement of the yaw. So P is that of the errors ξ, which do not depend on it (see `state`),
+H is taken over ξ (`with_turns`), and the mean moves on the group (`retract`). This is the
+right-invariant EKF on SE_2(3) (Barrau and Bonnabel 2017); `FilterConfig.error` switches it off.
+docs/filter.md has the derivation.
 
 A measurement is an object with a `name` and a method
 
@@ -335,23 +335,22 @@ def retract(
     """
     before = (jnp.arange(len(clones)) > step.newest).astype(core.dtype)[:, None]
     anchor_step = core[ANCHOR][None] - before * core[MOVE][None]
-    # One row for the position of every clone, then for the core's position and its velocity.
+    # One row for the position of every clone, then for the core's velocity and its position.
     thetas = jnp.concatenate([clones[:, CLONE_THETA], *2 * [core[THETA][None]]])
-    of_core = jnp.stack([core[ANCHOR] + core[OFFSET], core[VELOCITY]])
-    steps = jnp.concatenate([clones[:, CLONE_OFFSET] + anchor_step, of_core])
+    core_steps = jnp.stack([core[VELOCITY], core[ANCHOR] + core[OFFSET]])
+    steps = jnp.concatenate([clones[:, CLONE_OFFSET] + anchor_step, core_steps])
     turns, translations = jax.vmap(geometry.exp_rigid)(thetas, steps)
     clone_shift, shift = state.clone_shift, state.shift
     if step.config.invariant:
-        of_core = jnp.zeros_like(of_core) if shift is None else jnp.stack(shift[::-1])
-        before_step = jnp.concatenate([clone_shift, of_core])
-        after_step = jax.vmap(matmul)(turns, before_step[:, :, None])[:, :, 0] + translations
-        steps = after_step - before_step
-        clone_shift = after_step[:-2]
-        shift = Shift(velocity=after_step[-1], position=after_step[-2])
+        core_shifts = jnp.zeros_like(core_steps) if shift is None else jnp.stack(shift)
+        shifts = jnp.concatenate([clone_shift, core_shifts])
+        new_shifts = jax.vmap(matmul)(turns, shifts[:, :, None])[:, :, 0] + translations
+        steps = new_shifts - shifts
+        clone_shift, shift = new_shifts[:-2], Shift(new_shifts[-2], new_shifts[-1])
     return state._replace(
         rotation=matmul(turns[-1], state.rotation),
-        velocity=state.velocity + steps[-1],
-        offset=state.offset + steps[-2] - core[ANCHOR],
+        velocity=state.velocity + steps[-2],
+        offset=state.offset + steps[-1] - core[ANCHOR],
         gyro_bias=state.gyro_bias + core[GYRO_BIAS],
         accel_bias=state.accel_bias + core[ACCEL_BIAS],
         anchor=state.anchor + core[ANCHOR],
