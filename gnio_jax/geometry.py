@@ -79,10 +79,17 @@ def _small_or_safe(squared: Scalar) -> tuple[jax.Array, Scalar, Scalar]:
 
 @_series.defjvp
 def _series_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    """With c_n = Σ_k (−θ²)^k / (2k + n)!, the three are c_1, c_2, c_3, and the derivative of c_n by
-    θ² is (n c_{n+2} − c_{n+1}) / 2."""
     (squared,), (d_squared,) = primals, tangents
-    sine, versine, excess = _series(squared)
+    values = _series(squared)
+    slopes = _series_slopes(squared, *values[1:])
+    return values, tuple(slope * d_squared for slope in slopes)
+
+
+def _series_slopes(
+    squared: Scalar, versine: Scalar, excess: Scalar
+) -> tuple[Scalar, Scalar, Scalar]:
+    """The derivatives of the three by θ². With c_n = Σ_k (−θ²)^k / (2k + n)!, the three are c_1,
+    c_2, c_3, and the derivative of c_n is (n c_{n+2} − c_{n+1}) / 2."""
     small, x, safe = _small_or_safe(squared)
     fourth = jnp.where(
         small, 1 / 24 - x / 720 * (1 - x / 56 * (1 - x / 90)), (0.5 - versine) / safe
@@ -90,8 +97,7 @@ def _series_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
     fifth = jnp.where(
         small, 1 / 120 - x / 5040 * (1 - x / 72 * (1 - x / 110)), (1 / 6 - excess) / safe
     )
-    slopes = 0.5 * (excess - versine), fourth - 0.5 * excess, 0.5 * (3 * fifth - fourth)
-    return (sine, versine, excess), tuple(slope * d_squared for slope in slopes)
+    return 0.5 * (excess - versine), fourth - 0.5 * excess, 0.5 * (3 * fifth - fourth)
 
 
 def _polynomial(phi: Vector, squared: Scalar, first: Scalar, second: Scalar) -> Matrix:
@@ -237,14 +243,41 @@ def right_jacobian(phi: Vector) -> Matrix:
     return _polynomial(phi, squared, -versine, excess)
 
 
-@jax.jit
-def left_jacobian_product(phi: Vector, x: Vector) -> Vector:
-    """J_l(φ) x, where exp(φ + δ) ≈ exp(J_l(φ) δ) exp(φ): x + (1 − cos θ)/θ² φ × x + (θ − sin θ)/θ³
-    φ × (φ × x)."""
-    _, versine, excess = _series(jnp.sum(phi * phi))
-    turn = hat(phi)
-    once = matmul(turn, x[:, None])
-    return x + (versine * once + excess * matmul(turn, once))[:, 0]
+@jax.custom_jvp
+def exp_rigid(phi: Vector, x: Vector) -> tuple[Matrix, Vector]:
+    """The exponential of SE(3): rotation exp(φ) and translation t = J_l(φ) x of the rigid motion
+    with the twist (φ, x).
+
+    J_l(φ) = J_r(φ)ᵀ: exp(φ + δ) ≈ exp(J_l(φ) δ) exp(φ)."""
+    return exp(phi), contract_left(x[None], right_jacobian(phi))[0]
+
+
+@exp_rigid.defjvp
+def _exp_rigid_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    """dR = hat(J_l dφ) R and dt = J_l dx + K dφ. With u = φ × x, w = φ × u, b = (1 − cos θ)/θ² and
+    c = (θ − sin θ)/θ³ it is t = x + b u + c w, and with the slopes b', c' by θ²
+
+    K = (2 b' u + 2 c' w − 2 c x) φᵀ + c (φ xᵀ + φ·x I) − b hat(x)."""
+    (phi, x), (d_phi, d_x) = primals, tangents
+    eye, generators = np.eye(3, dtype=phi.dtype), _GENERATORS.astype(phi.dtype)
+    squared, along = jnp.sum(phi * phi), jnp.sum(phi * x)
+    _, versine, excess = _series(squared)
+    _, versine_slope, excess_slope = _series_slopes(squared, versine, excess)
+    once = matmul(hat(phi), x[:, None])[:, 0]
+    twice = along * phi - squared * x
+    by_squared = versine_slope * once + excess_slope * twice
+    by_phi = (
+        2 * (by_squared - excess * x)[:, None] * phi[None]
+        + excess * (phi[:, None] * x[None] + along * eye)
+        - versine * hat(x)
+    )
+    rotation, translation = exp_rigid(phi, x)
+    jacobian = right_jacobian(phi)
+    world = contract_left(d_phi[None], jacobian)[0]
+    d_rotation = contract_left(jnp.sum(generators * world[:, None, None], axis=0), rotation)
+    d_translation = contract_left(d_x[None], jacobian)[0]
+    d_translation += contract_right(by_phi, d_phi[:, None])[:, 0]
+    return (rotation, translation), (d_rotation, d_translation)
 
 
 def direction(

@@ -78,20 +78,23 @@ def test_right_jacobian_and_its_derivative(angle):
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_left_jacobian_product_and_its_derivative(angle):
-    """J_l x is the last column of exp([hat φ, x; 0, 0])."""
-    x = np.array([0.3, -1.2, 0.5])
+def test_exponential_of_a_rigid_motion_and_its_derivative(angle):
+    """The upper rows of exp([hat φ, x; 0, 0])."""
 
-    def oracle(phi):
+    def oracle(twist):
         block = np.zeros((4, 4))
-        block[:3, :3], block[:3, 3] = -np.cross(np.eye(3), -phi), x
-        return expm(block)[:3, 3]
+        block[:3, :3], block[:3, 3] = np.cross(np.eye(3), twist[:3]), twist[3:]
+        return expm(block)[:3]
 
-    phi = jnp.asarray(angle * AXIS)
-    product = geometry.left_jacobian_product
-    np.testing.assert_allclose(product(phi, x), oracle(angle * AXIS), atol=3e-15)
-    slope = jax.jacrev(product)(phi, jnp.asarray(x))
-    np.testing.assert_allclose(slope, differences(oracle, angle * AXIS), atol=1e-8)
+    def motion(twist):
+        rotation, translation = geometry.exp_rigid(twist[:3], twist[3:])
+        return jnp.concatenate([rotation, translation[:, None]], axis=1)
+
+    twist = np.concatenate([angle * AXIS, [0.3, -1.2, 0.5]])
+    np.testing.assert_allclose(jax.jit(motion)(twist), oracle(twist), atol=3e-15)
+    for jacobian in (jax.jacrev, jax.jacfwd):
+        slope = jax.jit(jacobian(motion))(twist)
+        np.testing.assert_allclose(slope, differences(oracle, twist), atol=1e-8)
 
 
 def test_cumulative_rotation():

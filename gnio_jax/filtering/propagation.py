@@ -40,11 +40,12 @@ from gnio_jax.filtering.state import (
     MOVE,
     OFFSET,
     THETA,
+    VELOCITY,
     FilterState,
     Mean,
-    turned,
+    Shift,
 )
-from gnio_jax.geometry import matmul
+from gnio_jax.geometry import hat, matmul
 from gnio_jax.types import GRAVITY, Array
 
 
@@ -88,7 +89,8 @@ def integrate(start: Mean, imu: Imu, noise: NoiseModel, dt: float) -> Interval:
     # to the velocity and the position.
     later = jnp.pad(by_tilt[:, :, :, 1:], ((0, 0), (0, 0), (0, 0), (0, 1)))
     right_jacobians = jax.vmap(geometry.right_jacobian, out_axes=2)(turns)
-    theta = dt * matmul(after, right_jacobians)
+    # A reduction is computed once; a sum that is written out, again in everything that reads it.
+    theta = dt * geometry.contract_right(after, right_jacobians)
     of_gyro = [theta, matmul(later[:, :, 0], theta), matmul(later[:, :, 1], theta)]
     velocity = dt * before
     of_accel = [jnp.zeros_like(velocity), velocity, lever[None, None] * velocity]
@@ -144,46 +146,35 @@ def _interval_noise(
 class Transition(NamedTuple):
     """F, the linear map of the core's error over one clone interval."""
 
-    motion: Float[Array, "9 15"]
-    """Rows θ, v, o of the new error, over θ, v, o, b_g, b_a before the anchor moved."""
+    motion: Float[Array, "12 15"]
+    """Rows θ, v, o of the new error, and the change of the anchor's, over θ, v, o, b_g, b_a before
+    the anchor moved."""
     decay: Float[Array, "e"]
     """Factors of the temporally correlated errors (`correlation_decay`)."""
     anchored: Float[Array, ""]
     """1 where the anchor moved up to the position at the start of the interval, else 0."""
-    lever: Float[Array, "3"] | None
-    """The position at the end from the pivot, m, in the invariant form; else None."""
-    pivot_lever: Float[Array, "3"] | None
-    """The move of the pivot before the interval (`state.move_pivot`), m; None: it cannot move."""
 
     def __call__(self, rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
         """The product of F and `rows`. Where the anchor moves, a' = a + o and s' = o."""
-        moved = self.anchored * rows[OFFSET]
+        motion, moved = jnp.split(self.motion @ rows[LOCAL], [9])
         anchor, move = rows[ANCHOR] + moved, (1 - self.anchored) * rows[MOVE] + moved
         correlated = self.decay[:, None] * rows[CORRELATED]
-        motion = self.motion @ rows[LOCAL]
         return jnp.concatenate([motion, rows[BIASES], anchor, move, correlated])
-
-    def pose(self, rows: Float[Array, "n m"]) -> Float[Array, "6 m"]:
-        """The error of the new clone, from rows of the core's error after the propagation."""
-        theta, offset = rows[THETA], rows[OFFSET]
-        if self.lever is not None:
-            offset = offset + turned(theta, self.lever)
-        return jnp.concatenate([theta, offset])
 
 
 def core_transition(
-    interval: Interval,
-    decay: Float[Array, "e"],
-    anchored: Float[Array, ""],
-    lever: Float[Array, "3"] | None = None,
-    pivot_lever: Float[Array, "3"] | None = None,
+    interval: Interval, decay: Float[Array, "e"], anchored: Float[Array, ""], shift: Shift | None
 ) -> Transition:
     """F over an interval that starts from the anchor, with o = 0, where the anchor has just
-    moved."""
-    of_offset = np.isin(np.arange(LOCAL.stop), np.r_[OFFSET]).astype(interval.transition.dtype)
-    kept = 1 - anchored * of_offset
-    motion = interval.transition * kept[None]
-    return Transition(motion, decay, anchored, lever, pivot_lever)
+    moved. It takes errors ξ of a core that updates have moved by `shift` to errors δ."""
+    to_anchor = anchored * np.eye(LOCAL.stop, dtype=interval.transition.dtype)[OFFSET]
+    motion = interval.transition * (1 - jnp.sum(to_anchor, axis=0))[None]
+    motion = jnp.concatenate([motion, to_anchor])
+    if shift is not None:
+        by_turn = matmul(motion[:, VELOCITY], hat(shift.velocity))
+        by_turn += matmul(motion[:, OFFSET], hat(shift.position))
+        motion = jnp.concatenate([motion[:, THETA] - by_turn, motion[:, THETA.stop :]], axis=1)
+    return Transition(motion, decay, anchored)
 
 
 def correlation_decay(
@@ -201,7 +192,7 @@ def propagate(
     state: FilterState, interval: Interval, transition: Transition, slot: Array | int
 ) -> FilterState:
     """Mean and covariance at the end of an interval, P ← F P Fᵀ + Q, with the new pose cloned into
-    `slot` of the ring in the place of the oldest clone."""
+    `slot` of the ring in the place of the oldest clone. No update has moved either of them yet."""
     core = transition(transition(state.core_covariance).T)
     errors = len(transition.decay)
     core = core + jnp.pad(interval.noise, (0, len(core) - len(interval.noise)))
@@ -209,7 +200,9 @@ def propagate(
     # The variance of the position grows, and with it the rounding difference between both
     # triangles.
     core = 0.5 * (core + core.T)
-    cross = put(transition(state.cross_covariance), transition.pose(core).T, 0, CLONE * slot)
+    pose = jnp.concatenate([core[:, THETA], core[:, OFFSET]], axis=1)
+    cross = put(transition(state.cross_covariance), pose, 0, CLONE * slot)
+    rows = jnp.concatenate([cross[THETA], cross[OFFSET]])
     return state._replace(
         rotation=interval.rotation,
         velocity=interval.velocity,
@@ -219,9 +212,9 @@ def propagate(
         clone_offset=put(state.clone_offset, interval.position[None], slot, 0),
         core_covariance=core,
         cross_covariance=cross,
-        clone_covariance=_replace_clone(
-            state.clone_covariance, transition.pose(cross), CLONE * slot
-        ),
+        clone_covariance=_replace_clone(state.clone_covariance, rows, CLONE * slot),
+        clone_shift=put(state.clone_shift, np.zeros((1, 3), core.dtype), slot, 0),
+        shift=None,
         step=state.step + 1,
     )
 

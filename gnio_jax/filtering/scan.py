@@ -33,9 +33,8 @@ from gnio_jax.filtering.settings import YawFrame
 from gnio_jax.filtering.state import (
     FilterState,
     core_covariance,
-    invariant_clones,
+    invariant_errors,
     move_anchor,
-    move_pivot,
     unroll_clones,
 )
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
@@ -174,7 +173,7 @@ def _run(
     config = inputs.ekf.config
     history = finished_history(records, age, inputs.state.healthy, config)
     state = state._replace(healthy=history.healthy[-1] > 0)
-    return unroll_clones(state, len(age) % config.clones, config), history
+    return unroll_clones(state, len(age) % config.clones), history
 
 
 def take_row(_: Array, __: Imu, row: Displacement, *___: Any) -> tuple[Displacement, dict]:
@@ -214,7 +213,7 @@ def clone_steps(
         return state, keep(slot, state, record, trace)
 
     rows = jnp.arange(len(age)), by_interval, displacement, inputs.measurements
-    start = invariant_clones(start._replace(window=None), config)
+    start = invariant_errors(start._replace(window=None), config)
     state, kept = blocked_scan(step, start, rows, config.checkpoint_every, config.truncate_every)
     memory = memory._replace(quiet=state.imu.quiet)
     return state._replace(imu=memory, window=window), kept, age
@@ -254,12 +253,7 @@ def clone_step(
     state = move_anchor(state, anchored)
     interval = _integrate(state.mean._replace(position=state.offset), imu, noise, config.dt)
     decay = correlation_decay(noise.correlation, config.clone_seconds, dtype)
-    lever = pivot_lever = None
-    if config.invariant:
-        if dtype == jnp.float32:
-            state, pivot_lever = move_pivot(state, anchored)
-        lever = state.anchor + interval.position - state.pivot
-    transition = core_transition(interval, decay, anchored, lever, pivot_lever)
+    transition = core_transition(interval, decay, anchored, state.shift)
     state = _propagate(state, interval, transition, slot)
 
     displacement, diagnostics = measure(state, oldest)
@@ -276,7 +270,7 @@ def clone_step(
         outcomes = {**outcomes, measurement.name: outcome}
         corrections = (*corrections, correction)
 
-    covariance = core_covariance(state.core_covariance, config)
+    covariance = core_covariance(state, config)
     if config.history == "diagonal":
         covariance = jnp.diagonal(covariance)
     record = StepRecord(state.mean, covariance, displacement, outcomes, diagnostics)

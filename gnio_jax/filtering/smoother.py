@@ -18,10 +18,9 @@ the slot of the oldest clone,
 
     λ ← Fᵀ λ,   Λ ← Fᵀ Λ F.
 
-An update that was not applied has no term, and a weighted update has its weight. Where the filter
-expressed its error at the new estimate, e ← G e (see `update`),
-
-    λ ← Gᵀ λ,   Λ ← Gᵀ Λ G.
+An update that was not applied has no term, and a weighted update has its weight. e is the error as
+the filter holds it (see `state`): an invariant error becomes an additive one only where it is added
+to the mean.
 
 Everything is linearised at the filter's own estimates, as in any extended smoother: Jacobians are
 not computed again at the smoothed ones.
@@ -53,13 +52,16 @@ from gnio_jax.filtering.settings import FilterConfig, YawFrame
 from gnio_jax.filtering.state import (
     CLONE,
     CORE,
+    OFFSET,
+    THETA,
     FilterState,
     Mean,
+    additive_core,
     arc_covariance,
-    turned_rows,
+    first_order_covariance,
     with_position,
 )
-from gnio_jax.filtering.update import Correction, Measurement, Shift, measurable_errors
+from gnio_jax.filtering.update import Correction, Measurement, measurable_errors
 from gnio_jax.geometry import matmul
 from gnio_jax.types import Array
 
@@ -146,9 +148,9 @@ def _smooth(
     rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)
 
     def keep(slot: Array, state: FilterState, record: StepRecord, trace: StepTrace) -> _ForwardStep:
-        covariance = with_position(with_position(state.core_covariance).T).T
         whole = jnp.concatenate([state.core_covariance, state.cross_covariance], axis=1)
-        return _ForwardStep(slot, record.mean, covariance, with_position(whole), trace)
+        cross = additive_core(state, with_position(whole))
+        return _ForwardStep(slot, record.mean, first_order_covariance(state), cross, trace)
 
     state, steps, _ = clone_steps(take_row, inputs, rows, keep)
     size, dtype = sum(state.cross_covariance.shape), state.offset.dtype
@@ -168,15 +170,12 @@ def _step_back(
     turn, *others = jnp.split(error, 5)
     if config.invariant:
         covariance = covariance + arc_covariance(covariance)
-        others[:2] = (geometry.left_jacobian_product(turn, part) for part in others[:2])
+        others[:2] = (geometry.exp_rigid(turn, part)[1] for part in others[:2])
     rotation = matmul(geometry.exp(turn), step.mean.rotation)
     mean = Mean(rotation, *map(jnp.add, step.mean[1:], others))
     oldest = (step.slot + 1) % config.clones
-    core = CORE + len(step.trace.transition.decay)
     for correction in reversed(step.trace.corrections):
-        adjoint = _pull_back_shift(adjoint, correction.after, core)
         adjoint = _pull_back_update(adjoint, correction, oldest)
-        adjoint = _pull_back_shift(adjoint, correction.before, core)
     adjoint = _pull_back_propagation(adjoint, step.trace.transition, step.slot)
     return adjoint, (mean, covariance)
 
@@ -206,21 +205,6 @@ def _pull_back_update(adjoint: Adjoint, correction: Correction, oldest: Int[Arra
     )
 
 
-def _pull_back_shift(adjoint: Adjoint, shift: Shift | None, core: int) -> Adjoint:
-    """The adjoint before the error, with `core` entries of the core, was expressed at the new
-    estimate."""
-    if shift is None:
-        return adjoint
-
-    def pull_back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
-        """Gᵀ rows; the clones stay as they are."""
-        like = jax.ShapeDtypeStruct((core, rows.shape[1]), rows.dtype)
-        (turned,) = jax.linear_transpose(shift, like)(rows[:core])
-        return jnp.concatenate([turned, rows[core:]])
-
-    return Adjoint(pull_back(adjoint.vector[:, None])[:, 0], pull_back(pull_back(adjoint.matrix).T))
-
-
 def _pull_back_propagation(
     adjoint: Adjoint, transition: Transition, slot: Int[Array, ""]
 ) -> Adjoint:
@@ -230,10 +214,8 @@ def _pull_back_propagation(
     def step(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
         """F rows."""
         moved, clones = transition(rows[:core]), rows[core:]
-        if transition.pivot_lever is not None:
-            levers = jnp.broadcast_to(transition.pivot_lever[None], (len(clones) // CLONE, 3))
-            clones = turned_rows(clones, levers)
-        return jnp.concatenate([moved, put(clones, transition.pose(moved), CLONE * slot, 0)])
+        pose = jnp.concatenate([moved[THETA], moved[OFFSET]])
+        return jnp.concatenate([moved, put(clones, pose, CLONE * slot, 0)])
 
     def pull_back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
         like = jax.ShapeDtypeStruct((size, rows.shape[1]), rows.dtype)

@@ -6,9 +6,16 @@ those of b, then 6 for each clone. Rotation errors are in the world frame and on
 R ← exp(δθ) R; everything else adds. b is the temporally correlated part of the displacements'
 errors (see `update`): no entries, or 3.
 
-In the invariant form (`FilterConfig.error`) the error of a clone inside a run is not δo_i but
-ξ_i = δo_i + hat(p_i − c) θ_i with a fixed point c, the pivot. A turn of the world does not change
-it, so an update need not express it at the new estimate (`invariant_clones`).
+In the invariant form (`FilterConfig.error`) the covariance inside a run is not that of the error δx
+of a velocity or a position, but that of
+
+    ξ = δx + hat(x − c) θ,
+
+with the θ of the same pose (that of a position is held by its offset o). c is fixed: the estimate x
+when the pose was propagated or cloned, which updates have moved by its shift x − c since. A turn of
+the world changes ξ by e_z × c, whatever x is, so no update has to express the covariance at its new
+estimate (see `update`). The next propagation takes up the core's shift (`core_transition`). Between
+runs all errors are additive (`invariant_errors`, `unroll_clones`).
 
 Positions are held as offsets o = p − a from an anchor a, a past position that moves up to the
 present once in a window; s is its last move. The offset of a clone refers to the anchor at the time
@@ -87,6 +94,15 @@ class Mean(NamedTuple):
     accel_bias: Float[Array, "*k 3"]
 
 
+class Shift(NamedTuple):
+    """The movement of the core's mean by the updates since its propagation, in the world frame."""
+
+    velocity: Float[Array, "3"]
+    """m/s"""
+    position: Float[Array, "3"]
+    """m"""
+
+
 class FilterState(NamedTuple):
     """Mean and covariance. c = W + 1 clones, oldest first between runs; inside a run they are a
     ring. Clones that do not exist yet are zero (their rotations the identity)."""
@@ -123,9 +139,12 @@ class FilterState(NamedTuple):
     """Clone intervals since initialisation."""
     gate: GateState
     imu: ImuMemory
-    pivot: Float[Array, "3"]
-    """c, a fixed point in the world frame, m, to which the clones' errors of a run in the invariant
-    form refer. Between runs it has no meaning."""
+    clone_shift: Float[Array, "c 3"]
+    """Movement of each clone's position since it was cloned, world frame, m; zero between runs and
+    with additive errors."""
+    shift: Shift | None
+    """That of the core; None where no update has moved it since its propagation, between runs, and
+    with additive errors."""
     healthy: Bool[Array, ""]
     """Once False, it remains False: see `FilterHistory.healthy`."""
     window: Float[Array, "r 7"] | None = None
@@ -193,7 +212,8 @@ def without_clones(
         step=jnp.int32(0),
         gate=GateState(jnp.bool_(False), last_success=jnp.int32(-1), pause_end=jnp.int32(0)),
         imu=ImuMemory(unknown, unknown, missing=jnp.int32(0), quiet=jnp.int32(0)),
-        pivot=pose.position,
+        clone_shift=jnp.zeros((clones, 3), dtype),
+        shift=None,
         healthy=jnp.bool_(True),
     )
 
@@ -227,11 +247,17 @@ def with_position(rows: Float[Array, "n k"]) -> Float[Array, "15 k"]:
     return jnp.concatenate([rows[: OFFSET.start], position, rows[BIASES]])
 
 
-def core_covariance(covariance: Float[Array, "n n"], config: FilterConfig) -> Float[Array, "15 15"]:
-    """Covariance of θ, v, p, b_g, b_a from that of the core's error; in the invariant form with the
-    part of second order (`arc_covariance`)."""
-    plain = with_position(with_position(covariance).T).T
+def core_covariance(state: FilterState, config: FilterConfig) -> Float[Array, "15 15"]:
+    """Covariance of the errors δ of θ, v, p, b_g, b_a; in the invariant form with the part of
+    second order (`arc_covariance`)."""
+    plain = first_order_covariance(state)
     return plain + arc_covariance(plain) if config.invariant else plain
+
+
+def first_order_covariance(state: FilterState) -> Float[Array, "15 15"]:
+    """Covariance of the errors δ of θ, v, p, b_g, b_a."""
+    covariance = with_position(with_position(state.core_covariance).T)
+    return additive_core(state, additive_core(state, covariance).T)
 
 
 def arc_covariance(covariance: Float[Array, "15 15"]) -> Float[Array, "15 15"]:
@@ -253,46 +279,46 @@ def arc_covariance(covariance: Float[Array, "15 15"]) -> Float[Array, "15 15"]:
 # ------------------------------------------------------------------------------------------------
 
 
-def turned(theta: Float[Array, "3 k"], lever: Float[Array, "3"]) -> Float[Array, "3 k"]:
-    """hat(lever) θ for every column θ."""
-    return matmul(hat(lever), theta)
-
-
-def invariant_clones(state: FilterState, config: FilterConfig) -> FilterState:
-    """The state at the start of a run: the clones' errors in the form of `config`, the invariant
-    one about a pivot at the anchor. `unroll_clones` is the way back."""
+def invariant_errors(state: FilterState, config: FilterConfig) -> FilterState:
+    """The state at the start of a run, with errors in the form of `config`: the additive errors are
+    the invariant ones about the present estimate. `unroll_clones` is the way back."""
     if not config.invariant:
         return state
-    state = state._replace(pivot=state.anchor)
-    return turned_clones(state, state.clone_offset)
+    return state._replace(shift=Shift(*jnp.zeros((2, 3), state.offset.dtype)))
 
 
-def turned_clones(state: FilterState, lever: Float[Array, "c 3"]) -> FilterState:
-    """The state with o_i + hat(lever_i) θ_i in the place of the error o_i of each clone."""
-    clones = turned_rows(turned_rows(state.clone_covariance, lever).T, lever)
+def additive_errors(state: FilterState) -> FilterState:
+    """The state with the errors δ in the place of ξ."""
+    if state.shift is None:
+        return state
+    core = additive_core(state, additive_core(state, state.core_covariance).T)
+    cross = additive_core(state, state.cross_covariance)
+    clones = _additive_clones(state, _additive_clones(state, state.clone_covariance).T)
     return state._replace(
-        cross_covariance=turned_rows(state.cross_covariance.T, lever).T,
+        core_covariance=0.5 * (core + core.T),
+        cross_covariance=_additive_clones(state, cross.T).T,
         clone_covariance=0.5 * (clones + clones.T),
+        clone_shift=jnp.zeros_like(state.clone_shift),
+        shift=None,
     )
 
 
-def turned_rows(rows: Float[Array, "m k"], lever: Float[Array, "c 3"]) -> Float[Array, "m k"]:
-    """Rows of the clones' θ_i, o_i with o_i + hat(lever_i) θ_i in the place of o_i."""
+def additive_core(state: FilterState, rows: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    """Rows of the core's errors δx = ξ − hat(x − c) θ from those of ξ; or rows of the errors of θ,
+    v, p, b_g, b_a."""
+    if state.shift is None:
+        return rows
+    theta, velocity, offset, others = jnp.split(rows, [THETA.stop, VELOCITY.stop, OFFSET.stop])
+    velocity = velocity - matmul(hat(state.shift.velocity), theta)
+    offset = offset - matmul(hat(state.shift.position), theta)
+    return jnp.concatenate([theta, velocity, offset, others])
+
+
+def _additive_clones(state: FilterState, rows: Float[Array, "m k"]) -> Float[Array, "m k"]:
+    """The same for the clones' errors."""
     theta, offset = jnp.split(rows.reshape(-1, CLONE, rows.shape[1]), 2, axis=1)
-    offset = offset + jax.vmap(turned)(theta, lever)
+    offset = offset - jax.vmap(matmul)(jax.vmap(hat)(state.clone_shift), theta)
     return jnp.concatenate([theta, offset], axis=1).reshape(rows.shape)
-
-
-def move_pivot(state: FilterState, anchored: Float[Array, ""]) -> tuple[FilterState, Array]:
-    """The state with the pivot moved up to the anchor if `anchored` is 1, and the lever c − c' of
-    this move.
-
-    In float32 a pivot that is far away would cost digits. In float64 it may stay where it is.
-    """
-    lever = anchored * (state.pivot - state.anchor)
-    levers = jnp.broadcast_to(lever[None], state.clone_offset.shape)
-    state = jax.lax.cond(anchored > 0, turned_clones, lambda state, _: state, state, levers)
-    return state._replace(pivot=state.pivot - lever), lever
 
 
 def move_anchor(state: FilterState, anchored: Float[Array, ""]) -> FilterState:
@@ -306,13 +332,14 @@ def move_anchor(state: FilterState, anchored: Float[Array, ""]) -> FilterState:
     )
 
 
-def unroll_clones(state: FilterState, oldest: int, config: FilterConfig) -> FilterState:
+def unroll_clones(state: FilterState, oldest: int) -> FilterState:
     """The state between runs: oldest clone first, all clones at the present anchor, and all errors
     additive.
 
     `oldest` is the slot of the oldest clone. The slots before it, written since the anchor's last
     move, are at the present anchor already.
     """
+    state = additive_errors(state)
     clones, dtype = state.clone_offset.shape[0], state.move.dtype
     at_anchor_before = (np.arange(clones) >= (oldest or clones)).astype(dtype)[:, None]
     # o ← o − s for those, in the mean and in the covariance.
@@ -325,13 +352,9 @@ def unroll_clones(state: FilterState, oldest: int, config: FilterConfig) -> Filt
     cross_covariance = state.cross_covariance - state.core_covariance[:, MOVE] @ loss.T
     offset = state.clone_offset - at_anchor_before * state.move[None]
     entries = CLONE * oldest
-    state = state._replace(
+    return state._replace(
         clone_rotation=jnp.roll(state.clone_rotation, -oldest, 0),
         clone_offset=jnp.roll(offset, -oldest, 0),
-        core_covariance=0.5 * (state.core_covariance + state.core_covariance.T),
         cross_covariance=jnp.roll(cross_covariance, -entries, 1),
         clone_covariance=jnp.roll(clone_covariance, (-entries, -entries), (0, 1)),
     )
-    if config.invariant:
-        state = turned_clones(state, (state.pivot - state.anchor)[None] - state.clone_offset)
-    return state

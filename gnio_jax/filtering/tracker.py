@@ -48,7 +48,7 @@ from gnio_jax.filtering.state import (
     ImuMemory,
     Mean,
     core_covariance,
-    invariant_clones,
+    invariant_errors,
     unroll_clones,
 )
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
@@ -208,7 +208,7 @@ class Tracker:
         if self._core is None:
             return None
         config, core = self._ekf.config, _copy(self._core)
-        state = unroll_clones(core.filter, int(core.intervals) % config.clones, config)
+        state = unroll_clones(core.filter, int(core.intervals) % config.clones)
         return state._replace(window=core.window)
 
     @property
@@ -240,7 +240,7 @@ class Tracker:
         window = state.window
         if window is None:
             window = jnp.zeros((config.reach, 7), state.offset.dtype)
-        state = invariant_clones(state._replace(window=None), config)
+        state = invariant_errors(state._replace(window=None), config)
         tangents = None if self._ekf.considered is None else start_tangents(state)
         # Copies, because the compiled step takes the memory of its argument, which no other array,
         # nor two of its fields, may share.
@@ -350,7 +350,7 @@ def device_pose(
     ekf: Filter, state: FilterState, flags: Float[Array, "3"], tangents: Tangents | None
 ) -> DevicePose:
     """The state's estimate; the consider covariance is added to its own."""
-    covariance = core_covariance(state.core_covariance, ekf.config)
+    covariance = core_covariance(state, ekf.config)
     if tangents is not None and ekf.considered is not None:
         sensitivity = core_sensitivity(state.mean, tangents)
         covariance = covariance + considered_covariance(sensitivity[None], ekf.considered)[0]

@@ -9,17 +9,12 @@ of the error (`PARTS`), so H P needs few rows of P. With S = H P Hᵀ + R = L L�
 gain is Yᵀ L⁻¹, the correction of the error is Yᵀ L⁻¹ r, and P ← P − Yᵀ Y is symmetric to the last
 bit.
 
-The error of a velocity or a position is additive, while that of the attitude turns the world. After
-an update that moves the mean from x⁻ to x⁺, P therefore still describes a turn of the old estimate.
-The next displacement would take the difference for a measurement of the yaw. So P is expressed at
-the new estimate,
-
-    P ← G P Gᵀ,   G[x, θ] = −hat(x⁺ − x⁻) for v, p and each p_i with its θ_i, else the identity,
-
-and the mean moves on the group, x⁺ = x⁻ + J_l(θ) δx. This is the right-invariant EKF on SE_2(3)
-(Barrau and Bonnabel 2017) in additive variables; `FilterConfig.error` switches it off. The clones
-need no G, because their errors are held in the invariant form (see `state`). docs/filter.md has the
-derivation.
+A turn of the world changes the additive error δx of a velocity or a position by e_z × x, which
+depends on the estimate x. An update moves x, and the next displacement would take the difference
+for a measurement of the yaw. So P is that of the errors ξ, which do not depend on it (see `state`),
+H is taken over ξ (`with_turns`), and the mean moves on the group (`retract`). This is the
+right-invariant EKF on SE_2(3) (Barrau and Bonnabel 2017); `FilterConfig.error` switches it off.
+docs/filter.md has the derivation.
 
 A measurement is an object with a `name` and a method
 
@@ -60,7 +55,7 @@ from gnio_jax.filtering.state import (
     THETA,
     VELOCITY,
     FilterState,
-    turned,
+    Shift,
 )
 from gnio_jax.geometry import contract_left, contract_right, matmul
 from gnio_jax.types import Array
@@ -119,28 +114,6 @@ class Correction(NamedTuple):
     """… and against the clones."""
     jacobian: dict[str, Float[Array, "m 3"]]
     """The blocks of L⁻¹ H."""
-    before: Shift | None
-    """Shift by which the error turned before this change, for a measurement in the world's frame;
-    else None."""
-    after: Shift | None
-    """Shift by which it turned after this change, for one in the carrier's frame; else None."""
-
-
-class Shift(NamedTuple):
-    """The movement x⁺ − x⁻ of the mean by an update, in the world frame; zero where none was
-    made."""
-
-    velocity: Float[Array, "3"]
-    """m/s"""
-    position: Float[Array, "3"]
-    """m"""
-
-    def __call__(self, rows: Float[Array, "n k"]) -> Float[Array, "n k"]:
-        """The product of G and `rows` of the core. The anchor's error stays, and that of the offset
-        turns with the position."""
-        change = jnp.concatenate([turned(rows[THETA], lever) for lever in self])
-        head, moved, tail = jnp.split(rows, (VELOCITY.start, OFFSET.stop))
-        return jnp.concatenate([head, moved - change, tail])
 
 
 MeasuredFrame = Literal["carrier", "world"]
@@ -277,11 +250,8 @@ def project(state: FilterState, linear: Linearised, step: Step) -> tuple[Outcome
     by_part = dict(linear.jacobian)
     if {"oldest_rotation", "since_oldest"} & by_part.keys():
         present = present & (state.step >= step.config.clones)
-    if step.config.invariant and "since_oldest" in by_part:
-        # δo_i = ξ_i − hat(p_i − c) θ_i
-        lever = state.position - since_oldest(state, step.oldest) - state.pivot
-        of_turn = matmul(by_part["since_oldest"], geometry.hat(lever))
-        by_part["oldest_rotation"] = by_part.get("oldest_rotation", 0.0) + of_turn
+    if step.config.invariant:
+        by_part = with_turns(by_part, state, step.oldest)
     jacobian = jnp.concatenate(list(by_part.values()), axis=1)
     touched = functools.partial(measurable_errors, by_part, oldest=step.oldest)
     core = matmul(jacobian, touched(state.core_covariance, state.cross_covariance.T))
@@ -296,7 +266,24 @@ def project(state: FilterState, linear: Linearised, step: Step) -> tuple[Outcome
     by_part = dict(zip(by_part, blocks, strict=True))
     weight = present.astype(volume.dtype)
     outcome = Outcome(present, present, residual, jnp.sum(white**2), volume, weight, present)
-    return outcome, Correction(white[:, 0], core, clones, by_part, None, None)
+    return outcome, Correction(white[:, 0], core, clones, by_part)
+
+
+def with_turns(
+    jacobian: dict[str, Float[Array, "m 3"]], state: FilterState, oldest: Array | int
+) -> dict[str, Float[Array, "m 3"]]:
+    """The blocks of H over the errors ξ, from those over the errors δx = ξ − hat(x − c) θ."""
+    shifts = [("since_oldest", "oldest_rotation", -state.clone_shift[oldest])]
+    if state.shift is not None:
+        velocity, position = state.shift
+        shifts += [("velocity", "rotation", velocity), ("position", "rotation", position)]
+        shifts += [("since_oldest", "rotation", position)]
+    blocks = dict(jacobian)
+    for part, rotation, shift in shifts:
+        if part in jacobian:
+            of_turn = matmul(jacobian[part], geometry.hat(shift))
+            blocks[rotation] = blocks.get(rotation, 0.0) - of_turn
+    return blocks
 
 
 def correct(
@@ -310,42 +297,21 @@ def correct(
     not accepted.
 
     A measurement of a quantity that is fixed to the world is given as `in_world`. Its update does
-    not know less of that quantity at another estimate, so P is first expressed at the new estimate
-    and then reduced.
+    not know less of that quantity at another estimate, so P is reduced over the errors δx at the
+    new one.
     """
     correction = jax.tree.map(lambda rows: jnp.where(outcome.accepted, rows, 0.0), correction)
     moved = moved_mean(state, correction, step)
-    if not step.config.invariant:
-        return reduced(moved, correction), outcome, correction
-    shift = Shift(moved.velocity - state.velocity, moved.position - state.position)
-    if in_world is None:
-        # G (P − Yᵀ Y) Gᵀ, which the compiler joins to one pass in this form.
-        moved = expressed_at_new_estimate(moved, shift)
-        at_new = correction._replace(core=shift(correction.core.T).T)
-        return reduced(moved, at_new), outcome, correction._replace(after=shift)
-    moved = expressed_at_new_estimate(moved, shift)
-    _, correction = project(moved, in_world, step)
-    correction = jax.tree.map(lambda rows: jnp.where(outcome.accepted, rows, 0.0), correction)
-    return reduced(moved, correction), outcome, correction._replace(before=shift)
-
-
-def expressed_at_new_estimate(state: FilterState, shift: Shift) -> FilterState:
-    """The state with G P Gᵀ, after its mean moved by `shift`. Both triangles agree to rounding; the
-    next propagation makes them equal."""
-    return state._replace(
-        core_covariance=shift(shift(state.core_covariance).T),
-        cross_covariance=shift(state.cross_covariance),
-    )
-
-
-def reduced(state: FilterState, correction: Correction) -> FilterState:
-    """The state with P − Yᵀ Y."""
+    if in_world is not None and step.config.invariant:
+        _, correction = project(moved, in_world, step)
+        correction = jax.tree.map(lambda rows: jnp.where(outcome.accepted, rows, 0.0), correction)
     cross = matmul(correction.core.T, correction.clones)
-    return state._replace(
+    reduced = moved._replace(
         core_covariance=downdate(state.core_covariance, correction.core),
         cross_covariance=state.cross_covariance - cross,
         clone_covariance=downdate(state.clone_covariance, correction.clones),
     )
+    return reduced, outcome, correction
 
 
 def moved_mean(state: FilterState, correction: Correction, step: Step) -> FilterState:
@@ -364,34 +330,36 @@ def retract(
 ) -> FilterState:
     """Move the mean by an error. The newest clone has the core's pose.
 
-    R ← exp(δθ) R, and all other parts are added. In the invariant form v and all positions move on
-    the group with their own δθ, x ← x + J_l(δθ) δx, for a clone p_i ← c + exp(θ_i) (p_i − c) +
-    J_l(θ_i) (ξ_i + δa), with the pivot c and the anchor a of the clone.
+    R ← exp(θ) R, and all other parts are added. In the invariant form v and all positions x move
+    rigidly with the θ and ξ of the same pose, x − c ← exp(θ) (x − c) + J_l(θ) ξ.
     """
-    turns = jax.vmap(geometry.exp)(clones[:, CLONE_THETA])
-    rotations = jax.vmap(matmul)(turns, state.clone_rotation)
-    steps, velocity_step = clones[:, CLONE_OFFSET], core[VELOCITY]
+    before = (jnp.arange(len(clones)) > step.newest).astype(core.dtype)[:, None]
+    anchor_step = core[ANCHOR][None] - before * core[MOVE][None]
+    # One row for the position of every clone, then for the core's velocity and its position.
+    thetas = jnp.concatenate([clones[:, CLONE_THETA], *2 * [core[THETA][None]]])
+    core_steps = jnp.stack([core[VELOCITY], core[ANCHOR] + core[OFFSET]])
+    steps = jnp.concatenate([clones[:, CLONE_OFFSET] + anchor_step, core_steps])
+    turns, translations = jax.vmap(geometry.exp_rigid)(thetas, steps)
+    clone_shift, shift = state.clone_shift, state.shift
     if step.config.invariant:
-        before = (jnp.arange(len(clones)) > step.newest).astype(core.dtype)[:, None]
-        anchor_step = core[ANCHOR][None] - before * core[MOVE][None]
-        lever = (state.anchor - state.pivot)[None] - before * state.move[None] + state.clone_offset
-        thetas = jnp.concatenate([clones[:, CLONE_THETA], core[THETA][None]])
-        added = jnp.concatenate([steps + anchor_step, velocity_step[None]])
-        added = jax.vmap(geometry.left_jacobian_product)(thetas, added)
-        turned_lever = jax.vmap(matmul)(turns, lever[:, :, None])[:, :, 0]
-        steps, velocity_step = turned_lever - lever + added[:-1] - anchor_step, added[-1]
-    offsets = state.clone_offset + steps
+        core_shifts = jnp.zeros_like(core_steps) if shift is None else jnp.stack(shift)
+        shifts = jnp.concatenate([clone_shift, core_shifts])
+        new_shifts = jax.vmap(matmul)(turns, shifts[:, :, None])[:, :, 0] + translations
+        steps = new_shifts - shifts
+        clone_shift, shift = new_shifts[:-2], Shift(new_shifts[-2], new_shifts[-1])
     return state._replace(
-        rotation=rotations[step.newest],
-        velocity=state.velocity + velocity_step,
-        offset=offsets[step.newest],
+        rotation=matmul(turns[-1], state.rotation),
+        velocity=state.velocity + steps[-2],
+        offset=state.offset + steps[-1] - core[ANCHOR],
         gyro_bias=state.gyro_bias + core[GYRO_BIAS],
         accel_bias=state.accel_bias + core[ACCEL_BIAS],
         anchor=state.anchor + core[ANCHOR],
         move=state.move + core[MOVE],
         correlated=state.correlated + core[CORRELATED],
-        clone_rotation=rotations,
-        clone_offset=offsets,
+        clone_rotation=jax.vmap(matmul)(turns[:-2], state.clone_rotation),
+        clone_offset=state.clone_offset + steps[:-2] - anchor_step,
+        clone_shift=clone_shift,
+        shift=shift,
     )
 
 

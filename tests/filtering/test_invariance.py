@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.state import arc_covariance, invariant_clones, unroll_clones
+from gnio_jax.filtering.state import arc_covariance, invariant_errors, unroll_clones
 from gnio_jax.filtering.update import Step
 from tests.support import manifold
 from tests.support.compiling import optimised, quick
@@ -219,7 +219,8 @@ def program(config):
 
 
 def test_a_run_in_pieces_is_the_run():
-    """Wherever it is cut: the offsets then have another anchor, and the clones another pivot."""
+    """Wherever it is cut: the offsets then have another anchor, and the errors another point to
+    which they refer."""
     whole = run_pieces("invariant", [40])
     for pieces in ([13, 40], [20, 40], [3, 24, 40]):
         state = run_pieces("invariant", pieces)
@@ -246,14 +247,14 @@ def updated(state, residual, spread):
     in the body, both with additive errors again."""
     config = config_of("invariant")
     step = Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), CLONES, 0, config, NOISE)
-    inside, eye, results = invariant_clones(state, config), np.eye(3), []
+    inside, eye, results = invariant_errors(state, config), np.eye(3), []
     for jacobian, frame in (
         ({"position": eye}, "world"),
         ({"velocity": eye, "since_oldest": 0.5 * eye}, "carrier"),
     ):
         linear = filtering.linearise(inside, residual, spread, **jacobian)
         after, _, _ = filtering.measure(inside, linear, step, frame=frame)
-        results.append(unroll_clones(after, 0, config))
+        results.append(unroll_clones(after, 0))
     return results
 
 

@@ -8,6 +8,7 @@ import zipfile
 import numpy as np
 import openpyxl
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gnio_jax.apps.importing import units
 from gnio_jax.data.labels import resolved
@@ -670,14 +671,16 @@ def test_gravity_tells_signs_and_axes(tmp_path, turn, words):
 
 
 def test_a_unit_in_doubt_tells_what_gravity_says(tmp_path):
-    """Of a phone that is turned without steps, by a gyro with the wrong sign."""
-    angle, rate = 0.6 * np.sin(0.9 * TIME), 0.54 * np.cos(0.9 * TIME)
-    force = 9.81 * np.stack([-np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
-    gyro = np.stack([0 * rate, -rate, 0 * rate], axis=1)
+    """Of a phone that is turned without steps about two axes, by a gyro with the wrong sign."""
+    angles = np.stack([0.6 * np.sin(0.9 * TIME), 0.5 * np.sin(0.7 * TIME)], axis=1)
+    rotation = Rotation.from_euler("YX", angles)
+    force = rotation.inv().apply([0, 0, 9.81])
+    turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() / np.diff(TIME)[:, None]
+    gyro = -np.concatenate([turns, turns[-1:]])
     values = np.hstack([gyro, force]) + np.random.default_rng(0).normal(0, 0.01, WALK.shape)
     words = "unit of field 'gyro' is ambiguous .* in rad/s gravity turns against the gyro"
     refused(put(tmp_path, table(values=values)), words)
-    right = put(tmp_path, table(values=values * [1, -1, 1, 1, 1, 1]))
+    right = put(tmp_path, table(values=values * [-1, -1, -1, 1, 1, 1]))
     assert any("gyro taken as rad/s" in note for note in import_recording(right)[1])
 
 
