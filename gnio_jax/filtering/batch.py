@@ -56,7 +56,7 @@ def padded_signals(
 
 
 def padded_masks(
-    masks: Iterable[Bool[np.ndarray, "m"] | None], samples: int
+    masks: Iterable[Bool[np.ndarray, "_"] | None], samples: int
 ) -> Bool[np.ndarray, "b n"] | None:
     """The masks `imu_valid` of `run_filter` for recordings, each with `samples` rows; None where no
     recording lacks a sample. Rows that are appended are valid."""
