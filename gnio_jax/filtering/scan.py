@@ -212,11 +212,13 @@ def clone_steps(
         state, record, trace = clone_step(ekf, state, imu, slot, measure_now, measurements)
         return state, keep(slot, state, record, trace)
 
-    rows = jnp.arange(len(age)), by_interval, displacement, inputs.measurements
+    inputs_by_interval = jnp.arange(len(age)), by_interval, displacement, inputs.measurements
     start = invariant_errors(start._replace(window=None), config)
-    state, kept = blocked_scan(step, start, rows, config.checkpoint_every, config.truncate_every)
+    state, rows = blocked_scan(
+        step, start, inputs_by_interval, config.checkpoint_every, config.truncate_every
+    )
     memory = memory._replace(quiet=state.imu.quiet)
-    return state._replace(imu=memory, window=window), kept, age
+    return state._replace(imu=memory, window=window), rows, age
 
 
 # One clone interval

@@ -163,7 +163,6 @@ class FilterState(NamedTuple):
         return Mean(self.rotation, self.velocity, self.position, self.gyro_bias, self.accel_bias)
 
 
-# One program in place of thirty, which take three times as long at the first call.
 def gyro_bias_covariance(
     rotation: Float[Array, "3 3"], vertical: Array | float, level: Array | float
 ) -> Float[Array, "3 3"]:
@@ -174,6 +173,7 @@ def gyro_bias_covariance(
     return vertical**2 * eye + (level**2 - vertical**2) * (eye - up[:, None] * up[None, :])
 
 
+# One program in place of thirty, which take three times as long at the first call.
 @functools.partial(jax.jit, static_argnames="clones")
 def without_clones(
     pose: Mean, std: InitialStd, clones: int, level_gyro_bias: Array | float | None = None
@@ -189,8 +189,8 @@ def without_clones(
     nothing, unknown = jnp.zeros(3, dtype), jnp.full(3, jnp.nan, dtype)
     # Standard deviations of tilt, yaw, v, o, b_g, b_a, a, s.
     parts = (*std[:3], 0.0, std.gyro_bias, std.accel_bias, std.position, 0.0)
-    each = jnp.stack([jnp.asarray(part, dtype) for part in parts])
-    core_std = jnp.repeat(each, np.array([2, 1, 3, 3, 3, 3, 3, 3]), total_repeat_length=CORE)
+    stds = jnp.stack([jnp.asarray(part, dtype) for part in parts])
+    core_std = jnp.repeat(stds, np.array([2, 1, 3, 3, 3, 3, 3, 3]), total_repeat_length=CORE)
     covariance = jnp.diag(core_std**2)
     if level_gyro_bias is not None:
         of_bias = gyro_bias_covariance(pose.rotation, std.gyro_bias, level_gyro_bias)
@@ -324,11 +324,11 @@ def _additive_clones(state: FilterState, rows: Float[Array, "m k"]) -> Float[Arr
 def move_anchor(state: FilterState, anchored: Float[Array, ""]) -> FilterState:
     """The state with the anchor moved up to the present position if `anchored` is 1, and unchanged
     if it is 0."""
-    wanted = anchored > 0
+    moves = anchored > 0
     return state._replace(
-        anchor=jnp.where(wanted, state.anchor + state.offset, state.anchor),
-        offset=jnp.where(wanted, 0.0, state.offset),
-        move=jnp.where(wanted, state.offset, state.move),
+        anchor=jnp.where(moves, state.anchor + state.offset, state.anchor),
+        offset=jnp.where(moves, 0.0, state.offset),
+        move=jnp.where(moves, state.offset, state.move),
     )
 
 

@@ -427,8 +427,8 @@ def whiten(
     return tuple(solve(part) for part in rows), volume
 
 
-def _dot(left: list[Array], right: list[Array]) -> Array | float:
-    return sum((x * y for x, y in zip(left, right, strict=False)), start=0.0)
+def _dot(row: list[Array], column: list[Array]) -> Array | float:
+    return sum((x * y for x, y in zip(row, column, strict=False)), start=0.0)
 
 
 @whiten.defjvp
