@@ -260,19 +260,29 @@ def first_order_covariance(state: FilterState) -> Float[Array, "15 15"]:
     return additive_core(state, additive_core(state, covariance).T)
 
 
-def arc_covariance(covariance: Float[Array, "15 15"]) -> Float[Array, "15 15"]:
+def arc_covariance(covariance: Float[Array, "*k 15 15"]) -> Float[Array, "*k 15 15"]:
     """The second order (ours) of an error ψ of the yaw in the covariance of θ, v, p, b_g, b_a.
 
     Velocity and position lie on an arc: an error ψ moves them by ψ e_z × l − ½ ψ² l, where l is
     their horizontal lever. With the variance σ² of ψ, E[ψ⁴] = 3 σ⁴, the second moment of the last
     term is ¾ σ⁴ l lᵀ, and σ² e_z × l is their covariance with ψ.
     """
-    yaw = covariance[:, THETA.stop - 1]
-    zero = jnp.zeros_like(yaw[:1])
-    lever = jnp.concatenate(
-        [zero, zero, zero, yaw[4:5], -yaw[3:4], zero, yaw[7:8], -yaw[6:7], jnp.zeros_like(yaw[8:])]
-    )
-    return 0.75 * lever[:, None] * lever[None]
+    yaw = covariance[..., THETA.stop - 1]
+    of_velocity, of_position = yaw_lever(yaw[..., VELOCITY]), yaw_lever(yaw[..., OFFSET])
+    nothing = jnp.zeros_like(of_velocity)
+    lever = [nothing, of_velocity, of_position, nothing, nothing]
+    return arc_of(jnp.concatenate(lever, axis=-1))
+
+
+def yaw_lever(with_yaw: Float[Array, "*k 3"]) -> Float[Array, "*k 3"]:
+    """σ² l, from the covariance σ² e_z × l of a velocity or a position with the yaw."""
+    x, y, z = jnp.moveaxis(with_yaw, -1, 0)
+    return jnp.stack([y, -x, jnp.zeros_like(z)], axis=-1)
+
+
+def arc_of(lever: Float[Array, "*k d"]) -> Float[Array, "*k d d"]:
+    """¾ σ⁴ l lᵀ, from σ² l."""
+    return 0.75 * lever[..., :, None] * lever[..., None, :]
 
 
 # The ring of clones and its anchor
