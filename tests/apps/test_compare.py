@@ -44,7 +44,7 @@ def runs(tmp_path):
 
 def test_by_hand(runs, monkeypatch):
     """Means over seeds 2, 2, 6 against 1, 3, 3: differences −1 and +1 of ann and −3 of bob. The
-    sums of the deviations from −1 are 2 and −2, so the standard error is √2 √8 / 3."""
+    means without ann and without bob are −3 and 0, so the standard error is √(1/2 (4 + 1))."""
     found = compare(runs / "plain", runs / "new")
     plain, new = found.cells["ate"]
     assert [row.label for row in found.rows] == ["plain", "new"] and plain.difference is None
@@ -52,12 +52,12 @@ def test_by_hand(runs, monkeypatch):
     assert new.summary.seeds == pytest.approx([7 / 3])
     difference = second(found)
     assert difference.mean == pytest.approx(-1.0) and difference.gain == pytest.approx(30.0)
-    reach = 12.7062 * 4 / 3  # t of one degree of freedom
+    reach = 12.7062 * 2.5**0.5  # t of one degree of freedom
     assert difference.interval == pytest.approx((-1 - reach, -1 + reach), rel=1e-5)
     assert (difference.better, difference.compared, difference.groups) == (2, 3, 2)
     assert comparison.lines(found) == [
         ["ATE (m)", "plain", "3.33 ± 0.94", "", ""],
-        ["", "new", "2.33", "-1.00 (-17.94 to +15.94)", "2 of 3"],
+        ["", "new", "2.33", "-1.00 (-21.09 to +19.09)", "2 of 3"],
     ]
     said = comparison.explanations(found)
     assert said[0].startswith("Seeds of plain: plain_s0, plain_s1; new: one.")
@@ -225,7 +225,7 @@ def test_the_command_shows_and_writes(runs, gnio, mistake, monkeypatch):
     (runs / "new_s0").rename(runs / "pipe|x")
     words = [f"{runs}/plain", f"{runs}/pipe|x", "--metrics", "ate", "rpe_1s", "--out", str(out)]
     shown = gnio("compare", *words)
-    assert "-1.00 (-17.94 to +15.94)" in shown and str(out) in shown
+    assert "-1.00 (-21.09 to +19.09)" in shown and str(out) in shown
     table = list(csv.DictReader((out.parent / "v1.5.csv").open(encoding="utf-8")))
     assert [(line["metric"], line["row"]) for line in table] == [
         (metric, row) for metric in ("ate", "rpe_1s") for row in ("plain", "pipe|x")
