@@ -287,8 +287,23 @@ def remarks(report: Report) -> list[str]:
     ]
     summaries = report.summary().values()
     lines += filter(None, (few_groups(summaries), *unevenness(summaries)))
-    lines += [f"left out: {name}: {reason}" for name, reason in report.left_out.items()]
+    left_out: dict[str, list[str]] = {}  # end of the reason, without the file -> names
+    for name, reason in report.left_out.items():
+        left_out.setdefault(reason.partition(": ")[2] or reason, []).append(name)
+    for names in left_out.values():
+        reason = report.left_out[names[0]]
+        several = f"{len(names)} recordings for one reason, the first: " if names[1:] else ""
+        lines.append(f"left out: {several}{names[0]}: {reason}")
     return lines + [f"{name}: the estimate diverged, and is in no mean" for name in report.diverged]
+
+
+def gaps(report: Report) -> str:
+    """A line about the recordings that the figures do not have; empty if there is none."""
+    if not report.left_out:
+        return ""
+    names, count = list(report.left_out), len(report.left_out)
+    listed = ", ".join([*names[:3], *(["..."] if names[3:] else [])])
+    return f"{count} of {count + len(report.scores)} recordings were left out: {listed}"
 
 
 # --- files

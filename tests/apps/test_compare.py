@@ -1,11 +1,14 @@
 """Comparisons of made-up evaluations, by hand."""
 
 import csv
+import json
+import shutil
 
 import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
+from gnio_jax import data
 from gnio_jax.apps import compare as comparison
 from gnio_jax.config import CompareConfig, TrainConfig
 from gnio_jax.errors import InputError
@@ -210,6 +213,40 @@ def test_refusals(runs):
     assert "no metric 'new'; write the runs before" in refused("plain", metrics=("ate", "new"))
     (runs / "plain_s1" / own).rename(runs / "elsewhere")
     assert "exists for 1 of 2 seeds only; missing: " in refused(f"seen/{own}", f"plain/{own}")
+
+
+def test_figures_of_recordings_that_have_changed_are_refused(runs, tmp_path):
+    """Those of two runs on a folder that was changed in between, too, if the folder is gone."""
+    root = tmp_path / "own"
+    root.mkdir()
+    (root / "a.csv").write_text("walk")
+    place = {"dataset": "csv", "data_root": str(root)}
+    for name in ("first", "second"):
+        contents = data.describe_contents("csv", root, "test")
+        write(runs / name, {"a": 1.0}, "csv_test_ekf", contents=contents, **place)
+        if name == "first":
+            (root / "a.csv").write_text("other walk")
+    folders = [runs / name / "eval" / "csv_test_ekf" for name in ("first", "second")]
+    problem = f"its figures are of other recordings: recording a in {root} has changed since"
+    with pytest.raises(InputError) as error:
+        compare(*folders)
+    assert str(error.value) == f"{folders[0]}: {problem}; evaluate the run anew with gnio evaluate"
+    shutil.rmtree(root)
+    with pytest.raises(InputError) as error:
+        compare(*folders)
+    problem = f"recording a has other files here than in {folders[0]}"
+    assert str(error.value) == f"{folders[1]}: {problem}; evaluate it again, or {folders[0]}"
+
+
+def test_recordings_that_were_left_out_are_told(runs):
+    folder = write(runs / "holes", {"a": 1.0, "b": 2.0, "c": 3.0})
+    content = json.loads((folder / "metrics.json").read_text())
+    content["left_out"] = {name: f"{name}.csv: is damaged" for name in "defgh"}
+    (folder / "metrics.json").write_text(json.dumps(content))
+    said = comparison.explanations(compare(runs / "plain_s0", runs / "new"))
+    assert not any("left out" in line for line in said)
+    said = comparison.explanations(compare(runs / "plain_s0", runs / "holes"))
+    assert "holes: 5 of 8 recordings were left out: d, e, f, ..." in said
 
 
 def test_the_command_shows_and_writes(runs, gnio, mistake, monkeypatch):

@@ -99,6 +99,17 @@ def test_marks_are_explained():
         assert all(line.startswith(words) for line, words in zip(lines, beginnings, strict=True))
 
 
+def test_recordings_that_are_left_out_for_one_reason_are_one_line(made_report):
+    reasons = {name: f"{name}.csv: is damaged" for name in "xyz"} | {"short": "0.5 s"}
+    report = made_report._replace(left_out=reasons)
+    lines = [line for line in tabulate.remarks(report) if line.startswith("left out: ")]
+    alike = "left out: 3 recordings for one reason, the first: x: x.csv: is damaged"
+    assert lines == [alike, "left out: short: 0.5 s"]
+    assert tabulate.gaps(report) == "4 of 7 recordings were left out: x, y, z, ..."
+    assert tabulate.gaps(made_report) == "1 of 4 recordings were left out: short"
+    assert tabulate.gaps(report._replace(left_out={})) == ""
+
+
 def test_groups_that_make_an_interval_unsure_are_told():
     """In the table and on the page, with the largest of the metrics' groups."""
 
