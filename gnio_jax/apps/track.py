@@ -80,7 +80,7 @@ class Summary(NamedTuple):
     """Horizontal distance of the end from the start, m."""
     expected_error: float
     """Expected horizontal error at the end, root mean square by the filter's covariance, m."""
-    rest: float
+    at_rest: float
     """Share of the time in which the IMU is quieter than a hand."""
     running: float
     """Share of the seconds with accelerations as in a run."""
@@ -135,16 +135,16 @@ def track(
     sequence, config = recording.sequence, trained.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
-    found, ready, ekf = estimate_recording(sequence, trained, progress)
-    compared = np.isfinite(found.reference.position).any() or found.waypoints is not None
-    errors = metrics.score([found])[found.name].values if compared else {}
-    summary = summarise(found, errors, ready, recording, trained, ekf)
+    result, ready, ekf = estimate_recording(sequence, trained, progress)
+    compared = np.isfinite(result.reference.position).any() or result.waypoints is not None
+    errors = metrics.score([result])[result.name].values if compared else {}
+    summary = summarise(result, errors, ready, recording, trained, ekf)
     with replacing_folder(out) as folder:
-        _write_figures(folder, found, summary, formats)
-        _draw(folder, found, summary, config, command)
+        _write_figures(folder, result, summary, formats)
+        _draw(folder, result, summary, config, command)
     if rerun_file is not None:
-        rerun.write(rerun_file, [found], [ready])
-    return Tracked(found, summary, out)
+        rerun.write(rerun_file, [result], [ready])
+    return Tracked(result, summary, out)
 
 
 def _check_results(
@@ -188,8 +188,8 @@ def estimate_recording(
         considered = ekf.considered._replace(raw_gyro_bias=0.0)
         ekf = dataclasses.replace(ekf, considered=considered if any(considered) else None)
     network = Network.of(trained.model, trained.variables)
-    (found,) = estimate(ready, network, config.data, ekf, 1, progress)
-    return found, ready[0], ekf
+    (result,) = estimate(ready, network, config.data, ekf, 1, progress)
+    return result, ready[0], ekf
 
 
 def _check_bridged(sequence: Sequence) -> None:
@@ -197,14 +197,14 @@ def _check_bridged(sequence: Sequence) -> None:
     motion in it."""
     # An earlier resampling interpolated the holes, and each clock has widened a hole by up to a
     # sample at each end.
-    there = np.union1d(sequence.time[sequence.measured_rows], sequence.time[[0, -1]])
+    measured = np.union1d(sequence.time[sequence.measured_rows], sequence.time[[0, -1]])
     bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
     check_gaps(sequence.time, sequence.name)
-    check_gaps(there, sequence.name, WINDOW_SECONDS + bridged)
+    check_gaps(measured, sequence.name, WINDOW_SECONDS + bridged)
 
 
 def summarise(
-    found: SequenceEstimate,
+    result: SequenceEstimate,
     errors: dict[str, float | None],
     ready: PreparedRecording,
     recording: Imported,
@@ -214,17 +214,17 @@ def summarise(
     """The figures of a finished track, up to a divergence if there was one.
 
     Args:
-        found: The estimate, with the filter's covariances.
+        result: The estimate, with the filter's covariances.
         errors: Metrics against the reference by their names; empty without a reference.
         ready: The recording as the filter took it.
         recording: The recording as it was imported, with its notes and warnings.
         trained: The network, for its name and its training data.
         ekf: The filter.
     """
-    filtered, sequence = found.filtered, recording.sequence
+    filtered, sequence = result.filtered, recording.sequence
     assert filtered is not None
-    rows = int(np.flatnonzero(found.trajectory.known)[-1]) + 1
-    time, position = found.trajectory.time[:rows], found.trajectory.position[:rows]
+    rows = int(np.flatnonzero(result.trajectory.known)[-1]) + 1
+    time, position = result.trajectory.time[:rows], result.trajectory.position[:rows]
     seconds = float(time[-1] - time[0])
     length = 0.0 if rows < 2 else metrics.path_length(position[:, :2], float(time[1] - time[0]))
     used = filtered.accepted[:rows]
@@ -244,7 +244,7 @@ def summarise(
         path_length=length,
         from_start=float(np.linalg.norm((position[-1] - position[0])[:2])),
         expected_error=error,
-        rest=_share_at_rest(ready, ekf),
+        at_rest=_share_at_rest(ready, ekf),
         running=_share_running(ready, ekf),
         climb=float(np.ptp(position[:, 2])),
         accepted=float(used.mean()) if len(used) else None,
@@ -255,9 +255,9 @@ def summarise(
         f"{error:.1f} m{share} by the filter, {counted}; network {trained.name}; place and heading "
         "are relative to the start",
     )
-    own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
-    own_rate = min(own_rate, float(sequence.attributes.get(RECORDED_RATE, own_rate)))
-    warnings = [*recording.warnings, *_warnings(summary, own_rate, 1.0 / ekf.config.dt)]
+    recorded_rate = 1.0 / float(np.median(np.diff(sequence.time)))
+    recorded_rate = min(recorded_rate, float(sequence.attributes.get(RECORDED_RATE, recorded_rate)))
+    warnings = [*recording.warnings, *_warnings(summary, recorded_rate, 1.0 / ekf.config.dt)]
     holes = ready.imu_valid is not None
     if holes or any(GAPS in note for note in recording.notes):
         where = "" if holes else " (see above)"
@@ -272,11 +272,11 @@ def summarise(
         )
     if ready.start.std.velocity > ROUGH_START:
         warnings.append("start: it moves in its first second, so velocity and tilt are inaccurate")
-    diverged = (note for note in found.notes if note not in ready.notes)
+    diverged = (note for note in result.notes if note not in ready.notes)
     return summary._replace(warnings=(*warnings, *diverged))
 
 
-def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
+def _warnings(summary: Summary, recorded_rate: float, rate: float) -> list[str]:
     """Warnings that limit the value of the figures."""
     accepted = 1.0 if summary.accepted is None else summary.accepted
     covered = {
@@ -286,12 +286,11 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
     shares = {of: share for of, share in covered.items() if share is not None}
     worst = min(shares, key=shares.__getitem__, default="")
     speed = summary.path_length / max(summary.seconds, 1e-9)
-    found = {
-        f"rate: recorded at {own_rate:.4g} Hz, the network was trained at {rate:g} Hz: the "
-        f"content above {own_rate / 2.0:.3g} Hz is unknown": own_rate < 0.99 * rate,
-        f"rest: it lies still {summary.rest:.0%} of the time, and the filter holds the position": (
-            summary.rest >= LYING
-        ),
+    conditions = {
+        f"rate: recorded at {recorded_rate:.4g} Hz, the network was trained at {rate:g} Hz: the "
+        f"content above {recorded_rate / 2.0:.3g} Hz is unknown": recorded_rate < 0.99 * rate,
+        f"rest: it lies still {summary.at_rest:.0%} of the time, and the filter holds the "
+        "position": summary.at_rest >= LYING,
         f"running: in {summary.running:.0%} of the seconds it is shaken as in a run, where "
         "networks trained on walks make the path too short": summary.running > RUNNING_SHARE,
         f"height: it changes by {summary.climb:.1f} m: that is drift unless the way goes up or "
@@ -304,7 +303,7 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
         f"errors: larger than the filter says: its 95 % region of {worst} holds the reference in "
         f"{shares.get(worst, 0.0):.0f} % of the rows": shares.get(worst, 100.0) < COVERED,
     }
-    return [text for text, applies in found.items() if applies]
+    return [text for text, applies in conditions.items() if applies]
 
 
 def _share_at_rest(ready: PreparedRecording, ekf: Filter) -> float:
@@ -328,48 +327,48 @@ def _share_running(ready: PreparedRecording, ekf: Filter) -> float:
 
 
 def _write_figures(
-    folder: Path, found: SequenceEstimate, summary: Summary, formats: tuple[str, ...]
+    folder: Path, result: SequenceEstimate, summary: Summary, formats: tuple[str, ...]
 ) -> None:
     """Write the summary and the trajectories, with the stamps of the recording's own clock."""
     plain = summary._asdict() | {"errors": report.finite(summary.errors)}
     text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False)
     (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     path, reference = (
-        each._replace(time=each.time + summary.start_time)
-        for each in (found.trajectory, found.reference)
+        trajectory._replace(time=trajectory.time + summary.start_time)
+        for trajectory in (result.trajectory, result.reference)
     )
     write_tum(folder / "trajectory.txt", path)
     if np.isfinite(reference.position).any():
         write_tum(folder / "reference.txt", reference)
     for kind in formats:
-        covariance = found.filtered and found.filtered.covariance
+        covariance = result.filtered and result.filtered.covariance
         export.export(folder / f"trajectory.{kind}", path, kind, covariance)
 
 
 def _draw(
-    folder: Path, found: SequenceEstimate, summary: Summary, config: TrainConfig, command: str
+    folder: Path, result: SequenceEstimate, summary: Summary, config: TrainConfig, command: str
 ) -> None:
     """Draw the picture and write the page, in the form of an evaluation's sequence."""
     from gnio_jax import drawing  # they take a second to import
     from gnio_jax.evaluation import page, plots, tabulate
     from gnio_jax.evaluation.views import make_view
 
-    seen = make_view(found, alignment=None)
+    view = make_view(result, alignment=None)
     length = f"{summary.path_length:.1f} m in {summary.seconds:.0f} s"
     expected = f"{summary.expected_error:.1f} m"
     title = f"{shown_name(summary.recording)}: {length}, expected error at the end {expected}"
-    drawing.save(folder / "track.png", plots.sequence(seen, title))
-    aligned = "start position and yaw" if found.waypoints is None else tabulate.TO_WAYPOINTS
-    known = np.isfinite(found.reference.position).all(axis=1).mean()
-    partly = f"known for {known:.0%} of the time: errors and ratios are of this part"
-    about = {
+    drawing.save(folder / "track.png", plots.sequence(view, title))
+    aligned = "start position and yaw" if result.waypoints is None else tabulate.TO_WAYPOINTS
+    share = np.isfinite(result.reference.position).all(axis=1).mean()
+    partly = f"known for {share:.0%} of the time: errors and ratios are of this part"
+    facts = {
         "command": command,
         "walked": f"{length}, ends {summary.from_start:.1f} m from the start",
         "expected error at the end": f"{expected} by the filter",
         "network": f"{summary.network}, trained on {summary.trained_on}",
         "window orientation": "filter",
         "alignment": aligned if summary.errors else "",
-        "reference": partly if 0 < known < 1 else "",
+        "reference": partly if 0 < share < 1 else "",
         "windows": tabulate.windows(dataclasses.asdict(config.data)),
     }
     figures = {"accepted": None if summary.accepted is None else 100.0 * summary.accepted}
@@ -377,9 +376,9 @@ def _draw(
     figures |= summary.errors | {"duration": summary.seconds, "path_length": summary.path_length}
     run = page.PageRun(
         "track",
-        {name: text for name, text in about.items() if text},
-        [seen],
-        {seen.name: figures},
+        {name: text for name, text in facts.items() if text},
+        [view],
+        {view.name: figures},
         warnings=summary.warnings,
         remarks=(summary.limits, *summary.notes),
         settings=configuration.to_yaml(config),

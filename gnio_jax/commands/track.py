@@ -93,7 +93,7 @@ def _table(summary: Any) -> Table:
     grid.add_row("path", f"{summary.path_length:.1f} m")
     grid.add_row("end from start", f"{summary.from_start:.1f} m")
     grid.add_row("expected error at the end", f"{summary.expected_error:.1f} m")
-    grid.add_row("at rest (quieter than a hand)", f"{summary.rest:.0%}")
+    grid.add_row("at rest (quieter than a hand)", f"{summary.at_rest:.0%}")
     if summary.accepted is not None:
         grid.add_row("displacements used", f"{summary.accepted:.0%}")
     for name in [metric for metric in ERRORS if metric in summary.errors]:

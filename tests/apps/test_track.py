@@ -286,7 +286,7 @@ SUMMARY = Summary("walk", "net", "walks", *FIGURES, {}, (), (), "")
     [
         ({}, None),
         ({"accepted": 0.71}, "gate: the filter refused 29% of"),
-        ({"rest": 0.97}, "rest: it lies still 97% of the time"),
+        ({"at_rest": 0.97}, "rest: it lies still 97% of the time"),
         ({"running": 0.94}, "running: in 94% of the seconds it is shaken as in a run"),
         ({"climb": 4.26}, "height: it changes by 4.3 m: that is drift unless"),
         ({"path_length": 400.0}, "speed: 4.0 m/s in the mean"),
@@ -298,7 +298,7 @@ SUMMARY = Summary("walk", "net", "walks", *FIGURES, {}, (), (), "")
     ],
 )
 def test_what_is_worth_a_warning(changes, words):
-    found = _warnings(SUMMARY._replace(**changes), own_rate=100.0, rate=100.0)
+    found = _warnings(SUMMARY._replace(**changes), recorded_rate=100.0, rate=100.0)
     assert [line[: len(words)] for line in found] == [words] if words else found == []
 
 
