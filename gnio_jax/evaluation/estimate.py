@@ -48,7 +48,7 @@ from gnio_jax.numerics import (
     yaw_rotation,
 )
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Array, Prediction, Waypoints
+from gnio_jax.types import Array, Waypoints
 
 PERFECT_STD = 0.01
 """Standard deviation of the true displacements that a `perfect` filter is given, m per axis."""
@@ -252,7 +252,7 @@ def _run(
             history = run_filter(ekf, state, *signals, displacement, covariance, valid)[1]
         else:
             frame = ekf.config.displacement_frame
-            predict = functools.partial(_predict, apply, variables)
+            predict = Network(apply, variables).predict(keep)
             history = run_odometry(predict, ekf, state, *signals, valid)[1]
         diagonal, whole = history.covariance_diagonal, history.covariance
         assert whole is not None
@@ -272,10 +272,6 @@ def _run(
         return history._replace(covariance_diagonal=diagonal, covariance=position)
 
     return over_sequences(run)(inputs)
-
-
-def _predict(apply: Callable, variables: Any, windows: Array) -> Prediction:
-    return keep(apply(variables, windows))
 
 
 def _convert_history(
