@@ -49,7 +49,7 @@ from gnio_jax.numerics import (
     yaw_rotation,
 )
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Array, Prediction, Waypoints
+from gnio_jax.types import Array, Waypoints
 
 PERFECT_STD = 0.01
 """Standard deviation of the true displacements that a `perfect` filter is given, m per axis."""
@@ -253,7 +253,7 @@ def _run(
             history = run_filter(ekf, state, *signals, displacement, covariance, valid)[1]
         else:
             frame = ekf.config.displacement_frame
-            predict = functools.partial(_predict, apply, variables)
+            predict = Network(apply, variables).predict(keep)
             history = run_odometry(predict, ekf, state, *signals, valid)[1]
         covariances = history.covariance
         assert covariances is not None
@@ -273,10 +273,6 @@ def _run(
         return history._replace(covariance_diagonal=diagonal, covariance=of_position)
 
     return over_sequences(run)(inputs)
-
-
-def _predict(apply: Callable, variables: Any, windows: Array) -> Prediction:
-    return keep(apply(variables, windows))
 
 
 def _convert_history(

@@ -39,7 +39,7 @@ from jaxtyping import Bool, Float, Int
 from gnio_jax.config import InitialStd, NoiseModel
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.geometry import hat, matmul
-from gnio_jax.types import Array
+from gnio_jax.types import Array, Memory
 
 CORE, CLONE = 21, 6
 """Number of entries of the error state: of the core without b, and of each clone."""
@@ -151,6 +151,9 @@ class FilterState(NamedTuple):
     """The last `FilterConfig.reach` samples before the state, with holes bridged: gyro rad/s, accel
     m/s², raw, and whether the filter used the sample. A later run needs them for the network's
     first windows. None at a start, and inside a run."""
+    memory: Memory | None = None
+    """The memory of a network that has one, with which a later run continues. None at a start, and
+    inside a run."""
 
     @property
     def position(self) -> Float[Array, "*k 3"]:
