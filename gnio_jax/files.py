@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from gnio_jax.errors import InputError
 
@@ -63,7 +64,7 @@ def _target(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _naming(path: Path) -> dict[str, str | Path]:
+def _naming(path: Path) -> dict[str, Any]:
     """The arguments with which `tempfile` makes the temporary file of a path."""
     return {"prefix": f".{path.stem}{PART}", "suffix": path.suffix, "dir": path.parent}
 

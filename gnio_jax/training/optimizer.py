@@ -147,7 +147,8 @@ def adam(
         held = optax.conditionally_mask(
             moments, lambda step, log_std_learns: log_std_learns, forward_extra_args=True
         )
-        labels = _by_path(lambda path: "held" if path[1].key in UNCERTAINTY else "learns")
+        names = NETWORK_PARTS["uncertainty"]
+        labels = _by_path(lambda path: "held" if path[1].key in names else "learns")
         parts = [optax.partition({"learns": moments, "held": held}, labels)]
     if config.weight_decay:
         parts.insert(0, optax.add_decayed_weights(config.weight_decay))
