@@ -13,7 +13,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import folder as results
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.report import Report
-from gnio_jax.evaluation.statistics import summarise
+from gnio_jax.evaluation.statistics import FEWEST_GROUPS, summarise
 from gnio_jax.files import file_stem
 from gnio_jax.networks import Card, TrainedNetwork
 from gnio_jax.networks.folder import evaluations_folder, has_card, write_published
@@ -110,11 +110,12 @@ def _describe_error(figures: dict[str, Report], datasets: tuple[str, ...]) -> st
         return settings["estimator"] != "ekf", not of_run, not tested, len(name), name
 
     for name in sorted(figures, key=rank):
-        if (error := _cell(figures[name], SHOWN[0])) != tabulate.number(None, 0):
+        error = _cell(figures[name], SHOWN[0], " m")
+        if not error.startswith(tabulate.number(None, 0)):
             seconds = summarise([figures[name].scores], "duration", figures[name].groups).mean
             length = "" if seconds is None else f" of {seconds:.0f} s"
             facts = "; ".join((name, *_by_placement(figures[name])))
-            return f"typical error {error} m on walks{length} ({facts})"
+            return f"typical error {error} on walks{length} ({facts})"
     return ""
 
 
@@ -132,13 +133,15 @@ def _by_placement(figures: Report) -> list[str]:
     ]
 
 
-def _cell(figures: Report, metric: str) -> str:
-    """The mean over the sequences with its 95 % interval."""
+def _cell(figures: Report, metric: str, unit: str = "") -> str:
+    """The mean over the sequences with its 95 % interval, or the number of groups if that is too
+    small for one."""
     summary = summarise([figures.scores], metric, figures.groups)
     digits = tabulate.column(metric).digits
-    text = tabulate.number(summary.mean, digits)
+    text = tabulate.number(summary.mean, digits) + unit
     if summary.interval is None:
-        return text
+        few = summary.mean is not None and summary.groups < FEWEST_GROUPS
+        return f"{text} ({summary.groups} group{'s' * (summary.groups > 1)})" if few else text
     low, high = (tabulate.number(bound, digits) for bound in summary.interval)
     return f"{text} ({low} to {high})"
 
@@ -191,7 +194,12 @@ def _write_text(
         for folder, evaluation in figures.items()
     ]
     means = "Means over sequences, with 95 % intervals over groups (people, sessions)."
-    table = f"{tabulate.markdown(header, rows)}\n{means}"
+    uneven = [
+        f"{folder}: {line}"
+        for folder, evaluation in figures.items()
+        for line in tabulate.unevenness(evaluation.summary().values())
+    ]
+    table = f"{tabulate.markdown(header, rows)}\n{' '.join([means, *uneven])}"
     fails = fails or ("Its publisher has not said. Try it on recordings like yours.",)
     return f"""# {name}
 

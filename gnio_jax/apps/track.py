@@ -98,7 +98,7 @@ def _check_results(
     track = all((out / name).is_file() for name in NAMES)
     if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
         raise InputError(out, "exists and is not an earlier track", "name another --out")
-    check_writable_folder(out.parent)
+    check_writable_folder(out)
     for kind in formats:
         export.check("--format", kind, stamps)
     if rerun_file is not None:

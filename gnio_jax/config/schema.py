@@ -237,14 +237,16 @@ class ModelConfig:
     """Network in the registry of `gnio_jax.models`."""
     width: Count | None = None
     """Channels of the first encoder group; the others follow (gnio, tlio, ronin_resnet, deepils:
-    64). Features of a sample (ctin: 96)."""
+    64). Features of a sample (ctin, state_space: 96), of the first convolution (gru: 64), of the
+    first block (ronin_tcn: 16), or units of a layer (ronin_lstm: 100)."""
     bank_size: NonNegativeCount | None = None
-    """Prototypes in the Motion Bank; 0 leaves the bank out (gnio: 64)."""
+    """Prototypes in the Motion Bank; 0 leaves the bank out (gnio: 64, networks with memory: 0)."""
     bank_std: Positive | None = None
     """Standard deviation of the prototypes before training (gnio: 1). Near 1/√d, for d features,
     all prototypes receive the same attention."""
     head: Literal["gated", "linear"] | None = None
-    """Displacement as scale × gate, or a plain linear layer (gnio: gated)."""
+    """Displacement as scale × gate, or a plain linear layer (gnio: gated, networks with memory:
+    linear)."""
     gate: Literal["tanh", "sigmoid"] | None = None
     """Activation of the gate (gnio: tanh)."""
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] | None = None

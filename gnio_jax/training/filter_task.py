@@ -150,7 +150,7 @@ class FilterTask(Task):
             settings = with_free_parameters(self.config.filter, numbers)
             ekf = dataclasses.replace(make_filter(self.config.data, settings), config=config)
             first = initial_state(ekf, *start)
-            predict = functools.partial(models.Inference(self.model), frozen)
+            predict = models.Network(models.Inference(self.model), frozen).predict()
             _, history = run_odometry(predict, ekf, first, segment.gyro, segment.accel)
             path = MotionPath(
                 *(
