@@ -256,6 +256,6 @@ def _replace_contents(path: Path, new: Path, temporary: Path) -> None:
                 child.rename(target / child.name)
                 moves.append((child, target / child.name))
     except OSError:
-        for origin, place in reversed(moves):
-            place.rename(origin)
+        for origin, target in reversed(moves):
+            target.rename(origin)
         raise

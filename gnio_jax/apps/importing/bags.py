@@ -124,8 +124,8 @@ def _check_tables(path: Path) -> None:
     computed column may compute for any time."""
     if set("%?#") & set(str(path)):  # SQLite would open another file
         raise InputError(path, "has %, ? or # in its name", "rename it, or its folder")
-    place = f"file:{urllib.parse.quote(str(path.absolute()))}?immutable=1"
-    with contextlib.closing(sqlite3.connect(place, uri=True)) as connection:
+    address = f"file:{urllib.parse.quote(str(path.absolute()))}?immutable=1"
+    with contextlib.closing(sqlite3.connect(address, uri=True)) as connection:
         rows = connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall()
         odd = [name for kind, name, _ in rows if kind not in ("table", "index")]
         odd += [name for _, name, sql in rows if re.match(r"\s*create\s+virtual", sql or "", re.I)]
@@ -145,10 +145,10 @@ def _rosbag1(path: Path, stack: ExitStack) -> Bag:
 
     reader = stack.enter_context(rosbag1.Reader(path))
     names = {function: name for name, function in rosbag1.reader.decompressors.items()}
-    for place, chunk in reader.chunks.items():
+    for start, chunk in reader.chunks.items():
         compression = names[chunk.decompressor]
         bounded = partial(_unpacked, compression=compression, path=path)
-        reader.chunks[place] = chunk._replace(decompressor=bounded)
+        reader.chunks[start] = chunk._replace(decompressor=bounded)
     decode = _decoder("ros1")
 
     def messages(names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
@@ -268,8 +268,8 @@ def _mcap_messages(file: Any, indexes: list[Any], chosen: set[int], path: Path) 
         while pending and pending[0][0] < index.message_start_time:
             yield heapq.heappop(pending)[-1]
         file.seek(index.chunk_start_offset + 1 + 8)  # its kind and its length
-        for place, message in enumerate(inside(Chunk.read(ReadDataStream(file)))):
-            heapq.heappush(pending, (message.log_time, number, place, message))
+        for row, message in enumerate(inside(Chunk.read(ReadDataStream(file)))):
+            heapq.heappush(pending, (message.log_time, number, row, message))
     while pending:
         yield heapq.heappop(pending)[-1]
 
