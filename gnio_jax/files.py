@@ -136,6 +136,8 @@ def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
     existing = next(parent for parent in parents if parent.exists())
     try:
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=existing)
+    except FileNotFoundError:  # /proc, or a disk that was unplugged
+        raise InputError(existing, "takes no files", "name another folder") from None
     except OSError as error:
         error.filename = str(existing)  # the user does not know the temporary file
         raise

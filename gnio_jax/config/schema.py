@@ -249,7 +249,7 @@ class ModelConfig:
     that the network does not have is refused."""
 
     name: str = "gnio"
-    """Network in the registry of `gnio_jax.models`."""
+    """Name of the network, one of the package or of a plugin."""
     width: Count | None = None
     """Channels of the first encoder group; the others follow (gnio, tlio, ronin_resnet, deepils:
     64). Features of a sample (ctin, state_space: 96), of the first convolution (gru: 64), of the
