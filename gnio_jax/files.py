@@ -142,6 +142,18 @@ def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
     Path(name).unlink()
 
 
+def file_in(folder: Path, name: str | Path) -> Path:
+    """The file `name` in a folder, or the only one there whose name differs from it in case alone,
+    as systems that do not tell cases apart may have written it. The first if there is neither."""
+    path = folder / name
+    if path.exists():
+        return path
+    alike: list[str] = []
+    with contextlib.suppress(OSError):
+        alike = [other for other in os.listdir(path.parent) if other.lower() == path.name.lower()]
+    return path.with_name(alike[0]) if len(alike) == 1 else path
+
+
 def with_ending(path: Path, ending: str) -> Path:
     """`path` with one more ending. `Path.with_suffix` would cut a name that contains a point."""
     return path.with_name(path.name + ending)
