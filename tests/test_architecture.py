@@ -54,8 +54,7 @@ LIBRARIES = {
 REFUSED = set("found own each given there known place seen about asked kept told here both".split())
 REFUSED |= set("these those wanted taken laid made left rest apart since late".split())
 """Words that do not say what a variable holds."""
-OLD_NAMES = ("apps/live", "apps/track", "filtering/propagation", "filtering/scan")
-OLD_NAMES += ("filtering/state", "filtering/update", "filtering/waypoints")
+OLD_NAMES = ("apps/live",)
 """Rooms and modules whose variables still have such names."""
 
 

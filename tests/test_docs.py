@@ -172,13 +172,17 @@ def test_a_dataset_of_two_csv_files(walks, tmp_path):
     assert found.valid.all() and not data.self_check(found).failures
 
 
+def test_the_block_of_networks_with_memory():
+    run("docs/networks_with_memory.md", code_of("docs/networks_with_memory.md"))
+
+
 def test_the_imports_of_the_reference():
     run("docs/api/index.md", code_of("docs/api/index.md"))
 
 
 def test_every_block_that_runs_has_a_test():
     tested = {"README.md", "docs/differentiable_filter.md", "docs/networks.md", "docs/weights.md"}
-    tested |= {"docs/measurements.md", "docs/many_sequences.md"}
+    tested |= {"docs/measurements.md", "docs/many_sequences.md", "docs/networks_with_memory.md"}
     tested |= {"docs/api/index.md", "CONTRIBUTING.md"}
     assert {block.page for block in RUN} == tested
 

@@ -74,17 +74,21 @@ def publish(
 
 
 def describe_data(network: TrainedNetwork) -> str:
-    """The training data of a network in words, with its measured error if there is one."""
+    """The training data of a network, in words."""
     if network.card is not None:
-        data, error = network.card.data, network.card.measured
-    else:
-        names = ", ".join(network.config.datasets)
-        data, error = f"dataset {names}, split {network.config.data.train_split}", ""
-        try:
-            error = _describe_error(_read_figures(network.path), network.config.datasets)
-        except InputError:
-            pass  # a damaged evaluation must not prevent tracking
-    return f"{data}, whose {error}" if error else data
+        return network.card.data
+    names = ", ".join(network.config.datasets)
+    return f"dataset {names}, split {network.config.data.train_split}"
+
+
+def describe_error(network: TrainedNetwork) -> str:
+    """The measured error of a network, in words; empty if it was not measured."""
+    if network.card is not None:
+        return network.card.measured
+    try:
+        return _describe_error(_read_figures(network.path), network.config.datasets)
+    except InputError:
+        return ""  # a damaged evaluation must not prevent tracking
 
 
 def _read_figures(path: Path | None) -> dict[str, Report]:
@@ -95,9 +99,10 @@ def _read_figures(path: Path | None) -> dict[str, Report]:
 
 
 def _describe_error(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
-    """The error that lists of networks show, in words, with that of each way of carrying. It is
-    that of the first evaluation that has it. Evaluations with the filter come first, then those on
-    the run's own datasets, then those on a test split. It is empty if no evaluation has it."""
+    """The error that lists of networks show, in words, with that of each way of carrying: the root
+    mean square of the horizontal error of a walk. It is that of the first evaluation that has it.
+    Evaluations with the filter come first, then those on the run's own datasets, then those on a
+    test split. It is empty if no evaluation has it."""
 
     def rank(name: str) -> tuple[bool, bool, bool, int, str]:
         settings = figures[name].settings
@@ -107,9 +112,10 @@ def _describe_error(figures: dict[str, Report], datasets: tuple[str, ...]) -> st
     for name in sorted(figures, key=rank):
         error = _cell(figures[name], SHOWN[0], " m")
         if not error.startswith(tabulate.number(None, 0)):
-            text = f"{tabulate.column(SHOWN[0]).heading} is {error} on {name}"
-            by_placement = _by_placement(figures[name])
-            return f"{text} ({'; '.join(by_placement)})" if by_placement else text
+            seconds = summarise([figures[name].scores], "duration", figures[name].groups).mean
+            length = "" if seconds is None else f" of {seconds:.0f} s"
+            facts = "; ".join((name, *_by_placement(figures[name])))
+            return f"typical error {error} on walks{length} ({facts})"
     return ""
 
 

@@ -285,6 +285,7 @@ def make_standing(
 # --- complexity
 
 NETWORKS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "imot_text", "gnio")
+NETWORKS += ("ronin_lstm", "ronin_tcn", "gru", "state_space")
 PAPERS_COST = {
     "tlio": (5.42, 0.08),
     "deepils": (2.29, 0.03),

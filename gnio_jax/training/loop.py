@@ -28,6 +28,7 @@ from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.initial import load_initial_network
 from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.run_folder import Log
+from gnio_jax.training.segment_task import SegmentTask, refuse_without_memory
 from gnio_jax.training.task import DispatchSums, Row, Task
 from gnio_jax.training.window_task import WindowTask
 
@@ -115,6 +116,9 @@ def train_all(
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
         start = None if resumed else load_initial_network(configs[0])
         task_type = FilterTask if through_filter else WindowTask
+        if configs[0].segments.seconds and not through_filter:
+            task_type = SegmentTask
+            refuse_without_memory(configs[0].model)
         task, data = set_up(task_type, configs[0], reporter, workers)
         for config, resume in zip(configs, resumes, strict=True):
             results.append(_train(task, data, config, start, resume, signals, reporter))

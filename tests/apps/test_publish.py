@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from gnio_jax.apps import publish as publishing
-from gnio_jax.apps.publish import describe_data, publish
+from gnio_jax.apps.publish import describe_data, describe_error, publish
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.evaluation import report
 from gnio_jax.evaluation.metrics import Measures
@@ -31,10 +31,15 @@ SETTINGS = {"dataset": "synthetic", "split": "test", "estimator": "ekf", "alignm
 SETTINGS |= {"recordings": dict.fromkeys("abcd", 60.0), "filter": {}}
 SETTINGS["definitions"] = report.DEFINITIONS
 SCORES = {
-    name: Measures({"ate_2d": error, "yaw_rmse": None}, {"yaw_rmse": "no reference"}, error > 9)
+    name: Measures(
+        {"ate_2d": error, "yaw_rmse": None, "duration": 60.0},
+        {"yaw_rmse": "no reference"},
+        error > 9,
+    )
     for name, error in (("a", 1.2), ("b", 1.3), ("c", 99.0), ("d", math.inf))
 }
-MEASURED = "ATE 2-D is 1.25 m (2 groups) on synthetic_test_ekf (in a pocket 1.2; in a hand 1.3)"
+MEASURED = "typical error 1.25 m (2 groups) on walks of 60 s (synthetic_test_ekf; in a pocket 1.2; "
+MEASURED += "in a hand 1.3)"
 """Two diverged."""
 SAID = ("simulated walks", "CC0", ("Running | jumping.",))
 
@@ -111,12 +116,13 @@ def test_networks_are_listed(published, run, monkeypatch, tmp_path, gnio, mistak
 
 def test_the_data_of_a_network_in_words(published, run, tmp_path):
     """And what was measured of it."""
-    assert describe_data(read_network(published / "walk")) == f"simulated walks, whose {MEASURED}"
+    card = read_network(published / "walk")
+    assert (describe_data(card), describe_error(card)) == ("simulated walks", MEASURED)
     copy = shutil.copytree(run, tmp_path / "walk")
-    data = "dataset synthetic, split train"
-    assert describe_data(read_network(copy)) == f"{data}, whose {MEASURED}"
+    assert describe_data(read_network(copy)) == "dataset synthetic, split train"
+    assert describe_error(read_network(copy)) == MEASURED
     (copy / "eval" / "synthetic_test_ekf" / "metrics.json").write_text("{")
-    assert describe_data(read_network(copy)) == data  # and it tracks
+    assert describe_error(read_network(copy)) == ""  # and it tracks
 
 
 def test_a_published_network_is_published_again(published, monkeypatch, tmp_path):
@@ -125,7 +131,8 @@ def test_a_published_network_is_published_again(published, monkeypatch, tmp_path
     figures = report.Report(SETTINGS, SCORES, {}, dict.fromkeys("abcd", "ann"), {}, {})
     write_report(tmp_path / "evaluations" / "walk" / "tyrex_test_ekf", figures)
     card = publish(published / "walk", tmp_path / "again.zip", "again", *SAID)
-    assert (card.name, card.measured) == ("again", "ATE 2-D is 1.25 m (1 group) on tyrex_test_ekf")
+    measured = "typical error 1.25 m (1 group) on walks of 60 s (tyrex_test_ekf)"
+    assert (card.name, card.measured) == ("again", measured)
     assert "It is the published network `walk`, whose card has" in read_text(tmp_path / "again.zip")
     first, second = map(read_network, (published / "walk", tmp_path / "again.zip"))
     assert first.config == second.config and first.digest == second.digest
