@@ -36,14 +36,14 @@ LIBRARIES = {
     "flax": {"models", "networks", "training", "evaluation"},
     "jax2onnx": {"apps.onnx.conversion"},
     "loky": {"data.workers"},
-    "mcap": {"apps.importing.ros", "apps.export"},
+    "mcap": {"apps.importing.bags", "apps.export"},
     "matplotlib": {"drawing", "data.pictures", "evaluation.plots", "tables.plots"},
     "onnx": ONNX,
     "onnxruntime": ONNX,
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
     "rerun": {"apps.rerun"},
-    "rosbags": {"apps.importing.ros", "apps.export"},
+    "rosbags": {"apps.importing.bags", "apps.export"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
     "safetensors": {"networks.folder"},
@@ -54,8 +54,7 @@ LIBRARIES = {
 REFUSED = set("found own each given there known place seen about asked kept told here both".split())
 REFUSED |= set("these those wanted taken laid made left rest apart since late".split())
 """Words that do not say what a variable holds."""
-OLD_NAMES = ("apps/live", "apps/track", "filtering/propagation", "filtering/scan")
-OLD_NAMES += ("filtering/state", "filtering/update", "filtering/waypoints")
+OLD_NAMES = ("apps/live",)
 """Rooms and modules whose variables still have such names."""
 
 

@@ -178,6 +178,10 @@ def test_a_dataset_of_two_csv_files(walks, tmp_path):
     assert found.valid.all() and not data.self_check(found).failures
 
 
+def test_the_block_of_networks_with_memory():
+    run("docs/networks_with_memory.md", code_of("docs/networks_with_memory.md"))
+
+
 def test_the_imports_of_the_reference():
     run("docs/api/index.md", code_of("docs/api/index.md"))
 

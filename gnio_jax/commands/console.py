@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -45,6 +46,9 @@ def run(main: Callable[[], object]) -> None:
     signal.signal(signal.SIGTERM, _terminate)
     # Pictures are files. The backend of a notebook, which its commands inherit, may be missing.
     os.environ["MPLBACKEND"] = "agg"
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # it was closed before the start, as by >&-
+            setattr(sys, name, open(os.devnull, "w"))
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may have any bytes
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -148,6 +152,14 @@ class _Plain(Console):
 
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(without_controls(text), **options)
+
+    def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+        """Its parts without the controls in texts, such as names in the cells of a table. Rich's
+        own controls are parts of their own."""
+        for segment in super().render(renderable, options):
+            if segment.control is None:
+                segment = segment._replace(text=without_controls(segment.text))
+            yield segment
 
 
 def stdout() -> Console:

@@ -61,6 +61,8 @@ def evaluate(request: EvaluateConfig, call: options.Call) -> None:
         console.say(f"page: {result.folder / 'report.html'} (open it in a browser)")
         pictures = result.folder / "plots" / "error_cdf.png"
         console.say(f"pictures: {pictures}, and there <name>.png of each sequence")
+    if line := tabulate.gaps(result.report):
+        console.say(f"warning: {line} (the reasons are below the table)")
 
 
 def score(request: ScoreOptions, _call: options.Call) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import warnings
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -22,6 +23,8 @@ class TrainOptions(TrainConfig):
     """A setting by its name in YAML; it may be given several times."""
     resume: bool = False
     """Continue the run in the work folder from its latest checkpoint."""
+    strict: bool = False
+    """Refuse damaged recordings, instead of leaving them out with a warning."""
     seeds: tuple[Seed, ...] = ()
     """Seeds to train one after the other, instead of --seed: WORKDIR_s0, WORKDIR_s1, ..."""
     devices: Count | None = None
@@ -53,11 +56,13 @@ def train(request: TrainOptions, call: options.Call) -> None:
       {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
     """
     config = experiment(request, call)
-    from gnio_jax import filtering, parallel  # late: mistakes do not wait for JAX
+    from gnio_jax import data, filtering, parallel  # late: mistakes do not wait for JAX
     from gnio_jax.training import loop
 
     if config.through_filter.learn:
         filtering.cores_as_devices()  # the filter's operations are too small for several cores
+    if request.strict:
+        warnings.simplefilter("error", data.DamagedRecording)
     parallel.initialise(request.distributed, request.devices)
     with console.terminal(shown=parallel.is_first()) as terminal:
         configs = configuration.with_seeds(config, request.seeds) if request.seeds else [config]

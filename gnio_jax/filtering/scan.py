@@ -245,12 +245,12 @@ def clone_steps(
         state, record, trace = clone_step(ekf, state, imu, slot, measure_now, measurements)
         return (state, memory), keep(slot, state, record, trace)
 
-    rows = jnp.arange(len(age)), by_interval, displacement, inputs.measurements
+    inputs_by_interval = jnp.arange(len(age)), by_interval, displacement, inputs.measurements
     start = invariant_errors(start._replace(window=None, memory=None), config)
     lengths = config.checkpoint_every, config.truncate_every
-    (state, memory), kept = blocked_scan(step, (start, memory), rows, *lengths)
+    (state, memory), rows = blocked_scan(step, (start, memory), inputs_by_interval, *lengths)
     imu_memory = imu_memory._replace(quiet=state.imu.quiet)
-    return state._replace(imu=imu_memory, window=window, memory=memory), kept, age
+    return state._replace(imu=imu_memory, window=window, memory=memory), rows, age
 
 
 # One clone interval

@@ -32,6 +32,7 @@ from gnio_jax.filtering.consider import (
     core_sensitivity,
     start_tangents,
     step_with_tangents,
+    with_considered,
 )
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.filter import Filter
@@ -375,7 +376,8 @@ def device_pose(
     covariance = core_covariance(state, ekf.config)
     if tangents is not None and ekf.considered is not None:
         sensitivity = core_sensitivity(state.mean, tangents)
-        covariance = covariance + considered_covariance(sensitivity[None], ekf.considered)[0]
+        added = considered_covariance(sensitivity[None], ekf.considered)
+        covariance = with_considered(covariance[None], added, ekf.config)[0]
     return DevicePose(state.mean, covariance, flags)
 
 

@@ -65,8 +65,9 @@ def register(name: str, network: type[nn.Module]) -> None:
     """Make your own network known to `create`, and so to configurations and command lines.
 
     `network(**options).apply(variables, windows, train=False)` must give a `Prediction`. Its fields
-    are its options. A second registration replaces the first. Raises `InputError` for the name of a
-    network of this package.
+    are its options. The names of its modules say what trains through the filter and what inference
+    folds: docs/networks.md has them. A second registration replaces the first. Raises `InputError`
+    for the name of a network of this package.
     """
     if name in _PUBLISHED:
         raise InputError(f"model '{name}'", "is a network of gnio-jax", "choose another name")

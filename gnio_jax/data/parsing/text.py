@@ -60,7 +60,8 @@ class Layout(NamedTuple):
 def shortened(text: object, most: int = 80) -> str:
     """A text from a file in a form that a message can quote: one line of at most `most` printable
     characters."""
-    line = "".join(c if c.isprintable() else "\ufffd" for c in str(text).strip()[: 4 * most])
+    words = " ".join(str(text).strip()[: 4 * most].split())
+    line = "".join(c if c.isprintable() else "\ufffd" for c in words)
     return line if len(line) <= most else line[: most - 3] + "..."
 
 

@@ -45,7 +45,7 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
     )
     names = ["_".join(folder.relative_to(root).parts) for folder in folders]
     return [
-        RecordingSource(name, partial(read, folder, name))
+        RecordingSource(name, partial(read, folder, name), (folder / _TABLE, folder / _TRUTH))
         for name, folder in zip(names, folders, strict=True)
     ]
 

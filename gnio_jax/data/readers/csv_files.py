@@ -61,7 +61,9 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
     for path in paths:
         if (other := named.setdefault(path.stem, path)) != path:
             raise InputError(path, f"has the name of {other}", "rename or remove one of them")
-    return [RecordingSource(name, partial(read, path)) for name, path in sorted(named.items())]
+    return [
+        RecordingSource(name, partial(read, path), (path,)) for name, path in sorted(named.items())
+    ]
 
 
 def files_of(root: Path) -> list[Path]:

@@ -87,10 +87,12 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
     sources, drives = [], find_drives(root)
     for drive, paths in drives.items():
         if split_of(drive) == split and paths[0].is_dir():
-            sources.append(RecordingSource(drive, partial(read_packets, paths[0])))
+            files = paths[0] / "timestamps.txt", paths[0] / "data"
+            sources.append(RecordingSource(drive, partial(read_packets, paths[0]), files))
         elif split_of(drive) == split:
             sources += [
-                RecordingSource(_piece_name(path), partial(read_piece, path)) for path in paths
+                RecordingSource(_piece_name(path), partial(read_piece, path), (path,))
+                for path in paths
             ]
     if drives and not sources:
         problem = f"none of its drives falls into split '{split}'"

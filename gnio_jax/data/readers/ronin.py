@@ -61,7 +61,12 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
     folders = find_folders(root, lambda folder: (folder / _TABLE).is_file())
     chosen = read_list(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
     choose = split in ("train", "val")
-    return [RecordingSource(folder.name, partial(read, folder, choose)) for folder in chosen]
+    return [
+        RecordingSource(
+            folder.name, partial(read, folder, choose), (folder / _TABLE, folder / _INFO)
+        )
+        for folder in chosen
+    ]
 
 
 def read(folder: Path, choose: bool = False) -> list[Sequence]:

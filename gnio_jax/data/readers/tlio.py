@@ -39,7 +39,12 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
         root,
         DATASET.layout,
     )
-    return [RecordingSource(folder.name, partial(read, folder)) for folder in folders]
+    return [
+        RecordingSource(
+            folder.name, partial(read, folder), (folder / _TABLE, folder / _DESCRIPTION)
+        )
+        for folder in folders
+    ]
 
 
 def read(folder: Path) -> list[Sequence]:
