@@ -60,13 +60,13 @@ def remembered_displacements(
         to_start = remove_yaw(recording.attitude[ends - windows.window])
         # From the frame of the first attitude to that of each window's start.
         turns = to_start @ remove_yaw(attitude[:1])[0].T
-        kept = jax.tree.map(lambda leaf: np.asarray(leaf)[clones - 1 :], prediction)
+        of_windows = jax.tree.map(lambda leaf: np.asarray(leaf)[clones - 1 :], prediction)
         with np.errstate(divide="ignore"):
-            in_frame = np.asarray(kept.covariance(np.log(least_std), np.float64))
+            in_frame = np.asarray(of_windows.covariance(np.log(least_std), np.float64))
         places = slice(first + clones - 1, end)
-        value[places] = np.einsum("mij,mj->mi", turns, kept.displacement)
+        value[places] = np.einsum("mij,mj->mi", turns, of_windows.displacement)
         covariance[places] = turns @ in_frame @ turns.transpose(0, 2, 1)
-        for name, rows_of in kept.diagnostics.items():
+        for name, rows_of in of_windows.diagnostics.items():
             whole = diagnostics.setdefault(name, np.full((strides, *rows_of.shape[1:]), np.nan))
             whole[places] = rows_of
     return value, covariance, diagnostics

@@ -297,11 +297,11 @@ def measure(
         length = jnp.sqrt(jnp.sum(segment.displacement[..., :2] ** 2, axis=-1) + 1e-12)
         along = jnp.sum(prediction.displacement * segment.displacement, axis=-1) / length
         return SegmentValidation(
-            *(figures[name] for name in ("loss", "mse", "nll", "horizon")),
-            jnp.mean(error**2, axis=(0, 1)),
-            jnp.mean(error**2 * jnp.exp(-2 * prediction.log_std), axis=(0, 1)),
-            jnp.mean(along),
-            jnp.mean(length),
+            **figures,
+            axis_mse=jnp.mean(error**2, axis=(0, 1)),
+            axis_normalised=jnp.mean(error**2 * jnp.exp(-2 * prediction.log_std), axis=(0, 1)),
+            predicted=jnp.mean(along),
+            walked=jnp.mean(length),
         )
 
     figures = jax.vmap(one)(prediction, segments)

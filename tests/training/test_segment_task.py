@@ -26,7 +26,7 @@ from gnio_jax.training.recordings import set_up
 from gnio_jax.training.segment_task import BANDS, SegmentTask, horizon_error, validate
 from gnio_jax.training.task import gradient_of
 from gnio_jax.training.walk_segments import (
-    Grid,
+    SegmentGrid,
     cut_walks,
     draw_walks,
     grid_of,
@@ -99,7 +99,7 @@ def test_segments_are_cut_with_the_attitude_of_the_reference():
     assert len(source.earliest) == 4  # one of 4 s before and behind each hole
     chosen = jnp.array([source.earliest[0], source.latest[3]], np.int32)
     grid = grid_of(config)
-    assert grid == Grid(N, intervals, W, RATE)
+    assert grid == SegmentGrid(N, intervals, W, RATE)
     cut = jax.device_get(cut_walks(jax.device_put(source), chosen, unchanged(2), grid))
     for i, row in enumerate(chosen):
         signals, displacement = reference_segment(sequence, row % 700, intervals)
@@ -118,7 +118,7 @@ def test_a_frame_drifts_as_its_gyro_says():
     begins, and so are the samples."""
     config, sequence = dataclasses.replace(OFF, gyro_bias=0.5), walk()
     source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))
-    row, grid = source.earliest[:1], Grid(N, 20, W, RATE)
+    row, grid = source.earliest[:1], SegmentGrid(N, 20, W, RATE)
     plain, drifted = (
         jax.device_get(draw_walks(jax.random.key(2), source, row, grid, augment))
         for augment in (OFF, config)
@@ -138,7 +138,7 @@ def test_a_frame_drifts_as_its_gyro_says():
 def test_biases_are_constant_in_the_body():
     rng = np.random.default_rng(0)
     imu = jnp.asarray(rng.standard_normal((3, 40, 6)), jnp.float32)
-    rotation = Rotation.random(120, random_state=1).as_matrix().reshape(3, 40, 3, 3)
+    rotation = Rotation.from_rotvec(rng.standard_normal((120, 3))).as_matrix().reshape(3, 40, 3, 3)
     config = dataclasses.replace(OFF, gyro_bias=0.1, accel_bias=0.4)
     changed, drift = with_errors(jax.random.key(0), imu, jnp.asarray(rotation, jnp.float32), config)
     error = np.asarray(changed - imu).reshape(3, 40, 2, 3)
