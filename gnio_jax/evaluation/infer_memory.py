@@ -45,7 +45,7 @@ def remembered_displacements(
     rates = recording.gyro - recording.start.gyro_bias
     value, covariance = np.full((strides, 3), np.nan), np.full((strides, 3, 3), np.nan)
     diagnostics: dict[str, np.ndarray] = {}
-    for first, end in spans(measured):
+    for first, end in spans(measured).tolist():
         if end - first < clones:
             continue
         rows = slice(first * n, end * n)
