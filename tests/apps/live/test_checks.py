@@ -101,12 +101,23 @@ FLIP = np.array([-1.0, 1.0, 1.0])
     ("change", "problem"),
     [
         (lambda g, a: (-g, a), "gravity turns against the gyro"),
-        (lambda g, a: (g[:, SWAP], a[:, SWAP]), "gravity turns against the gyro"),
+        (lambda g, a: (g[:, SWAP], a[:, SWAP]), "against the gyro.*two axes of both sensors$"),
         (lambda g, a: (FLIP * g, FLIP * a), "gravity turns against the gyro"),
-        (lambda g, a: (np.degrees(g).clip(-90, 90), a), "its gyro looks like deg/s"),
-        (lambda g, a: (g[:, [1, 2, 0]], a), "gravity does not turn as the gyro says"),
+        (
+            lambda g, a: (np.degrees(g).clip(-90, 90), a),
+            "its gyro looks like deg/s.*--gyro-unit deg/s$",
+        ),
+        (lambda g, a: (g[:, [1, 2, 0]], a), "not turn as the gyro says.*the same axes$"),
+        (lambda g, a: (131 * np.degrees(g) / 5000, a), "raw counts.*or send it in rad/s$"),
     ],
-    ids=["gyro negated", "x and y exchanged", "x mirrored", "degrees", "axes of the gyro turned"],
+    ids=[
+        "gyro negated",
+        "x and y exchanged",
+        "x mirrored",
+        "degrees",
+        "axes of the gyro turned",
+        "counts",
+    ],
 )
 def test_sensors_that_contradict_each_other_end_the_stream(change, problem):
     """Nine seconds after its begin, or with the next look at it, as a recording is refused."""
