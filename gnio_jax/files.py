@@ -2,34 +2,49 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import errno
+import fcntl
 import hashlib
 import os
 import re
 import shutil
+import stat
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from gnio_jax.errors import InputError
+
 HDF5 = (".h5", ".hdf5")
 """Endings of the package's own files of recordings."""
+PART = ".gnio-"
+"""Part of the name of a file or folder that is not whole yet: .walk.gnio-1a2b3c4d.h5."""
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path`, which it replaces on success. On failure it is removed.
 
-    The folder is created if it is missing. A reader sees the old file or the whole new one.
+    The folder is created if it is missing. A reader sees the old file or the whole new one, which
+    is on the disk before it replaces the old one. A link stays, and the file that it names is
+    replaced. What killed processes left there is removed. Raises `InputError` if `path` is there
+    and is neither a file nor a folder: a pipe or a device would become a file.
     """
-    path = Path(path)
+    path = _target(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    remove_leftovers(path.parent)
+
+    def create() -> tuple[str, int]:
+        handle, name = tempfile.mkstemp(path.suffix, f".{path.stem}{PART}", path.parent)
+        return name, handle
+
+    temporary, handle = _locked(create)
     try:
         yield temporary
+        os.fsync(handle)  # it has the errors that some file systems report late
         umask = os.umask(0)
         os.umask(umask)
         # mkstemp makes it private: give it the mode of any other new file.
@@ -40,20 +55,78 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _target(path: str | os.PathLike[str]) -> Path:
+    """The file that is written for `path`: the one that a link names."""
+    path = Path(path)
+    if path.is_symlink():
+        path = Path(os.path.realpath(path))
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(path, "is a pipe or a device, not a file", "name a file")
+    return path
+
+
+def _locked(create: Callable[[], tuple[str, int]]) -> tuple[Path, int]:
+    """A new temporary file or folder with its open handle. Its lock shows other processes that it
+    is being written; the system removes it when this process ends, in whatever way."""
+    while True:
+        name, handle = create()
+        with contextlib.suppress(OSError):  # some file systems have no locks
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Another process may have taken it for a leftover before it was locked.
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(handle), os.stat(name)):
+                return Path(name), handle
+        os.close(handle)
+
+
+_LEFTOVER = re.compile(rf"\.(.+){re.escape(PART)}[a-z0-9_]{{8}}(\..*)?")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed processes were writing into a folder. What a process still writes is
+    locked and stays. A folder that was moved away to be replaced returns."""
+    with contextlib.suppress(OSError):
+        for path in list(folder.iterdir()):
+            if match := _LEFTOVER.fullmatch(path.name):
+                with contextlib.suppress(OSError):
+                    _remove_leftover(path, folder / match[1])
+
+
+def _remove_leftover(path: Path, target: Path) -> None:
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not stat.S_ISDIR(os.fstat(handle).st_mode):
+            path.unlink()
+            return
+        if (path / _OLD).exists() and not target.exists():
+            (path / _OLD).rename(target)
+        if (path / _CONTENTS).exists():
+            for child in (path / _CONTENTS).iterdir():
+                if not (path.parent / child.name).exists():
+                    child.rename(path.parent / child.name)
+        shutil.rmtree(path, ignore_errors=True)
+    finally:
+        os.close(handle)
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Raise `OSError` now if no file could be written at `path` later."""
-    path = Path(path)
+    """Raise `OSError` or `InputError` now if no file could be written at `path` later."""
+    path = _target(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     # The name is that of `replacing`, because a name can be too long.
-    _check_writable_folder(path.parent, f".{path.stem}.", path.suffix)
+    _check_writable_folder(path.parent, f".{path.stem}{PART}", path.suffix)
 
 
-def check_writable_folder(folder: Path) -> None:
-    """Raise `OSError` now if nothing could be written into `folder` later."""
-    _check_writable_folder(folder, ".probe.", "")
+def check_writable_folder(path: Path) -> None:
+    """Raise `OSError` now if no folder could be written at `path` later by `replacing_folder`."""
+    path = Path(os.path.realpath(path))
+    parent = path if _is_fixed(path) else path.parent
+    _check_writable_folder(parent, f".{path.name}{PART}", "")
 
 
 def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
@@ -62,11 +135,25 @@ def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
     existing = next(parent for parent in parents if parent.exists())
     try:
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=existing)
+    except FileNotFoundError:  # /proc, or a disk that was unplugged
+        raise InputError(existing, "takes no files", "name another folder") from None
     except OSError as error:
         error.filename = str(existing)  # the user does not know the temporary file
         raise
     os.close(handle)
     Path(name).unlink()
+
+
+def file_in(folder: Path, name: str | Path) -> Path:
+    """The file `name` in a folder, or the only one there whose name differs from it in case alone,
+    as systems that do not tell cases apart may have written it. The first if there is neither."""
+    path = folder / name
+    if path.exists():
+        return path
+    alike: list[str] = []
+    with contextlib.suppress(OSError):
+        alike = [other for other in os.listdir(path.parent) if other.lower() == path.name.lower()]
+    return path.with_name(alike[0]) if len(alike) == 1 else path
 
 
 def with_ending(path: Path, ending: str) -> Path:
@@ -122,17 +209,38 @@ def shown_name(name: str, length: int = 60) -> str:
     return text.replace("$", r"\$")
 
 
+_OLD, _CONTENTS = "old", "contents"
+"""Names inside a temporary folder of the folder that it replaces, or of what was in that."""
+
+
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
     """Yield an empty folder beside `path`. On success it replaces `path`; on failure it is removed
-    and `path` stays."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    and `path` stays.
+
+    The working folder and one that is mounted cannot be renamed: what is in them is replaced. Of a
+    link the folder is replaced that it names. Raises `InputError` if `path` is a file.
+    """
+    path = Path(os.path.realpath(path))
+    if path.exists() and not path.is_dir():
+        raise InputError(path, "is a file", "name a folder")
+    is_fixed = _is_fixed(path)
+    parent = path if is_fixed else path.parent
+    parent.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(parent)
+
+    def create() -> tuple[str, int]:
+        name = tempfile.mkdtemp(prefix=f".{path.name}{PART}", dir=parent)
+        return name, os.open(name, os.O_RDONLY)
+
+    temporary, handle = _locked(create)
     try:
-        new = temporary / "new"
+        new, old = temporary / "new", temporary / _OLD
         new.mkdir()
         yield new
-        old = temporary / "old"
+        if is_fixed:
+            _replace_contents(path, new, temporary)
+            return
         if path.exists():
             path.rename(old)
         try:
@@ -141,5 +249,32 @@ def replacing_folder(path: Path) -> Iterator[Path]:
             if old.exists():
                 old.rename(path)
             raise
+    except OSError as error:
+        # The user does not know the temporary folder.
+        if error.errno is not None:
+            error.filename = str(error.filename or path).replace(str(temporary / "new"), str(path))
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        os.close(handle)
+
+
+def _is_fixed(path: Path) -> bool:
+    """Whether a folder cannot be renamed, because it is mounted or has the working folder."""
+    return path.is_dir() and (os.path.ismount(path) or Path.cwd().is_relative_to(path))
+
+
+def _replace_contents(path: Path, new: Path, temporary: Path) -> None:
+    """Replace what is in the folder `path` by what is in `new`. On failure it is as before."""
+    contents = temporary / _CONTENTS
+    contents.mkdir()
+    moves: list[tuple[Path, Path]] = []
+    try:
+        for source, target in ((path, contents), (new, path)):
+            for child in [child for child in source.iterdir() if child != temporary]:
+                child.rename(target / child.name)
+                moves.append((child, target / child.name))
+    except OSError:
+        for origin, target in reversed(moves):
+            target.rename(origin)
+        raise

@@ -323,14 +323,15 @@ def yaw_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:
 
 def rotation_z(angle: Scalar) -> Matrix:
     """Rotation by `angle` (rad) about the world's z axis."""
-    return _rotation_z(jnp.cos(angle), jnp.sin(angle))
+    return heading_rotation(jnp.cos(angle), jnp.sin(angle))
 
 
 def yaw_rotation(rotation: Matrix) -> Matrix:
     """R_γ(R): the rotation by the yaw of `rotation` about z."""
-    return _rotation_z(*yaw_direction(rotation))
+    return heading_rotation(*yaw_direction(rotation))
 
 
-def _rotation_z(cosine: Scalar, sine: Scalar) -> Matrix:
+def heading_rotation(cosine: Scalar, sine: Scalar) -> Matrix:
+    """The rotation about z by the angle with this cosine and sine."""
     zero, one = jnp.zeros_like(cosine), jnp.ones_like(cosine)
     return jnp.array([[cosine, -sine, zero], [sine, cosine, zero], [zero, zero, one]])

@@ -137,3 +137,17 @@ class Prediction(NamedTuple):
         log_std = jnp.asarray(self.log_std)[..., : error.shape[-1]]
         log_std = log_std if least is None else jnp.maximum(log_std, least)
         return error**2 * jnp.exp(-2 * log_std), log_std
+
+
+class Memory(NamedTuple):
+    """The memory of a network that carries a state from one clone interval to the next, and the
+    frame in which it is expressed: gravity on z, and a heading of its own (`models.memory`)."""
+
+    network: Any
+    """The network's state: arrays in float32."""
+    heading: Float[Array, "2"]
+    """Cosine and sine of the yaw that turns the frame to the world; zeros before the first step."""
+    attitude: Float[Array, "3 3"]
+    """Attitude at the end of the last interval as it was estimated then, body → world."""
+    intervals: Int[Array, ""]
+    """Number of intervals since the memory began."""

@@ -139,6 +139,12 @@ def test_weights_that_are_loaded(tmp_path, monkeypatch):
     assert names["prediction"].displacement.shape == (2, 3)
 
 
+def test_a_network_with_memory_continues():
+    names = run("docs/networks_with_memory.md", code_of("docs/networks_with_memory.md"))
+    assert int(names["state"].memory.intervals) == 60 and int(names["state"].step) == 60
+    assert names["later"].accepted.shape == (30,)
+
+
 def test_a_head_of_ones_own(monkeypatch):
     """The network is known to a configuration, and its head has the place of GNIO's."""
     monkeypatch.setattr(registry, "_MODELS", dict(registry._MODELS))
@@ -172,13 +178,17 @@ def test_a_dataset_of_two_csv_files(walks, tmp_path):
     assert found.valid.all() and not data.self_check(found).failures
 
 
+def test_the_block_of_networks_with_memory():
+    run("docs/networks_with_memory.md", code_of("docs/networks_with_memory.md"))
+
+
 def test_the_imports_of_the_reference():
     run("docs/api/index.md", code_of("docs/api/index.md"))
 
 
 def test_every_block_that_runs_has_a_test():
     tested = {"README.md", "docs/differentiable_filter.md", "docs/networks.md", "docs/weights.md"}
-    tested |= {"docs/measurements.md", "docs/many_sequences.md"}
+    tested |= {"docs/measurements.md", "docs/many_sequences.md", "docs/networks_with_memory.md"}
     tested |= {"docs/api/index.md", "CONTRIBUTING.md"}
     assert {block.page for block in RUN} == tested
 

@@ -16,7 +16,8 @@ from gnio_jax import networks
 from gnio_jax.apps.importing import units
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.recording import RawRecording, as_sequence
-from gnio_jax.apps.track import estimate_recording, summarise
+from gnio_jax.apps.summary import summarise
+from gnio_jax.apps.track import estimate_recording
 from gnio_jax.config import ImportOptions
 from gnio_jax.data import physics
 from gnio_jax.data.parsing.stamps import check_seconds, first_stamp

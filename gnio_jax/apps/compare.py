@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gnio_jax.config import CompareConfig, EvaluateConfig
+from gnio_jax.data.contents import CONTENT
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import reuse, statistics, tabulate
 from gnio_jax.evaluation.folder import REMEDY, read
@@ -186,7 +187,9 @@ def _source(path: Path, config: CompareConfig) -> EvaluationSource:
     report = read(path)
     folder = Path(os.path.abspath(path)).parent
     run = folder.parent if folder.name == "eval" else folder
-    if path.resolve().parent.name == "eval" and (problem := reuse.find_change(report, run)):
+    in_run = path.resolve().parent.name == "eval"
+    problem = reuse.find_change(report, run) if in_run else ""
+    if problem := problem or reuse.find_other_recordings(report):
         raise InputError(path, problem, REMEDY)
     identity = {name: report.settings.get(name) for name in IDENTITY}
     return EvaluationSource(path, run, path, identity, report)
@@ -222,10 +225,16 @@ def _check_sources(sources: list[EvaluationSource]) -> None:
 
 
 def _check_recordings(folders: list[Path], reports: list[Report]) -> None:
-    """Raise `InputError` if recordings of one name have different lengths, or belong to different
-    people or sessions. The seeds of a row are checked too."""
+    """Raise `InputError` if recordings of one name have different lengths or files, or belong to
+    different people or sessions. The seeds of a row are checked too."""
     references: dict[str, tuple[Path, str, float]] = {}
+    contents: dict[str, tuple[Path, str]] = {}
     for folder, report in zip(folders, reports, strict=True):
+        for name, digests in report.settings.get("contents", {}).items():
+            first, content = contents.setdefault(name, (folder, digests[CONTENT]))
+            if content != digests[CONTENT]:
+                problem = f"recording {name} has other files here than in {first}"
+                raise InputError(folder, problem, f"evaluate it again, or {first}")
         for name, group in report.groups.items():
             seconds = report.settings["recordings"][name]
             first, *other = references.setdefault(name, (folder, group, seconds))
@@ -309,6 +318,9 @@ def explanations(comparison: Comparison) -> list[str]:
             "The rows are not of the same recordings, so their means cannot be compared, only "
             f"their differences. {rows[0].label} has {len(first)}; {others}."
         )
+    for row in rows:
+        gaps = dict.fromkeys(filter(None, map(tabulate.gaps, row.reports)))
+        remarks += [f"{row.label}: {line}" for line in gaps]
     if options := filter_options(comparison):
         remarks.append(f"The rows differ in options of the filter: {', '.join(options)}.")
     return remarks + tabulate.marks(cells)

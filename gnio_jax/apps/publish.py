@@ -13,7 +13,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import folder as results
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.report import Report
-from gnio_jax.evaluation.statistics import summarise
+from gnio_jax.evaluation.statistics import FEWEST_GROUPS, summarise
 from gnio_jax.files import file_stem
 from gnio_jax.networks import Card, TrainedNetwork
 from gnio_jax.networks.folder import evaluations_folder, has_card, write_published
@@ -74,17 +74,21 @@ def publish(
 
 
 def describe_data(network: TrainedNetwork) -> str:
-    """The training data of a network in words, with its measured error if there is one."""
+    """The training data of a network, in words."""
     if network.card is not None:
-        data, error = network.card.data, network.card.measured
-    else:
-        names = ", ".join(network.config.datasets)
-        data, error = f"dataset {names}, split {network.config.data.train_split}", ""
-        try:
-            error = _describe_error(_read_figures(network.path), network.config.datasets)
-        except InputError:
-            pass  # a damaged evaluation must not prevent tracking
-    return f"{data}, whose {error}" if error else data
+        return network.card.data
+    names = ", ".join(network.config.datasets)
+    return f"dataset {names}, split {network.config.data.train_split}"
+
+
+def describe_error(network: TrainedNetwork) -> str:
+    """The measured error of a network, in words; empty if it was not measured."""
+    if network.card is not None:
+        return network.card.measured
+    try:
+        return _describe_error(_read_figures(network.path), network.config.datasets)
+    except InputError:
+        return ""  # a damaged evaluation must not prevent tracking
 
 
 def _read_figures(path: Path | None) -> dict[str, Report]:
@@ -95,9 +99,10 @@ def _read_figures(path: Path | None) -> dict[str, Report]:
 
 
 def _describe_error(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
-    """The error that lists of networks show, in words, with that of each way of carrying. It is
-    that of the first evaluation that has it. Evaluations with the filter come first, then those on
-    the run's own datasets, then those on a test split. It is empty if no evaluation has it."""
+    """The error that lists of networks show, in words, with that of each way of carrying: the root
+    mean square of the horizontal error of a walk. It is that of the first evaluation that has it.
+    Evaluations with the filter come first, then those on the run's own datasets, then those on a
+    test split. It is empty if no evaluation has it."""
 
     def rank(name: str) -> tuple[bool, bool, bool, int, str]:
         settings = figures[name].settings
@@ -105,10 +110,12 @@ def _describe_error(figures: dict[str, Report], datasets: tuple[str, ...]) -> st
         return settings["estimator"] != "ekf", not of_run, not tested, len(name), name
 
     for name in sorted(figures, key=rank):
-        if (error := _cell(figures[name], SHOWN[0])) != tabulate.number(None, 0):
-            text = f"{tabulate.column(SHOWN[0]).heading} is {error} m on {name}"
-            by_placement = _by_placement(figures[name])
-            return f"{text} ({'; '.join(by_placement)})" if by_placement else text
+        error = _cell(figures[name], SHOWN[0], " m")
+        if not error.startswith(tabulate.number(None, 0)):
+            seconds = summarise([figures[name].scores], "duration", figures[name].groups).mean
+            length = "" if seconds is None else f" of {seconds:.0f} s"
+            facts = "; ".join((name, *_by_placement(figures[name])))
+            return f"typical error {error} on walks{length} ({facts})"
     return ""
 
 
@@ -126,13 +133,15 @@ def _by_placement(figures: Report) -> list[str]:
     ]
 
 
-def _cell(figures: Report, metric: str) -> str:
-    """The mean over the sequences with its 95 % interval."""
+def _cell(figures: Report, metric: str, unit: str = "") -> str:
+    """The mean over the sequences with its 95 % interval, or the number of groups if that is too
+    small for one."""
     summary = summarise([figures.scores], metric, figures.groups)
     digits = tabulate.column(metric).digits
-    text = tabulate.number(summary.mean, digits)
+    text = tabulate.number(summary.mean, digits) + unit
     if summary.interval is None:
-        return text
+        few = summary.mean is not None and summary.groups < FEWEST_GROUPS
+        return f"{text} ({summary.groups} group{'s' * (summary.groups > 1)})" if few else text
     low, high = (tabulate.number(bound, digits) for bound in summary.interval)
     return f"{text} ({low} to {high})"
 
@@ -185,7 +194,12 @@ def _write_text(
         for folder, evaluation in figures.items()
     ]
     means = "Means over sequences, with 95 % intervals over groups (people, sessions)."
-    table = f"{tabulate.markdown(header, rows)}\n{means}"
+    uneven = [
+        f"{folder}: {line}"
+        for folder, evaluation in figures.items()
+        for line in tabulate.unevenness(evaluation.summary().values())
+    ]
+    table = f"{tabulate.markdown(header, rows)}\n{' '.join([means, *uneven])}"
     fails = fails or ("Its publisher has not said. Try it on recordings like yours.",)
     return f"""# {name}
 

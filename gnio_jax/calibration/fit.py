@@ -32,12 +32,13 @@ from gnio_jax.filtering import (
     run_filter,
     sensitivity,
 )
-from gnio_jax.filtering.history import POSITION
+from gnio_jax.filtering.history import POSITION, YAW
 from gnio_jax.filtering.settings import (
     free_parameters,
     with_free_parameters,
     with_written_parameters,
 )
+from gnio_jax.filtering.state import arc_of, yaw_lever
 from gnio_jax.training.filter_losses import gaussian_nll, normalised_squares
 from gnio_jax.training.optimizer import FILTER_PARTS
 from gnio_jax.types import Array
@@ -320,6 +321,11 @@ class PositionErrors(NamedTuple):
     """The filter's covariance, m²."""
     sensitivity: Float[np.ndarray, "k 3 6"]
     """S of the position."""
+    with_yaw: Float[np.ndarray, "k 3"]
+    """The filter's covariance of the position with the yaw, m·rad; 0 with additive errors, where
+    no covariance has an arc."""
+    yaw_sensitivity: Float[np.ndarray, "k 6"]
+    """S of the yaw; 0 with additive errors."""
     raw_axis: Float[np.ndarray, "k 3"]
     """As `considered_covariance` takes it."""
 
@@ -354,9 +360,10 @@ def fit_considered(
             dataclasses.replace(settings, considered=initial),
             "considered.raw_gyro_bias",
         )
+    with_fitted = _add_considered(positions, fitted.considered)
     before, after = (
         float(jnp.mean(normalised_squares(positions.error, covariance))) / 3
-        for covariance in (positions.covariance, _add_considered(positions, fitted.considered))
+        for covariance in (positions.covariance, with_fitted)
     )
     return ConsiderFit(fitted, before, after)
 
@@ -384,9 +391,16 @@ def _fit_considered_below(
 
 
 def _add_considered(positions: PositionErrors, std: ConsideredStd) -> Array:
-    """The covariances of the positions, with the consider covariance."""
-    added = considered_covariance(positions.sensitivity, std, positions.raw_axis)
-    return positions.covariance + added
+    """The covariances of the positions, with the consider covariance as `with_considered` adds
+    it."""
+    rows = jnp.concatenate([positions.yaw_sensitivity[:, None], positions.sensitivity], axis=1)
+    added = considered_covariance(rows, std, positions.raw_axis)
+    covariance = positions.covariance + added[:, 1:, 1:]
+    arc, arc_before = (
+        arc_of(yaw_lever(with_yaw))
+        for with_yaw in (positions.with_yaw + added[:, 0, 1:], jnp.asarray(positions.with_yaw))
+    )
+    return covariance + arc - arc_before
 
 
 def compare_positions(
@@ -408,9 +422,9 @@ def compare_positions(
 @functools.partial(jax.jit, static_argnames="windows")
 def _run_walks(
     walks: BatchInputs, settings: FilterSettings, *, windows: DataConfig
-) -> tuple[Array, Array, Array, Array, Array]:
-    """For every walk: where the filter is healthy, its positions, their covariances and S, and the
-    axis of a raw gyro."""
+) -> tuple[Array, ...]:
+    """For every walk: where the filter is healthy, its positions, and the other parts of
+    `PositionErrors`."""
 
     def of_walk(settings: FilterSettings, walk: BatchInputs) -> tuple[Any, ...]:
         ekf = make_filter(windows, settings)
@@ -421,7 +435,11 @@ def _run_walks(
         derivatives = sensitivity(run, state, displacement)
         assert history.covariance is not None
         covariance = history.covariance[:, POSITION, POSITION]
+        of_position = covariance, derivatives[:, POSITION]
+        of_yaw = history.covariance[:, POSITION, YAW], derivatives[:, YAW]
+        if not ekf.config.invariant:
+            of_yaw = jax.tree.map(jnp.zeros_like, of_yaw)
         axis = jnp.tile(start.raw_axis[None], (len(covariance), 1))
-        return history.healthy, history.position, covariance, derivatives[:, POSITION], axis
+        return history.healthy, history.position, *of_position, *of_yaw, axis
 
     return over_sequences(of_walk, shared=1)(settings, walks)

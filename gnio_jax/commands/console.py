@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
+from rich.segment import Segment
+from rich.table import Column, Table
 from rich.text import Text
 
 import gnio_jax
@@ -45,6 +46,9 @@ def run(main: Callable[[], object]) -> None:
     signal.signal(signal.SIGTERM, _terminate)
     # Pictures are files. The backend of a notebook, which its commands inherit, may be missing.
     os.environ["MPLBACKEND"] = "agg"
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # it was closed before the start, as by >&-
+            setattr(sys, name, open(os.devnull, "w"))
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may have any bytes
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -149,6 +153,14 @@ class _Plain(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(without_controls(text), **options)
 
+    def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+        """Its parts without the controls in texts, such as names in the cells of a table. Rich's
+        own controls are parts of their own."""
+        for segment in super().render(renderable, options):
+            if segment.control is None:
+                segment = segment._replace(text=without_controls(segment.text))
+            yield segment
+
 
 def stdout() -> Console:
     """The console of results. Into a file or a pipe, lines are not cut to a terminal's width."""
@@ -157,8 +169,21 @@ def stdout() -> Console:
 
 
 def say(result: Any) -> None:
-    """Print a line of any length, or a table, on the console of results."""
-    stdout().print(result, soft_wrap=isinstance(result, str))
+    """Print a line of any length, or a table, on the console of results. Into a file or a pipe,
+    lines of tables have no blanks at their ends."""
+    console = stdout()
+    if isinstance(result, str) or console.is_terminal:
+        console.print(result, soft_wrap=isinstance(result, str))
+        return
+    with console.capture() as capture:
+        console.print(result)
+    for line in capture.get().splitlines():
+        console.print(line.rstrip(), soft_wrap=True)
+
+
+def shown_path(path: Path) -> Path:
+    """A path as people write it: below the working folder without that folder's name."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def columns(*names: str, **options: Any) -> Table:
@@ -217,13 +242,15 @@ def terminal(shown: bool = True) -> Iterator[Terminal]:
     from rich import progress  # late, because neither help nor errors need it
 
     console = _Plain(stderr=True)
+    # The times stand before the numbers, which are cut where a terminal is narrow.
+    cut = Column(ratio=1, no_wrap=True, overflow="ellipsis")
     columns = (
         progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
+        progress.BarColumn(bar_width=10),
         progress.TaskProgressColumn(),
-        progress.TextColumn("{task.fields[numbers]}"),
         progress.TimeElapsedColumn(),
         progress.TimeRemainingColumn(elapsed_when_finished=True),
+        progress.TextColumn("{task.fields[numbers]}", table_column=cut),
     )
     disable = not (shown and console.is_terminal)
     with progress.Progress(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,6 +13,7 @@ from rich.table import Table
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
 from gnio_jax.config.schema import UNNAMED
+from gnio_jax.errors import InputError
 from gnio_jax.files import file_stem
 
 ERRORS = ("ate", "ate_2d", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio")
@@ -49,6 +51,8 @@ def track(request: TrackOptions, call: options.Call) -> None:
       {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
           accel_z=az
     """
+    if not request.file.exists():
+        raise InputError(request.file, "no such file or folder")
     console.compile_quickly()
     import jax  # late, so that mistakes do not wait for it
 
@@ -64,15 +68,19 @@ def track(request: TrackOptions, call: options.Call) -> None:
         terminal.progress("compiling and tracking", 0.0)
         details = {"command": str(call), "rerun_file": request.rerun}
         result = tracking.track(recording, trained, out, request.format, **details)
-    for note in result.summary.notes:
-        console.say(f"  {note}")
-    console.say(_table(result.summary))
-    for warning in result.summary.warnings:
-        console.say(f"warning: {warning}")
     summary = result.summary
-    console.say(f"network: {summary.network}, trained on {summary.trained_on}")
-    console.say(result.summary.limits)
-    console.say(f"results: {result.folder} (look at track.png, report.html)")
+    no_walk = summary.warnings[:1] if math.isnan(summary.expected_error) else ()
+    for warning in no_walk:  # before every figure
+        console.say(f"warning: {warning}")
+    for note in summary.notes:
+        console.say(f"  {note}")
+    console.say(_table(summary))
+    for warning in summary.warnings[len(no_walk) :]:
+        console.say(f"warning: {warning}")
+    if not no_walk:  # what was measured are walks
+        measured = summary.measured or "its error was not measured (gnio evaluate)"
+        console.say(f"network {summary.network}: {measured}")
+    console.say(f"results: {result.folder} (open report.html, or look at track.png)")
 
 
 def _folder_name(name: str) -> str:
@@ -92,10 +100,13 @@ def _table(summary: Any) -> Table:
     grid.add_row("time", f"{summary.seconds:.1f} s")
     grid.add_row("path", f"{summary.path_length:.1f} m")
     grid.add_row("end from start", f"{summary.from_start:.1f} m")
-    grid.add_row("expected error at the end", f"{summary.expected_error:.1f} m")
-    grid.add_row("at rest (quieter than a hand)", f"{summary.rest:.0%}")
+    if not math.isnan(summary.expected_error):
+        grid.add_row("expected error at the end", f"{summary.expected_error:.1f} m")
+    if summary.steps is not None:
+        grid.add_row("time with steps", f"{summary.steps:.0%}")
+    grid.add_row("time at rest (quieter than a hand)", f"{summary.at_rest:.0%}")
     if summary.accepted is not None:
-        grid.add_row("displacements used", f"{summary.accepted:.0%}")
+        grid.add_row("displacements accepted", f"{summary.accepted:.0%}")
     for name in [metric for metric in ERRORS if metric in summary.errors]:
         column = tabulate.column(name)
         text = tabulate.number(summary.errors.get(name), column.digits)

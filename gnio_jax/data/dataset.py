@@ -30,7 +30,8 @@ class RecordingSource(NamedTuple):
     validated and on a uniform clock, but not self-checked. It raises `InputError` for a damaged
     file, and `Refusal` if the recording cannot be used."""
     files: tuple[Path, ...] = ()
-    """The files from which its sequences are made; some may be absent."""
+    """The files from which its sequences are made; some may be absent. A folder stands for all that
+    is in it."""
     slow: bool = False
     """Whether `read` is slow. Then the cache keeps its result, and processes share the work."""
     attributes: dict[str, Any] = {}

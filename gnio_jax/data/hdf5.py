@@ -11,6 +11,7 @@ import contextlib
 import functools
 import hashlib
 import json
+import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from gnio_jax.data.parsing.tables import hdf5_field, hdf5_node, parsed_as
+from gnio_jax.data.parsing.tables import hdf5_field, hdf5_node, parsed_as, shortened
 from gnio_jax.data.validation import validate
 from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
@@ -29,6 +30,10 @@ _FORMAT = "gnio-jax sequence 1"
 _OPTIONAL_FIELDS = ("device_orientation", "imu_valid")
 _FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")
 _WAYPOINTS = tuple(f"waypoints/{field}" for field in Waypoints._fields)
+_BLOCK = 1 << 20
+"""Bytes by which a file in memory grows."""
+_NUMBERS = {"start_time": -math.inf, "recorded_rate": 0.0, "accel_clipped": -1e-9}
+"""Attributes with which is computed, and the values above which they must be."""
 _ATTRIBUTE_TYPES = (str, bool, int, float, np.bool_, np.integer, np.floating)
 
 
@@ -43,8 +48,11 @@ def write_hdf5(path: str | os.PathLike[str], sequence: Sequence) -> None:
     are the group `waypoints`. Raises `InputError` for an attribute that is not a text, number or
     boolean.
     """
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with _in_memory() as file:
         _write(file, sequence, path)
+        content = _image(file)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
@@ -58,8 +66,24 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
     return _stored_sequence(stored, path)
 
 
+def _in_memory() -> h5py.File:
+    """A new HDF5 file in memory. On a full disk the library would leave data out without an
+    error, and may end the process."""
+    return h5py.File("memory", "w", driver="core", backing_store=False, block_size=_BLOCK)
+
+
+def _image(file: h5py.File) -> bytes:
+    """The bytes of a file in memory."""
+    file.flush()
+    return file.id.get_file_image()
+
+
 def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
-    group.attrs["format"], group.attrs["name"] = _FORMAT, sequence.name
+    group.attrs["format"] = _FORMAT
+    try:
+        group.attrs["name"] = sequence.name
+    except ValueError:  # bytes of a file's name that are no text, or a zero
+        raise InputError(path, f"the name {sequence.name!a} is no text", "rename it") from None
     for field in (*_FIELDS, *_OPTIONAL_FIELDS):
         if getattr(sequence, field) is not None:
             group.create_dataset(field, data=getattr(sequence, field))
@@ -68,10 +92,14 @@ def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
             group.create_dataset(f"waypoints/{field}", data=values)
     attributes = group.create_group("attributes").attrs
     for key, value in sequence.attributes.items():
+        remedy = "attributes are text, numbers or booleans"
         if not isinstance(value, _ATTRIBUTE_TYPES):
-            problem = f"attribute '{key}' is {type(value).__name__}"
-            raise InputError(path, problem, "attributes are text, numbers or booleans")
-        attributes[key] = value
+            raise InputError(path, f"attribute '{key}' is {type(value).__name__}", remedy)
+        try:
+            attributes[key] = value
+        except (ValueError, TypeError):
+            problem = f"attribute '{key}' is {shortened(ascii(value))}"
+            raise InputError(path, problem, remedy) from None
 
 
 _StoredGroup = tuple[dict[str, Any], dict[str, np.ndarray | None], dict[str, Any]]
@@ -110,9 +138,23 @@ def _stored_sequence(stored: _StoredGroup, path: Path) -> Sequence:
     if present.intersection(_WAYPOINTS):
         optional["waypoints"] = Waypoints(*map(field_values, _WAYPOINTS))
     name = str(header.get("name", path.stem))
-    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in attributes.items()}
+    plain = {key: _plain(key, value, path) for key, value in attributes.items()}
     required = map(field_values, _FIELDS)
     return validate(Sequence(name, *required, **optional, attributes=plain), path)
+
+
+def _plain(key: str, value: object, path: Path) -> str | bool | int | float:
+    """An attribute as a text, number or boolean. Raises `InputError` for anything else, and for one
+    of `_NUMBERS` that is no number."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    problem = f"attribute '{key}' is {shortened(ascii(plain))}"
+    if not isinstance(plain, str | bool | int | float):
+        raise InputError(path, f"{problem}, no text or number", "convert the recording again")
+    least = _NUMBERS.get(key)
+    if least is None or (isinstance(plain, int | float) and least < plain < math.inf):
+        return plain
+    remedy = "convert the recording again, or remove the attribute"
+    raise InputError(path, f"{problem}, no possible number", remedy)
 
 
 # --- the cache
@@ -174,12 +216,16 @@ def _sources() -> str:
 def write_reading(entry: Path, reading: Reading) -> None:
     """Keep a reading without damage, whole or not at all, in the place of earlier ones of the same
     recording. If nothing can be written, recordings are read every time."""
-    with contextlib.suppress(OSError), replacing(entry) as temporary:
-        with h5py.File(temporary, "w") as file:
+    # HDF5 refuses some texts by ValueError, and an image larger than the memory by RuntimeError.
+    with contextlib.suppress(OSError, ValueError, RuntimeError, MemoryError):
+        with _in_memory() as file:
             file.attrs["notes"] = json.dumps(reading.notes)
             file.attrs["refusals"] = json.dumps(reading.refusals)
             for number, sequence in enumerate(reading.sequences):
                 _write(file.create_group(f"{number:04}"), sequence, entry)
+            content = _image(file)
+        with replacing(entry) as temporary:
+            temporary.write_bytes(content)
     recording, _, _ = entry.name.partition("-")
     for other in entry.parent.glob(f"{recording}-*.h5"):
         if other != entry:  # a process that reads it now finishes; others read anew

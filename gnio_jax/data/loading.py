@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -23,18 +22,24 @@ from gnio_jax.types import Sequence
 # --- the sequences of a split
 
 
+class DamagedRecording(UserWarning):
+    """A recording is left out, because a file of it is damaged. Where this warning is an error
+    (`warnings.simplefilter("error", DamagedRecording)`), the damage is raised instead."""
+
+
 def load(
     name: str,
     root: str | os.PathLike[str] | None = None,
     split: str = "test",
     workers: int = 1,
     progress: Progress = silent,
+    left_out: dict[str, str] | None = None,
 ) -> list[Sequence]:
     """The sequences of a split of a dataset, validated and self-checked, at its native rate, in the
     order of its recordings. `resample` changes the rate.
 
-    Recordings that cannot be used, or that fail the physical self-check, are left out with a
-    warning. Sequences, warnings and errors do not depend on the number of workers.
+    Recordings that are damaged, that cannot be used, or that fail the physical self-check, are left
+    out with a warning. Sequences, warnings and errors do not depend on the number of workers.
 
     Args:
         name: The dataset, one of `names()`.
@@ -43,12 +48,14 @@ def load(
         workers: Number of processes that read the recordings that are slow to read and not in the
             cache yet.
         progress: A function that gets the finished share of these recordings.
+        left_out: It gets the reason for each recording that is left out, by its name.
 
     Raises:
-        InputError: The name or the split is unknown, the folder is missing, a file is damaged, two
-            sequences have one name, or the split has no sequence.
+        InputError: The name or the split is unknown, the folder is missing, all recordings are
+            damaged, or one is and the split is a fold, which depends on all; two sequences have one
+            name, or the split has no sequence.
     """
-    return list(load_each(name, root, split, workers, progress))
+    return list(load_each(name, root, split, workers, progress, left_out))
 
 
 def load_each(
@@ -57,6 +64,7 @@ def load_each(
     split: str = "test",
     workers: int = 1,
     progress: Progress = silent,
+    left_out: dict[str, str] | None = None,
 ) -> Iterator[Sequence]:
     """The sequences of `load` one after another, if together they do not fit into memory.
 
@@ -66,15 +74,26 @@ def load_each(
         split: A split, a fold of one, or all but a fold.
         workers: Number of processes that read.
         progress: A function that gets the finished share.
+        left_out: It gets the reason for each recording that is left out.
     """
-    if fold := parse_fold(split):
-        return iter(fold.select(load_each(name, root, fold.split, workers, progress)))
+    fold, (dataset, folder, whole) = parse_fold(split), find_split(name, root, split)
+    strict = fold is not None
+    sequences = read_split(dataset, folder, whole, workers, progress, left_out, strict)
+    return sequences if fold is None else iter(fold.select(sequences))
+
+
+def find_split(
+    name: str, root: str | os.PathLike[str] | None, split: str
+) -> tuple[Dataset, Path, str]:
+    """The dataset, its folder, and the split that the dataset knows, of which `split` may be a
+    fold. Raises `InputError` if one of them does not exist."""
+    fold = parse_fold(split)
+    split = split if fold is None else fold.split
     dataset = get(name)
     # If lists at the root define the splits, the reader knows them.
     if dataset.list_splits is None:
         check_split(dataset, split, dataset.splits)
-    folder = find_root(name, root) if dataset.needs_root else Path(root or ".")
-    return read_split(dataset, folder, split, workers, progress)
+    return dataset, find_root(name, root) if dataset.needs_root else Path(root or "."), split
 
 
 def read_split(
@@ -83,12 +102,17 @@ def read_split(
     split: str,
     workers: int = 1,
     progress: Progress = silent,
+    left_out: dict[str, str] | None = None,
+    strict: bool = False,
 ) -> Iterator[Sequence]:
-    """The sequences of `load_each` for a `Dataset`, which need not be registered."""
+    """The sequences of `load_each` for a `Dataset`, which need not be registered. With `strict` the
+    first damage is raised."""
     recordings = dataset.recordings(root, split)
     if not recordings:
         refuse_empty_split(dataset, root, split, "sequence")
-    names, left_out = set(), []
+    reasons = {} if left_out is None else left_out
+    names, implausible = set(), []
+    damages: dict[str, InputError] = {}
     refused: dict[str, list[str]] = {}  # reason without the file -> all whole lines
     for recording, reading in zip(
         recordings, _read_all(recordings, workers, progress), strict=True
@@ -98,9 +122,10 @@ def read_split(
         for reason in reading.refusals:
             why = reason.partition(": ")[2]
             refused.setdefault(why, []).append(f"{recording.name}: left out: {reason}")
+            reasons[recording.name] = reason
         if reading.damage is not None:
-            _warn_of_refusals(refused)
-            raise reading.damage
+            damages[recording.name] = reading.damage
+            reasons[recording.name] = str(reading.damage)
         for sequence in map(dataset.with_origin, reading.sequences):
             if sequence.name in names:
                 problem = f"two sequences of split '{split}' have the name '{sequence.name}'"
@@ -108,19 +133,36 @@ def read_split(
             names.add(sequence.name)
             failures = check_sequence(sequence, dataset).failures if dataset.needs_root else ()
             if failures:
-                text = f"{sequence.name}: left out by the self-check: {'; '.join(failures)}"
-                warnings.warn(text, stacklevel=2)
-                left_out.append(sequence.name)
+                reason = f"the self-check: {'; '.join(failures)}"
+                warnings.warn(f"{sequence.name}: left out by {reason}", stacklevel=2)
+                implausible.append(sequence.name)
+                reasons[sequence.name] = reason
             else:
                 yield sequence
+        if damages and (strict or names):  # a split of which all is damaged is an error below
+            _warn_of_damages(damages, strict)
+            damages.clear()
     _warn_of_refusals(refused)
+    if damages:
+        raise next(iter(damages.values()))
     if not names:
         problem = f"none of the {len(recordings)} recordings of split '{split}' can be used"
         raise InputError(root, problem, "see the warnings above")
-    if len(left_out) == len(names):
-        problem = f"none of {len(left_out)} sequences passes the physical self-check"
+    if len(implausible) == len(names):
+        problem = f"none of {len(implausible)} sequences passes the physical self-check"
         remedy = "see the warnings above; check units, frames and time offset of the recordings"
-        raise InputError(", ".join(left_out[:3]), problem, remedy)
+        raise InputError(", ".join(implausible[:3]), problem, remedy)
+
+
+def _warn_of_damages(damages: dict[str, InputError], strict: bool) -> None:
+    """Warn of damaged recordings, or raise the first damage."""
+    for name, damage in damages.items():
+        if strict:
+            raise damage
+        try:
+            warnings.warn(DamagedRecording(f"{name}: left out: {damage}"), stacklevel=3)
+        except DamagedRecording:
+            raise damage from None
 
 
 def _warn_of_refusals(refused: dict[str, list[str]]) -> None:
@@ -161,11 +203,7 @@ def _read_all(
     for recording in recordings:
         if id(recording) in in_pool and not died:
             try:
-                reading = next(readings)
-                if reading.damage is not None:  # an error ends the work
-                    with suppress(InputError):
-                        readings.throw(reading.damage)
-                yield reading
+                yield next(readings)
                 continue
             except ProcessDied:  # this process reads the remaining ones
                 died = True

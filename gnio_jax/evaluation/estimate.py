@@ -34,6 +34,7 @@ from gnio_jax.filtering import (
     run_filter,
     run_odometry,
     sensitivity,
+    with_considered,
 )
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION, explain_failure
@@ -48,7 +49,7 @@ from gnio_jax.numerics import (
     yaw_rotation,
 )
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Array, Prediction, Waypoints
+from gnio_jax.types import Array, Waypoints
 
 PERFECT_STD = 0.01
 """Standard deviation of the true displacements that a `perfect` filter is given, m per axis."""
@@ -252,11 +253,10 @@ def _run(
             history = run_filter(ekf, state, *signals, displacement, covariance, valid)[1]
         else:
             frame = ekf.config.displacement_frame
-            predict = functools.partial(_predict, apply, variables)
+            predict = Network(apply, variables).predict(keep)
             history = run_odometry(predict, ekf, state, *signals, valid)[1]
-        diagonal, whole = history.covariance_diagonal, history.covariance
-        assert whole is not None
-        position = whole[:, POSITION, POSITION]
+        covariances = history.covariance
+        assert covariances is not None
         if ekf.considered is not None:
             displacement, covariance = history.given(ekf.noise)
 
@@ -267,15 +267,12 @@ def _run(
             derivatives = sensitivity(repeat_run, state, displacement)
             axis = jnp.tile(inputs.start.raw_axis[None], (len(derivatives), 1))
             added = considered_covariance(derivatives, ekf.considered, axis)
-            diagonal = diagonal + jnp.diagonal(added, axis1=1, axis2=2)
-            position = position + added[:, POSITION, POSITION]
-        return history._replace(covariance_diagonal=diagonal, covariance=position)
+            covariances = with_considered(covariances, added, ekf.config)
+        diagonal = jnp.diagonal(covariances, axis1=1, axis2=2)
+        of_position = covariances[:, POSITION, POSITION]
+        return history._replace(covariance_diagonal=diagonal, covariance=of_position)
 
     return over_sequences(run)(inputs)
-
-
-def _predict(apply: Callable, variables: Any, windows: Array) -> Prediction:
-    return keep(apply(variables, windows))
 
 
 def _convert_history(

@@ -104,7 +104,10 @@ def evaluate(
     def stage(name: str) -> Progress:
         return functools.partial(reporter.progress, name)
 
-    sequences = data.load(config.dataset, config.data_root, config.split, workers, stage("reading"))
+    unread: dict[str, str] = {}
+    sequences = data.load(
+        config.dataset, config.data_root, config.split, workers, stage("reading"), unread
+    )
     for sequence in sequences:
         if sequence.waypoints is not None and config.alignment not in ("origin", "yaw_position"):
             problem = f"has waypoints, and no --alignment {config.alignment}"
@@ -150,7 +153,7 @@ def evaluate(
         {row: score(of, config.alignment) for row, of in compared.items() if of},
         {recording.name: recording.group for recording in recordings},
         {result.name: list(result.notes) for result in estimates if result.notes},
-        left_out,
+        unread | left_out,
         {recording.name: recording.placement for recording in recordings if recording.placement},
     )
     folder = folder_of(path, config, trained.config)
@@ -274,6 +277,7 @@ def _describe_settings(
         "recordings": {
             sequence.name: round(float(np.ptp(sequence.time)), 3) for sequence in sequences
         },
+        "contents": data.describe_contents(config.dataset, config.data_root, config.split),
         "estimator": config.estimator,
         "coupling": config.coupling if config.estimator == "ekf" else None,
         "orientation_source": config.orientation,

@@ -39,7 +39,7 @@ from gnio_jax.reporting import Progress, silent
 
 PAGE = "report.html"
 REMEDY = "evaluate the run anew with gnio evaluate"
-SHARED = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "step")
+SHARED = ("dataset", "split", "data_root", "recordings", "contents", "model", "checkpoint", "step")
 """Settings that evaluations must share to be shown together."""
 
 

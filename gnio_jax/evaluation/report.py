@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from gnio_jax.evaluation import statistics
 from gnio_jax.evaluation.metrics import Measures
 from gnio_jax.evaluation.statistics import MetricSummary, Scores
 
-DEFINITIONS = 3
+DEFINITIONS = 4
 """Version of the meaning of the figures of metrics.json, in its `settings`. Raise it with every
 change after which the figures of older files cannot be compared with newer ones: another definition
 of a metric, of divergence or of a mean, or a new field that tables need."""
@@ -109,6 +109,7 @@ def from_json(content: Mapping[str, Any]) -> Report:
     texts = [settings[name] for name in ("dataset", "split", "estimator", "alignment")]
     valid = [isinstance(text, str) for text in texts]
     valid += [math.isfinite(settings["recordings"][name]) for name in sequences]
+    valid += [len(digests["files"] + digests["sha256"]) > 0 for digests in _contents(settings)]
     if not sequences or not all(valid) or not isinstance(settings["filter"], dict):
         raise ValueError
     rows = {name: row["sequences"] for name, row in content["reference_rows"].items()}
@@ -128,6 +129,11 @@ def from_json(content: Mapping[str, Any]) -> Report:
     if plain != (sequences, rows, content["left_out"]):
         raise ValueError
     return report
+
+
+def _contents(settings: Mapping[str, Any]) -> Iterable[Mapping[str, str]]:
+    """The digests of the recordings; none for a dataset that is computed."""
+    return settings.get("contents", {}).values()
 
 
 def _scores_of(sequences: Mapping[str, Any]) -> dict[str, Measures]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
+from gnio_jax import data
 from gnio_jax.config import EvaluateConfig, to_plain
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import evaluate, folder_of, resolve
@@ -48,7 +49,11 @@ def find_existing(config: EvaluateConfig) -> RequestedEvaluation:
     if (folder / "metrics.json").exists():
         try:
             report = read(folder)
-            problem = _find_difference(report, config) or find_change(report, path)
+            problem = (
+                _find_difference(report, config)
+                or find_change(report, path)
+                or find_other_recordings(report)
+            )
         except InputError as error:
             problem = f"its figures cannot be used: {error}"
     return RequestedEvaluation(config, folder, None if problem else report, problem)
@@ -74,6 +79,17 @@ def find_change(report: Report, path: Path) -> str:
     else:
         current = report.settings.get("weights") == read_settings(path).digest
     return "" if current else "its figures are of weights that the network has no more"
+
+
+def find_other_recordings(report: Report) -> str:
+    """The reason why the figures are not of the recordings that are there now; empty if they
+    are."""
+    settings = report.settings
+    data_root = settings.get("data_root")
+    change = data.find_change(
+        settings["dataset"], data_root, settings["split"], settings.get("contents", {})
+    )
+    return f"its figures are of other recordings: {change}" if change else ""
 
 
 def _find_difference(report: Report, config: EvaluateConfig) -> str:

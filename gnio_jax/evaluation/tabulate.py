@@ -185,6 +185,7 @@ def marks(cells: Sequence[Cell]) -> list[str]:
         "No interval: the sequences compared are of one person or session.": any(
             difference.groups == 1 and not difference.withheld for difference in differences
         ),
+        **dict.fromkeys(unevenness(differences), True),
         "A difference is over the sequences that both rows have with every seed, and on which no "
         "error is infinite; a mean is over all that a row has with every seed.": any(
             difference.compared < difference.sequences for difference in differences
@@ -202,6 +203,27 @@ def marks(cells: Sequence[Cell]) -> list[str]:
         ),
     }
     return [line for line, applies in conditions.items() if applies]
+
+
+def unevenness(figures: Iterable[MetricSummary | Difference]) -> list[str]:
+    """A line about the intervals, if one group has most of the sequences of any of the figures."""
+    uneven = [figure for figure in figures if figure.interval and statistics.is_uneven(figure)]
+    if not uneven:
+        return []
+    worst = max(uneven, key=lambda figure: figure.largest)
+    count = worst.sequences if isinstance(worst, MetricSummary) else worst.compared
+    share = f"One of {worst.groups} people or sessions has {worst.largest} of {count} sequences"
+    return [f"{share}, so the interval may be too narrow."]
+
+
+def few_groups(summaries: Iterable[MetricSummary]) -> str:
+    """The reason why means have no interval, if they are of too few groups; else empty."""
+    counts = {summary.groups for summary in summaries if summary.mean is not None}
+    few = sorted(counts - {count for count in counts if count >= statistics.FEWEST_GROUPS})
+    if not few:
+        return ""
+    groups = f"{' or '.join(map(str, few))} group{'s' if few != [1] else ''}"
+    return f"no interval of a mean over {groups}: it needs {statistics.FEWEST_GROUPS}"
 
 
 # --- how the figures were made
@@ -239,8 +261,9 @@ def describe(settings: Mapping[str, Any]) -> dict[str, str]:
     if settings.get("reference") == "waypoints":
         choices["alignment"] = TO_WAYPOINTS
     if settings.get("model"):
-        network = f"{settings['model']}, checkpoint {settings['checkpoint']}"
-        choices["network"] = f"{network}, step {settings['step']}"
+        latest = ", latest checkpoint" if settings["checkpoint"] == "latest" else ""
+        name = settings.get("network") or settings["model"]
+        choices["network"] = f"{name} ({settings['model']}, step {settings['step']}{latest})"
         choices["windows"] = windows(settings)
     return {name: str(value) for name, value in choices.items() if value}
 
@@ -253,8 +276,8 @@ def windows(settings: Mapping[str, Any]) -> str:
 
 
 def remarks(report: Report) -> list[str]:
-    """Notes about sequences: each note once with its sequences, the sequences that were left out
-    with the reason, and those that diverged."""
+    """Notes about intervals and about sequences: each note once with its sequences, the sequences
+    that were left out with the reason, and those that diverged."""
     sequences_of: dict[str, list[str]] = {}
     for name, notes in report.notes.items():
         for note in notes:
@@ -263,8 +286,25 @@ def remarks(report: Report) -> list[str]:
         f"{', '.join(names) if len(names) < 4 else f'{len(names)} sequences'}: {note}"
         for note, names in sequences_of.items()
     ]
-    lines += [f"left out: {name}: {reason}" for name, reason in report.left_out.items()]
+    summaries = report.summary().values()
+    lines += filter(None, (few_groups(summaries), *unevenness(summaries)))
+    left_out: dict[str, list[str]] = {}  # end of the reason, without the file -> names
+    for name, reason in report.left_out.items():
+        left_out.setdefault(reason.partition(": ")[2] or reason, []).append(name)
+    for names in left_out.values():
+        reason = report.left_out[names[0]]
+        several = f"{len(names)} recordings for one reason, the first: " if names[1:] else ""
+        lines.append(f"left out: {several}{names[0]}: {reason}")
     return lines + [f"{name}: the estimate diverged, and is in no mean" for name in report.diverged]
+
+
+def gaps(report: Report) -> str:
+    """A line about the recordings that the figures do not have; empty if there is none."""
+    if not report.left_out:
+        return ""
+    names, count = list(report.left_out), len(report.left_out)
+    listed = ", ".join([*names[:3], *(["..."] if names[3:] else [])])
+    return f"{count} of {count + len(report.scores)} recordings were left out: {listed}"
 
 
 # --- files

@@ -6,7 +6,7 @@ The network is any function from windows to a `Prediction`.
 
 from gnio_jax.config import ConsideredStd, CorrelatedError, FilterSettings, InitialStd, NoiseModel
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
-from gnio_jax.filtering.consider import considered_covariance, sensitivity
+from gnio_jax.filtering.consider import considered_covariance, sensitivity, with_considered
 from gnio_jax.filtering.displacement import displacements
 from gnio_jax.filtering.filter import Filter, make_filter
 from gnio_jax.filtering.fix import Fix, fixes_on_intervals
@@ -59,4 +59,5 @@ __all__ = [
     "sensitivity",
     "smooth",
     "waypoint_poses",
+    "with_considered",
 ]

@@ -289,6 +289,8 @@ def checked_state(state: FilterState, ekf: Filter) -> FilterState:
         raise ValueError(f"state.correlated: {problem}")
     dtype = jnp.float32 if config.allow_float32 else jnp.float64
     shapes = state_shapes(config, noise, dtype)
+    # Only the network knows the shapes of its memory (`network.first_memory`).
+    memory, state = state.memory, state._replace(memory=None)
     if state.window is not None:
         shapes = shapes._replace(window=jax.ShapeDtypeStruct((config.reach, 7), dtype))
 
@@ -306,7 +308,7 @@ def checked_state(state: FilterState, ekf: Filter) -> FilterState:
     core, clones = np.arange(len(state.core_covariance)), np.arange(len(state.clone_covariance))
     check_covariance("state.core_covariance", state.core_covariance, core)
     check_covariance("state.clone_covariance", state.clone_covariance, clones // 3 % 2)
-    return state
+    return state._replace(memory=memory)
 
 
 def checked_displacements(

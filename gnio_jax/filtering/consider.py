@@ -6,10 +6,11 @@ displacement of uncertain heading corrects the yaw with its own error. But a cov
 these errors is too small. Let c be the omitted errors, constant over a recording, with E[c cᵀ] = C,
 and let S = ∂x̂/∂c be the sensitivity of the estimate x̂. The covariance of its error is then
 
-    P + S C Sᵀ.
+    P + S C Sᵀ,
 
-The estimate, its gains and its innovations do not change. c has the error of the first gyro bias
-(3, rad/s) and an error of all displacements u of a walk (ours):
+and where the filter's error is the invariant one, the second order of an uncertain yaw is that of
+this sum (`with_considered`). The estimate, its gains and its innovations do not change. c has the
+error of the first gyro bias (3, rad/s) and an error of all displacements u of a walk (ours):
 
     d = exp(s) Rz(ψ) u + γ |u_xy| e_z,
 
@@ -38,8 +39,9 @@ from gnio_jax.filtering.checks import check_numbers
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.history import FilterHistory
 from gnio_jax.filtering.scan import Measure
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.smoother import SmoothedHistory
-from gnio_jax.filtering.state import FilterState, Mean
+from gnio_jax.filtering.state import FilterState, Mean, arc_covariance
 from gnio_jax.types import Array
 
 T = TypeVar("T")
@@ -70,6 +72,22 @@ def considered_covariance(
         along = jnp.einsum("kdi,ki->kd", sensitivity[:, :, OF_BIAS], raw_axis)
         root = jnp.concatenate([root, std.raw_gyro_bias * along[:, :, None]], axis=2)
     return jnp.einsum("kic,kjc->kij", root, root)
+
+
+def with_considered(
+    covariance: Float[Array, "k 15 15"], added: Float[Array, "k 15 15"], config: FilterConfig
+) -> Float[Array, "k 15 15"]:
+    """The covariances of θ, v, p, b_g, b_a that a filter or a smoother with `config` reports, with
+    S C Sᵀ = `added`.
+
+    In the invariant form the arc of the place (`state.arc_covariance`) is that of the yaw's whole
+    uncertainty. The arc has no part in the yaw's own rows, so the reported covariance shows the
+    filter's part of it.
+    """
+    total = covariance + added
+    if not config.invariant:
+        return total
+    return total + arc_covariance(total) - arc_covariance(covariance)
 
 
 def disturb(displacement: Float[Array, "k 3"], c: Float[Array, "6"]) -> Float[jax.Array, "k 3"]:

@@ -17,7 +17,7 @@ from gnio_jax.filtering.state import Mean
 from gnio_jax.filtering.update import Outcome
 from gnio_jax.types import Array
 
-VELOCITY, POSITION, GYRO_BIAS = slice(3, 6), slice(6, 9), slice(9, 12)
+YAW, VELOCITY, POSITION, GYRO_BIAS = 2, slice(3, 6), slice(6, 9), slice(9, 12)
 """Rows of these in the history's covariances, which are of θ, v, p, b_g, b_a."""
 
 

@@ -1,25 +1,137 @@
-"""The network in the filter's loop: its window, its prediction, and the resulting measurement."""
+"""The network in the filter's loop: its window or its memory, its prediction, and the resulting
+measurement.
+
+A network with memory sees each sample once, at the attitude that the filter has then. Its frame has
+gravity on z. The yaw of this frame is carried with the memory: when an update turns the filter's
+attitude about z, the frame turns by the same angle (`models.memory`), so the network never sees a
+step of the yaw, and recent samples remain consistent with each other. The frame of the prediction
+therefore has the error δθ_z of the filter's own yaw, as the frame of a window has, and the
+displacement is linearised in the same way (`displacement.linearise_displacement`, frame "own").
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
+from gnio_jax import geometry
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
-from gnio_jax.types import Array, Prediction
+from gnio_jax.types import Array, Memory, Prediction
 from gnio_jax.windows import cut_window
 
 Predict = Callable[[Any], Prediction]
 """From windows with their context (1, C + N, 6) float32, channels [accel m/s², gyro rad/s], to a
 `Prediction` with the same leading axis."""
+
+
+@runtime_checkable
+class PredictWithMemory(Protocol):
+    """A network that carries a memory from one clone interval to the next."""
+
+    def begin(self, dtype: Any) -> Memory:
+        """An empty memory, whose attitude is of this type."""
+        ...
+
+    def step(
+        self, memory: Memory, samples: Float[Array, "n 6"], attitude: Float[Array, "3 3 n+1"]
+    ) -> tuple[Memory, Prediction]:
+        """The memory after the n samples of one clone interval, and the displacement over the last
+        window, in the frame of this memory.
+
+        samples: [accel m/s², gyro rad/s] in the body, without their biases; attitude: body → world,
+        at each sample and at the end of the interval.
+        """
+        ...
+
+
+class Recall(NamedTuple):
+    """What a network with memory predicts at the end of a clone interval."""
+
+    prediction: Prediction
+    """In the frame of the memory; NaN where there is no whole window."""
+    heading: Float[Array, "2"]
+    """Cosine and sine of the yaw that turns this frame to the world."""
+
+
+MemoryStep = Callable[[Any, FilterState, Imu], tuple[Memory, Recall]]
+"""From the memory and the filter's state at the start of a clone interval, and its samples, to the
+memory and the prediction at its end."""
+
+
+def has_memory(predict: Predict | PredictWithMemory) -> TypeGuard[PredictWithMemory]:
+    """Whether this is a network with memory."""
+    return isinstance(predict, PredictWithMemory)
+
+
+def first_memory(predict: PredictWithMemory, ekf: Filter, state: FilterState) -> Memory:
+    """The memory at the start of a run: that of the state, or an empty one. Raises `ValueError` if
+    the state has the memory of another network, and for windows that a network with memory has
+    not."""
+    if ekf.config.window_rotation != "per_sample":
+        problem = "a network with memory rotates every sample with its own attitude"
+        raise ValueError(f"ekf.config.window_rotation: {problem}: it must be 'per_sample'")
+    memory = predict.begin(state.offset.dtype)
+    if state.memory is None:
+        return memory
+    shapes, state_shapes = (
+        jax.tree.map(lambda leaf: (jnp.shape(leaf), leaf.dtype), tree)
+        for tree in (memory, state.memory)
+    )
+    if shapes != state_shapes:
+        raise ValueError("state.memory: is the memory of another network")
+    return state.memory
+
+
+def memory_step(predict: PredictWithMemory, ekf: Filter) -> MemoryStep:
+    """The network's step in every clone interval.
+
+    There is a prediction where the memory has seen the whole window and the filter has made W
+    intervals. An interval in which the filter coasts empties the memory. Raises `ValueError` if
+    `predict` does not return what the filter needs.
+    """
+    config = ekf.config
+
+    def advance(memory: Memory, state: FilterState, imu: Imu) -> tuple[Memory, Recall]:
+        rates, forces = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
+        attitude = geometry.integrate_turns(state.rotation, rates * config.dt)
+        samples = jnp.concatenate([forces, rates], axis=1)
+        memory, prediction = predict.step(memory, samples, attitude)
+        _check(jax.tree.map(lambda leaf: leaf[None], prediction))
+        prediction = jax.tree.map(_make_floating, prediction)
+        if imu.gap is not None:
+            coasted, empty = jnp.any(imu.gap.used == 0), predict.begin(state.offset.dtype)
+            memory = jax.tree.map(lambda x, new: jnp.where(coasted, new, x), memory, empty)
+        window = config.clones_per_window
+        whole = (memory.intervals >= window) & (state.step >= window)
+        displacement = jnp.where(whole, prediction.displacement, jnp.nan)
+        return memory, Recall(prediction._replace(displacement=displacement), memory.heading)
+
+    return advance
+
+
+def recalled_displacement(
+    ekf: Filter, recall: Recall, state: FilterState, oldest: Array | int
+) -> tuple[Displacement, dict[str, Array]]:
+    """The displacement that a network with memory measures, in the yaw frame of the oldest clone,
+    with its diagnostics."""
+    dtype = state.offset.dtype
+    to_world = geometry.heading_rotation(*recall.heading.astype(dtype))
+    turn = geometry.matmul(geometry.yaw_rotation(state.clone_rotation[oldest]).T, to_world)
+    covariance = recall.prediction.covariance(ekf.config.log_std_min, dtype)
+    covariance = geometry.matmul(geometry.matmul(turn, covariance), turn.T)
+    displacement = recall.prediction.displacement.astype(dtype)
+    turned = geometry.matmul(turn, displacement[:, None])[:, 0]
+    symmetric = 0.5 * (covariance + covariance.T)
+    measured = scaled_displacement(turned, symmetric, ekf.noise, ekf.config.displacement_frame)
+    return measured, recall.prediction.diagnostics
 
 
 def network_measurement(

@@ -126,17 +126,17 @@ def _interval_noise(
     walk = jnp.repeat(jnp.stack([noise.gyro_bias_walk, noise.accel_bias_walk]) ** 2 * dt, 3)
     # The gyro's noise and the walks as one product of 9 rows.
     of_gyro = effect[:, :3]
-    right = [of_gyro * gyro_variance[None, None], by_bias * walk[None, :, None]]
-    left, right = (
+    weighted_parts = [of_gyro * gyro_variance[None, None], by_bias * walk[None, :, None]]
+    effects, weighted = (
         jnp.concatenate([part.reshape(9, -1) for part in parts], axis=1)
-        for parts in ([of_gyro, by_bias], right)
+        for parts in ([of_gyro, by_bias], weighted_parts)
     )
     # The accelerometer's noise is isotropic, so its rotations cancel in R Rᵀ: each sample adds one
     # number for each pair of v and p.
     gains = np.stack([np.zeros(n), np.ones(n), (n - 0.5 - np.arange(n)) * dt])
     pairs = dt**2 * np.einsum("il,jl->ijl", gains, gains).astype(dtype)
     of_accel = jnp.kron(pairs @ accel_variance, np.eye(3, dtype=dtype))
-    motion = left @ right.T + of_accel
+    motion = effects @ weighted.T + of_accel
     mixed = jnp.sum(by_bias, axis=2) * walk[None]
     motion_rows = jnp.concatenate([motion, mixed], axis=1)
     bias_rows = jnp.concatenate([mixed.T, jnp.diag(n * walk)], axis=1)
@@ -239,7 +239,7 @@ def _replace_clone_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     covariance, _, entry = primals
     d_covariance, d_rows, _ = tangents
     index = np.arange(len(covariance))
-    kept = ((index < entry) | (index >= entry + CLONE)).astype(covariance.dtype)
+    unchanged = ((index < entry) | (index >= entry + CLONE)).astype(covariance.dtype)
     nothing = jnp.zeros_like(covariance)
-    changed = put(nothing, d_rows * kept[None], entry, 0) + put(nothing, d_rows.T, 0, entry)
-    return _replace_clone(*primals), d_covariance * kept[:, None] * kept[None] + changed
+    changed = put(nothing, d_rows * unchanged[None], entry, 0) + put(nothing, d_rows.T, 0, entry)
+    return _replace_clone(*primals), d_covariance * unchanged[:, None] * unchanged[None] + changed

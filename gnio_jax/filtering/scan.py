@@ -21,7 +21,17 @@ from gnio_jax.filtering.displacement import Displacement, scaled_displacement
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.gaps import Imu, after_window, bridge
 from gnio_jax.filtering.history import FilterHistory, StepRecord, finished_history
-from gnio_jax.filtering.network import Predict, network_measurement
+from gnio_jax.filtering.network import (
+    MemoryStep,
+    Predict,
+    PredictWithMemory,
+    Recall,
+    first_memory,
+    has_memory,
+    memory_step,
+    network_measurement,
+    recalled_displacement,
+)
 from gnio_jax.filtering.propagation import (
     Transition,
     core_transition,
@@ -38,7 +48,7 @@ from gnio_jax.filtering.state import (
     unroll_clones,
 )
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
-from gnio_jax.types import Array
+from gnio_jax.types import Array, Memory
 
 T = TypeVar("T")
 
@@ -100,7 +110,7 @@ def _run_filter(
 
 
 def run_odometry(
-    predict: Predict,
+    predict: Predict | PredictWithMemory,
     ekf: Filter,
     state: FilterState,
     gyro: Any,
@@ -121,11 +131,15 @@ def run_odometry(
     the first `FilterConfig.first_measured` intervals after the start, which have no whole window. A
     window in which the filter coasted through a gap is no measurement.
 
+    A network with memory (`PredictWithMemory`) is called once in every interval, with the samples
+    of this interval alone. Its memory is carried from interval to interval, and the final state has
+    it. It begins anew behind an interval in which the filter coasted.
+
     Jit it from outside. It is also differentiable in the values that `predict` closes over.
 
     Args:
         predict: A function from windows (1, C + N, 6) float32, N = n·W, channels [accel m/s², gyro
-            rad/s], to a `Prediction` with the same leading axis.
+            rad/s], to a `Prediction` with the same leading axis; or a network with memory.
         ekf: The filter (`Filter`, `make_filter`).
         state: The start (`initial_state`, `level_state`), or the final state of an earlier run.
         gyro: (K·n, 3) angular rate, body frame, rad/s, raw: the filter subtracts its bias.
@@ -142,6 +156,10 @@ def run_odometry(
     """
     inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
     config, begun = ekf.config, inputs.state.window is not None
+    if has_memory(predict):
+        memory = first_memory(predict, inputs.ekf, inputs.state)
+        measure_recalled = functools.partial(_measure_recalled, inputs.ekf)
+        return _run(measure_recalled, inputs, None, memory_step(predict, inputs.ekf), memory)
     of_window = network_measurement(predict, inputs.ekf)
 
     def measure(
@@ -161,14 +179,22 @@ def run_odometry(
     return _run(measure, inputs, None)
 
 
+def _measure_recalled(
+    ekf: Filter, _: Array, __: Imu, recall: Recall, state: FilterState, oldest: Array
+) -> tuple[Displacement, dict]:
+    return recalled_displacement(ekf, recall, state, oldest)
+
+
 def _run(
     measure: Callable[..., tuple[Displacement, dict]],
     inputs: FilterInputs,
     displacement: Displacement | None,
+    remember: MemoryStep | None = None,
+    memory: Memory | None = None,
 ) -> tuple[FilterState, FilterHistory]:
     """The state and the history of `clone_steps`."""
     state, records, age = clone_steps(
-        measure, inputs, displacement, lambda slot, _, record, __: record
+        measure, inputs, displacement, lambda slot, _, record, __: record, remember, memory
     )
     config = inputs.ekf.config
     history = finished_history(records, age, inputs.state.healthy, config)
@@ -186,6 +212,8 @@ def clone_steps(
     inputs: FilterInputs,
     displacement: Displacement | None,
     keep: Callable[[Array, FilterState, StepRecord, StepTrace], T],
+    remember: MemoryStep | None = None,
+    memory: Memory | None = None,
 ) -> tuple[FilterState, T, Float[Array, "k"]]:
     """Bridge holes of the stream and take a clone step for every interval. Returns the state at the
     end, whose clones are a ring, the stacked results of `keep`, and the age of the oldest held
@@ -195,28 +223,34 @@ def clone_steps(
     network's diagnostics: `number` counts the intervals from 0; `stream` is the whole stream behind
     the last `FilterConfig.reach` samples before it; `row` is the interval's row of `displacement`,
     and `oldest` the slot of the oldest clone. keep(slot, state, record, trace) takes the slot of
-    the newest clone and what `clone_step` returns.
+    the newest clone and what `clone_step` returns. A network with memory takes its own step before
+    the filter does, remember(memory, state, imu), and what it returns is the interval's `row`.
     """
     ekf, start, config = inputs.ekf, inputs.state, inputs.ekf.config
     signals = inputs.gyro, inputs.accel, inputs.imu_valid
-    stream, age, memory = bridge(*signals, start.imu, config)
+    stream, age, imu_memory = bridge(*signals, start.imu, config)
     n = config.samples_per_clone
     by_interval = jax.tree.map(lambda x: x.reshape(-1, n, *x.shape[1:]), stream)
     age = age.reshape(-1, n).max(1)
     with_past, window = after_window(stream, start.window, config)
 
-    def step(state: FilterState, row: tuple) -> tuple[FilterState, T]:
-        number, imu, displacement, measurements = row
+    def step(
+        carry: tuple[FilterState, Memory | None], row: tuple
+    ) -> tuple[tuple[FilterState, Memory | None], T]:
+        (state, memory), (number, imu, displacement, measurements) = carry, row
+        if remember is not None:
+            memory, displacement = remember(memory, state, imu)
         measure_now = functools.partial(measure, number, with_past, displacement)
         slot = number % config.clones
         state, record, trace = clone_step(ekf, state, imu, slot, measure_now, measurements)
-        return state, keep(slot, state, record, trace)
+        return (state, memory), keep(slot, state, record, trace)
 
-    rows = jnp.arange(len(age)), by_interval, displacement, inputs.measurements
-    start = invariant_errors(start._replace(window=None), config)
-    state, kept = blocked_scan(step, start, rows, config.checkpoint_every, config.truncate_every)
-    memory = memory._replace(quiet=state.imu.quiet)
-    return state._replace(imu=memory, window=window), kept, age
+    inputs_by_interval = jnp.arange(len(age)), by_interval, displacement, inputs.measurements
+    start = invariant_errors(start._replace(window=None, memory=None), config)
+    lengths = config.checkpoint_every, config.truncate_every
+    (state, memory), rows = blocked_scan(step, (start, memory), inputs_by_interval, *lengths)
+    imu_memory = imu_memory._replace(quiet=state.imu.quiet)
+    return state._replace(imu=imu_memory, window=window, memory=memory), rows, age
 
 
 # One clone interval

@@ -39,7 +39,7 @@ from jaxtyping import Bool, Float, Int
 from gnio_jax.config import InitialStd, NoiseModel
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.geometry import hat, matmul
-from gnio_jax.types import Array
+from gnio_jax.types import Array, Memory
 
 CORE, CLONE = 21, 6
 """Number of entries of the error state: of the core without b, and of each clone."""
@@ -151,6 +151,9 @@ class FilterState(NamedTuple):
     """The last `FilterConfig.reach` samples before the state, with holes bridged: gyro rad/s, accel
     m/s², raw, and whether the filter used the sample. A later run needs them for the network's
     first windows. None at a start, and inside a run."""
+    memory: Memory | None = None
+    """The memory of a network that has one, with which a later run continues. None at a start, and
+    inside a run."""
 
     @property
     def position(self) -> Float[Array, "*k 3"]:
@@ -163,7 +166,6 @@ class FilterState(NamedTuple):
         return Mean(self.rotation, self.velocity, self.position, self.gyro_bias, self.accel_bias)
 
 
-# One program in place of thirty, which take three times as long at the first call.
 def gyro_bias_covariance(
     rotation: Float[Array, "3 3"], vertical: Array | float, level: Array | float
 ) -> Float[Array, "3 3"]:
@@ -174,6 +176,7 @@ def gyro_bias_covariance(
     return vertical**2 * eye + (level**2 - vertical**2) * (eye - up[:, None] * up[None, :])
 
 
+# One program in place of thirty, which take three times as long at the first call.
 @functools.partial(jax.jit, static_argnames="clones")
 def without_clones(
     pose: Mean, std: InitialStd, clones: int, level_gyro_bias: Array | float | None = None
@@ -189,8 +192,8 @@ def without_clones(
     nothing, unknown = jnp.zeros(3, dtype), jnp.full(3, jnp.nan, dtype)
     # Standard deviations of tilt, yaw, v, o, b_g, b_a, a, s.
     parts = (*std[:3], 0.0, std.gyro_bias, std.accel_bias, std.position, 0.0)
-    each = jnp.stack([jnp.asarray(part, dtype) for part in parts])
-    core_std = jnp.repeat(each, np.array([2, 1, 3, 3, 3, 3, 3, 3]), total_repeat_length=CORE)
+    stds = jnp.stack([jnp.asarray(part, dtype) for part in parts])
+    core_std = jnp.repeat(stds, np.array([2, 1, 3, 3, 3, 3, 3, 3]), total_repeat_length=CORE)
     covariance = jnp.diag(core_std**2)
     if level_gyro_bias is not None:
         of_bias = gyro_bias_covariance(pose.rotation, std.gyro_bias, level_gyro_bias)
@@ -260,19 +263,29 @@ def first_order_covariance(state: FilterState) -> Float[Array, "15 15"]:
     return additive_core(state, additive_core(state, covariance).T)
 
 
-def arc_covariance(covariance: Float[Array, "15 15"]) -> Float[Array, "15 15"]:
+def arc_covariance(covariance: Float[Array, "*k 15 15"]) -> Float[Array, "*k 15 15"]:
     """The second order (ours) of an error ψ of the yaw in the covariance of θ, v, p, b_g, b_a.
 
     Velocity and position lie on an arc: an error ψ moves them by ψ e_z × l − ½ ψ² l, where l is
     their horizontal lever. With the variance σ² of ψ, E[ψ⁴] = 3 σ⁴, the second moment of the last
     term is ¾ σ⁴ l lᵀ, and σ² e_z × l is their covariance with ψ.
     """
-    yaw = covariance[:, THETA.stop - 1]
-    zero = jnp.zeros_like(yaw[:1])
-    lever = jnp.concatenate(
-        [zero, zero, zero, yaw[4:5], -yaw[3:4], zero, yaw[7:8], -yaw[6:7], jnp.zeros_like(yaw[8:])]
-    )
-    return 0.75 * lever[:, None] * lever[None]
+    yaw = covariance[..., THETA.stop - 1]
+    of_velocity, of_position = yaw_lever(yaw[..., VELOCITY]), yaw_lever(yaw[..., OFFSET])
+    nothing = jnp.zeros_like(of_velocity)
+    lever = [nothing, of_velocity, of_position, nothing, nothing]
+    return arc_of(jnp.concatenate(lever, axis=-1))
+
+
+def yaw_lever(with_yaw: Float[Array, "*k 3"]) -> Float[Array, "*k 3"]:
+    """σ² l, from the covariance σ² e_z × l of a velocity or a position with the yaw."""
+    x, y, z = jnp.moveaxis(with_yaw, -1, 0)
+    return jnp.stack([y, -x, jnp.zeros_like(z)], axis=-1)
+
+
+def arc_of(lever: Float[Array, "*k d"]) -> Float[Array, "*k d d"]:
+    """¾ σ⁴ l lᵀ, from σ² l."""
+    return 0.75 * lever[..., :, None] * lever[..., None, :]
 
 
 # The ring of clones and its anchor
@@ -324,11 +337,11 @@ def _additive_clones(state: FilterState, rows: Float[Array, "m k"]) -> Float[Arr
 def move_anchor(state: FilterState, anchored: Float[Array, ""]) -> FilterState:
     """The state with the anchor moved up to the present position if `anchored` is 1, and unchanged
     if it is 0."""
-    wanted = anchored > 0
+    moves = anchored > 0
     return state._replace(
-        anchor=jnp.where(wanted, state.anchor + state.offset, state.anchor),
-        offset=jnp.where(wanted, 0.0, state.offset),
-        move=jnp.where(wanted, state.offset, state.move),
+        anchor=jnp.where(moves, state.anchor + state.offset, state.anchor),
+        offset=jnp.where(moves, 0.0, state.offset),
+        move=jnp.where(moves, state.offset, state.move),
     )
 
 

@@ -33,12 +33,21 @@ from gnio_jax.filtering.consider import (
     core_sensitivity,
     start_tangents,
     step_with_tangents,
+    with_considered,
 )
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory, describe_failure, finished_history
-from gnio_jax.filtering.network import Predict, network_measurement
+from gnio_jax.filtering.network import (
+    Predict,
+    PredictWithMemory,
+    first_memory,
+    has_memory,
+    memory_step,
+    network_measurement,
+    recalled_displacement,
+)
 from gnio_jax.filtering.propagation import integrate
 from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid
 from gnio_jax.filtering.scan import Measure, clone_step
@@ -54,7 +63,7 @@ from gnio_jax.filtering.state import (
     unroll_clones,
 )
 from gnio_jax.filtering.zero_velocity import quiet_samples
-from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
+from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array, Memory
 
 
 class Pose(NamedTuple):
@@ -105,6 +114,8 @@ class Core(NamedTuple):
     """Number of clone steps so far."""
     tangents: Tangents | None
     """Derivatives of the filter by the errors that it does not estimate; None: there are none."""
+    memory: Memory | None
+    """The memory of a network that has one."""
 
 
 class Tracker:
@@ -139,7 +150,7 @@ class Tracker:
 
     def __init__(
         self,
-        predict: Predict,
+        predict: Predict | PredictWithMemory,
         ekf: Filter,
         state: FilterState | None = None,
         *,
@@ -160,6 +171,7 @@ class Tracker:
         if start is None:  # The programs are compiled for the shapes of any start.
             zeros = jnp.zeros(3, dtype)
             start = initial_state(ekf, jnp.eye(3, dtype=dtype), zeros, zeros)
+        self._predict = predict
         core = self._start(start)
         self._advance, self._look_ahead = compile_programs(predict, core, self._ekf)
         if state is None:
@@ -218,7 +230,7 @@ class Tracker:
             return None
         config, core = self._ekf.config, _copy(self._core)
         state = unroll_clones(core.filter, int(core.intervals) % config.clones)
-        return state._replace(window=core.window)
+        return state._replace(window=core.window, memory=core.memory)
 
     @property
     def delay(self) -> float:
@@ -252,11 +264,13 @@ class Tracker:
         window = state.window
         if window is None:
             window = jnp.zeros((config.reach, 7), state.offset.dtype)
-        state = invariant_errors(state._replace(window=None), config)
+        remembers = has_memory(self._predict)
+        memory = first_memory(self._predict, self._ekf, state) if remembers else None
+        state = invariant_errors(state._replace(window=None, memory=None), config)
         tangents = None if self._ekf.considered is None else start_tangents(state)
         # Copies, because the compiled step takes the memory of its argument, which no other array,
         # nor two of its fields, may share.
-        core = _copy(Core(state, window, jnp.int32(0), tangents))
+        core = _copy(Core(state, window, jnp.int32(0), tangents, memory))
         flags = jnp.stack([jnp.nan, jnp.nan, state.healthy, 0.0]).astype(window.dtype)
         self._core: Core | None = core
         estimate = device_pose(self._ekf, state, flags, tangents)
@@ -301,7 +315,7 @@ def rest_problem(rows: Float[np.ndarray, "n 7"], config: FilterConfig) -> tuple[
 
 
 def compile_programs(
-    predict: Predict, core: Core, ekf: Filter
+    predict: Predict | PredictWithMemory, core: Core, ekf: Filter
 ) -> tuple[Callable[..., tuple[Core, DevicePose]], Callable[..., tuple[DevicePose, ImuMemory]]]:
     """`advance` and `look_ahead`, compiled for cores like this one."""
     rows = jax.ShapeDtypeStruct((ekf.config.samples_per_clone, 7), core.window.dtype)
@@ -315,23 +329,32 @@ def compile_programs(
 def advance(
     core: Core,
     rows: Float[Array, "n 7"],
-    predict: Predict,
+    predict: Predict | PredictWithMemory,
     ekf: Filter,
 ) -> tuple[Core, DevicePose]:
     """One clone step, as `run_odometry` makes it, from the n grid samples (gyro, accel, valid) of
     its interval. The network is not called if the window is no measurement."""
     config, valid = ekf.config, rows[:, VALID] > 0
-    imu, age, memory = bridge(rows[:, GYRO], rows[:, ACCEL], valid, core.filter.imu, config)
+    signals = rows[:, GYRO], rows[:, ACCEL], valid
+    imu, age, imu_memory = bridge(*signals, core.filter.imu, config)
     assert imu.gap is not None
     newest = jnp.concatenate([imu.gyro, imu.accel, imu.gap.used[:, None]], axis=1)
     window = jnp.concatenate([core.window[config.samples_per_clone :], newest])
-    complete = core.filter.step >= config.clones_per_window
-    complete = complete & jnp.all(window[:, VALID] > 0)
-    measure_window = network_measurement(predict, ekf)
-    latest = Imu(window[:, GYRO], window[:, ACCEL], None)
+    memory = core.memory
+    if has_memory(predict):
+        memory, recall = memory_step(predict, ekf)(memory, core.filter, imu)
 
-    def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
-        return measure_window(complete, lambda: latest, state, oldest)[0], {}
+        def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
+            return recalled_displacement(ekf, recall, state, oldest)[0], {}
+
+    else:
+        complete = core.filter.step >= config.clones_per_window
+        complete = complete & jnp.all(window[:, VALID] > 0)
+        measure_window = network_measurement(predict, ekf)
+        latest = Imu(window[:, GYRO], window[:, ACCEL], None)
+
+        def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
+            return measure_window(complete, lambda: latest, state, oldest)[0], {}
 
     def step(state: FilterState, measure: Measure) -> tuple[FilterState, FilterHistory]:
         slot = core.intervals % config.clones
@@ -341,13 +364,13 @@ def advance(
         (state, history), tangents = step(core.filter, measure), None
     else:
         state, history, tangents = step_with_tangents(step, core.filter, core.tangents, measure)
-    state = state._replace(imu=memory._replace(quiet=state.imu.quiet))
+    state = state._replace(imu=imu_memory._replace(quiet=state.imu.quiet))
     rate, force = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
     quiet = jnp.all(valid) & jnp.all(quiet_samples(rate, force, config))
     flags = [history.accepted[0], history.nis[0], history.healthy[0]]
     flags = jnp.stack([*flags, quiet.astype(flags[0].dtype)])
     estimate = device_pose(ekf, state, flags, tangents)
-    return Core(state, window, core.intervals + 1, tangents), estimate
+    return Core(state, window, core.intervals + 1, tangents, memory), estimate
 
 
 def advance_filter(
@@ -392,7 +415,8 @@ def device_pose(
     covariance = core_covariance(state, ekf.config)
     if tangents is not None and ekf.considered is not None:
         sensitivity = core_sensitivity(state.mean, tangents)
-        covariance = covariance + considered_covariance(sensitivity[None], ekf.considered)[0]
+        added = considered_covariance(sensitivity[None], ekf.considered)
+        covariance = with_considered(covariance[None], added, ekf.config)[0]
     return DevicePose(state.mean, covariance, flags)
 
 

@@ -296,15 +296,18 @@ def correct(
     """Mean and covariance after an update, and its correction, which is zero if the measurement was
     not accepted.
 
-    A measurement of a quantity that is fixed to the world is given as `in_world`. Its update does
-    not know less of that quantity at another estimate, so P is reduced over the errors δx at the
-    new one.
+    A measurement of a quantity that is fixed to the world is given as `in_world`. Its Jacobian over
+    the errors ξ depends on the estimate, so the update is made again with the Jacobian at the
+    estimate that the first one reached, as in an iterated EKF (Bell and Cathey 1993). Mean,
+    covariance and smoother then have one gain.
     """
     correction = jax.tree.map(lambda rows: jnp.where(outcome.accepted, rows, 0.0), correction)
     moved = moved_mean(state, correction, step)
     if in_world is not None and step.config.invariant:
-        _, correction = project(moved, in_world, step)
+        linear = linearised_again(in_world, state, moved, correction, step)
+        _, correction = project(moved, linear, step)
         correction = jax.tree.map(lambda rows: jnp.where(outcome.accepted, rows, 0.0), correction)
+        moved = moved_mean(state, correction, step)
     cross = matmul(correction.core.T, correction.clones)
     reduced = moved._replace(
         core_covariance=downdate(state.core_covariance, correction.core),
@@ -314,14 +317,44 @@ def correct(
     return reduced, outcome, correction
 
 
-def moved_mean(state: FilterState, correction: Correction, step: Step) -> FilterState:
-    """The state with the mean after a correction."""
+def linearised_again(
+    linear: Linearised, state: FilterState, moved: FilterState, correction: Correction, step: Step
+) -> Linearised:
+    """A measurement at the estimate x_1 = `moved`, to which `correction` has moved `state`: its
+    residual is r(x_1) + H(x_1) e, with the error e of that correction.
+
+    With r(x_1) = r − J Δx for the moved velocity and positions this is r + J (δx − Δx), where
+    δx = ξ − hat(x_1 − c) θ. The difference is of second order.
+    """
+    moves = {
+        "velocity": moved.velocity - state.velocity,
+        "position": moved.position - state.position,
+        "since_oldest": since_oldest(moved, step.oldest) - since_oldest(state, step.oldest),
+    }
+    blocks = {part: block for part, block in linear.jacobian.items() if part in moves}
+    core, clones = (error[:, None] for error in error_of(correction))
+    residual = linear.residual
+    for part, block in with_turns(blocks, moved, step.oldest).items():
+        error = measurable_errors([part], core, clones, step.oldest)
+        residual = residual + matmul(block, error)[:, 0]
+    for part, block in blocks.items():
+        residual = residual - matmul(block, moves[part][:, None])[:, 0]
+    return linear._replace(residual=residual)
+
+
+def error_of(correction: Correction) -> tuple[Float[Array, "n"], Float[Array, "c"]]:
+    """The error e of core and clones by which a correction moves the mean."""
     # A reduction is used on purpose: its result is kept, but a sum that is written out would be
     # computed again for every entry that the correction of the mean reads.
-    core, clones = (
-        jnp.sum(correction.residual[:, None] * rows, axis=0)
-        for rows in (correction.core, correction.clones)
+    whitened = correction.residual[:, None]
+    return jnp.sum(whitened * correction.core, axis=0), jnp.sum(
+        whitened * correction.clones, axis=0
     )
+
+
+def moved_mean(state: FilterState, correction: Correction, step: Step) -> FilterState:
+    """The state with the mean after a correction."""
+    core, clones = error_of(correction)
     return retract(state, core, clones.reshape(-1, CLONE), step)
 
 
@@ -394,8 +427,8 @@ def whiten(
     return tuple(solve(part) for part in rows), volume
 
 
-def _dot(left: list[Array], right: list[Array]) -> Array | float:
-    return sum((x * y for x, y in zip(left, right, strict=False)), start=0.0)
+def _dot(row: list[Array], column: list[Array]) -> Array | float:
+    return sum((x * y for x, y in zip(row, column, strict=False)), start=0.0)
 
 
 @whiten.defjvp

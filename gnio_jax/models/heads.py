@@ -40,11 +40,13 @@ class GatedHead(nn.Module):
 
 
 class LinearHead(nn.Module):
-    """d̂ = W h + b: the ablation without a gate."""
+    """d̂ = W h + b: the ablation without a gate. With two outputs the vertical is 0."""
+
+    outputs: int = 3
 
     @nn.compact
     def __call__(self, h: Float[Array, "b d"]) -> tuple[Float[Array, "b 3"], dict[str, Array]]:
-        return linear(3, "displacement")(h), {}
+        return to_axes(linear(self.outputs, "displacement")(h)), {}
 
 
 class UncertaintyHead(nn.Module):

@@ -15,9 +15,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from jaxtyping import Float
 
+from gnio_jax.models import memory as with_memory
 from gnio_jax.models.layers import EPSILON
-from gnio_jax.types import Prediction
+from gnio_jax.types import Array, Memory, Prediction
 
 
 class InferenceVariables(NamedTuple):
@@ -38,6 +40,36 @@ class Inference:
     def __call__(self, ready: InferenceVariables, windows: jax.Array) -> Prediction:
         return self.model.apply(ready.variables, windows, **ready.constants)  # type: ignore[return-value]
 
+    @property
+    def has_memory(self) -> bool:
+        """Whether the network carries a memory from interval to interval (`models.memory`)."""
+        return isinstance(self.model, with_memory.NetworkWithMemory)
+
+
+@dataclass(frozen=True, eq=False)
+class Stepwise:
+    """A network with memory and its variables, as the filter takes it
+    (`filtering.network.PredictWithMemory`)."""
+
+    model: with_memory.NetworkWithMemory
+    ready: InferenceVariables
+    select: Callable[[Prediction], Prediction]
+    """A function of every prediction, which may leave out some of its diagnostics."""
+
+    def begin(self, dtype: Any = float) -> Memory:
+        """An empty memory."""
+        return with_memory.begin(self.model, self.ready.variables, dtype)
+
+    def step(
+        self, memory: Memory, samples: Float[Array, "n 6"], attitude: Float[Array, "3 3 n+1"]
+    ) -> tuple[Memory, Prediction]:
+        """See `models.memory.step`."""
+        variables, constants = self.ready
+        after, prediction = with_memory.step(
+            self.model, variables, memory, samples, attitude, **constants
+        )
+        return after, self.select(prediction)
+
 
 class Network(NamedTuple):
     """A network with its parameters."""
@@ -52,6 +84,23 @@ class Network(NamedTuple):
         """A network prepared for inference: quantities that depend only on its parameters are
         computed here, once."""
         return cls(Inference(model), inference_variables(model, variables))
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the network carries a memory from interval to interval."""
+        return isinstance(self.apply, Inference) and self.apply.has_memory
+
+    def predict(
+        self, select: Callable[[Prediction], Prediction] = lambda prediction: prediction
+    ) -> Any:
+        """The network as the filter takes it: a function of windows, or a network with memory.
+        `select` is applied to every prediction."""
+        apply, variables = self
+        if self.has_memory:
+            assert isinstance(apply, Inference)
+            assert isinstance(apply.model, with_memory.NetworkWithMemory)
+            return Stepwise(apply.model, variables, select)
+        return lambda windows: select(apply(variables, windows))
 
 
 @functools.partial(jax.jit, static_argnames="model")

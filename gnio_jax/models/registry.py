@@ -26,17 +26,25 @@ from gnio_jax.models.ctin import CTIN
 from gnio_jax.models.deepils import DeepILS
 from gnio_jax.models.equivariance import CanonicalFrame, FourHeadings
 from gnio_jax.models.gnio import GNIO
+from gnio_jax.models.gru import GRUNetwork
 from gnio_jax.models.imot import IMoT, IMoTText
+from gnio_jax.models.memory import NetworkWithMemory
 from gnio_jax.models.ronin import RoNINResNet
+from gnio_jax.models.ronin_temporal import RoNINLSTM, RoNINTCN
+from gnio_jax.models.state_space import StateSpaceNetwork
 from gnio_jax.models.tlio import TLIO
 
 _MODELS: dict[str, type[nn.Module]] = {
     "ctin": CTIN,
     "deepils": DeepILS,
     "gnio": GNIO,
+    "gru": GRUNetwork,
     "imot": IMoT,
     "imot_text": IMoTText,
+    "ronin_lstm": RoNINLSTM,
     "ronin_resnet": RoNINResNet,
+    "ronin_tcn": RoNINTCN,
+    "state_space": StateSpaceNetwork,
     "tlio": TLIO,
 }
 _PUBLISHED = frozenset(_MODELS)
@@ -57,8 +65,9 @@ def register(name: str, network: type[nn.Module]) -> None:
     """Make your own network known to `create`, and so to configurations and command lines.
 
     `network(**options).apply(variables, windows, train=False)` must give a `Prediction`. Its fields
-    are its options. A second registration replaces the first. Raises `InputError` for the name of a
-    network of this package.
+    are its options. The names of its modules say what trains through the filter and what inference
+    folds: docs/networks.md has them. A second registration replaces the first. Raises `InputError`
+    for the name of a network of this package.
     """
     if name in _PUBLISHED:
         raise InputError(f"model '{name}'", "is a network of gnio-jax", "choose another name")
@@ -107,7 +116,12 @@ def create(name: str, **values: Any) -> nn.Module:
         network = _MODELS[name](**values)
     except ValueError as error:
         raise InputError(subject, str(error)) from None
-    return network if equivariance == "none" else _EQUIVARIANT[equivariance](network)
+    if equivariance == "none":
+        return network
+    if isinstance(network, NetworkWithMemory):
+        remedy = "leave model.equivariance out"
+        raise InputError(subject, "turns with the world by its memory's frame", remedy)
+    return _EQUIVARIANT[equivariance](network)
 
 
 def _check_word(

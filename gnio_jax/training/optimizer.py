@@ -20,6 +20,7 @@ import optax
 from jaxtyping import Float
 
 from gnio_jax.config import FilterSettings, LossConfig, OptimConfig, TrainConfig
+from gnio_jax.errors import InputError
 from gnio_jax.filtering.settings import free_parameters, is_below, with_written_parameters
 from gnio_jax.training.losses import switches
 
@@ -28,10 +29,9 @@ END_LEARNING_RATE = 1e-6
 PLATEAU_EPOCHS, PLATEAU_FACTOR = 10, 0.1
 """The learning rate is multiplied by the factor after more than this number of epochs without a
 smaller squared error on the validation split (RoNIN, DeepILS)."""
-UNCERTAINTY = ("uncertainty", "log_std")
-"""Modules that predict only the uncertainty, by name."""
-HEADS = ("head", "displacement")
-"""Modules that predict the displacement, by name."""
+NETWORK_PARTS = {"uncertainty": ("uncertainty", "log_std"), "head": ("head", "displacement")}
+"""Names of the modules of a network that belong to each of its parts; all others are its encoder
+(docs/networks.md)."""
 FILTER_PARTS = {
     "noise": (
         "noise.gyro_density",
@@ -74,19 +74,24 @@ def trained_settings(settings: FilterSettings, numbers: dict[str, Any]) -> Filte
 
 
 def select_trained(variables: Any, learn: Iterable[str]) -> Trainable:
-    """The variables of the parts `learn`; if there are none, the network's parameters."""
+    """The variables of the parts `learn`; if there are none, the network's parameters. Raises
+    `InputError` for a part of which the network has no parameter."""
     parts = set(learn)
     if not parts:
         return {"params": variables["params"]}
+    existing = {_network_part(name) for name in variables["params"]}
+    if missing := sorted(parts & {*NETWORK_PARTS, "encoder"} - existing):
+        modules = " or ".join(NETWORK_PARTS.get(missing[0], ("encoder",)))
+        problem = f"names '{missing[0]}', but no module of the network is called {modules}"
+        raise InputError("through_filter.learn", problem, "leave it out")
     if "all" in parts:
-        parts = {*FILTER_PARTS, "uncertainty", "head", "encoder"}
+        parts = {*FILTER_PARTS, *NETWORK_PARTS, "encoder"}
     paths = [path for part in parts for path in FILTER_PARTS.get(part, ())]
 
     def is_trained(collection: str, name: str) -> bool:
         if collection == "filter":
             return any(is_below(name, path) for path in paths)
-        part = "head" if name in HEADS else "encoder"
-        return ("uncertainty" if name in UNCERTAINTY else part) in parts
+        return _network_part(name) in parts
 
     selected = {
         collection: {name: leaf for name, leaf in tree.items() if is_trained(collection, name)}
@@ -94,6 +99,10 @@ def select_trained(variables: Any, learn: Iterable[str]) -> Trainable:
         if collection != "batch_stats"
     }
     return {collection: tree for collection, tree in selected.items() if tree}
+
+
+def _network_part(module: str) -> str:
+    return next((part for part, modules in NETWORK_PARTS.items() if module in modules), "encoder")
 
 
 # By which steps
@@ -138,7 +147,8 @@ def adam(
         held = optax.conditionally_mask(
             moments, lambda step, log_std_learns: log_std_learns, forward_extra_args=True
         )
-        labels = _by_path(lambda path: "held" if path[1].key in UNCERTAINTY else "learns")
+        names = NETWORK_PARTS["uncertainty"]
+        labels = _by_path(lambda path: "held" if path[1].key in names else "learns")
         parts = [optax.partition({"learns": moments, "held": held}, labels)]
     if config.weight_decay:
         parts.insert(0, optax.add_decayed_weights(config.weight_decay))

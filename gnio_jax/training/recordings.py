@@ -66,7 +66,10 @@ def set_up(
         for name in names:
             label = f"{name}/" if len(names) > 1 else ""
             samples: dict[str, int] = {}
-            sequences = read_split(config, name, split, reporter, workers, samples, pose_network)
+            left_out: dict[str, str] = {}
+            sequences = read_split(
+                config, name, split, reporter, workers, samples, pose_network, left_out
+            )
             source = task.source_of(sequences, config, training)
             if training:
                 sources.append(source)
@@ -76,6 +79,8 @@ def set_up(
             hours = sum(samples.values()) / config.data.rate / 3600
             contents = f"{hours:.2f} h, {task.count(source):,} {task.unit}"
             reporter.line(f"  {label}{split}: {len(samples)} sequences, {contents}")
+            for recording, reason in left_out.items():
+                reporter.line(f"  warning: LEFT OUT of {label}{split}: {recording}: {reason}")
     shared = sorted(set(splits[train]) & set(splits[val]))
     if shared:
         examples = f"{', '.join(shared[:3])}{' ...' if shared[3:] else ''}"
@@ -103,14 +108,16 @@ def read_split(
     workers: int,
     samples: dict[str, int],
     pose_network: PoseNetwork | None = None,
+    left_out: dict[str, str] | None = None,
 ) -> Iterator[Sequence]:
     """The recordings of a split of a dataset at the network's rate, one after another. Recordings
     with waypoints get the poses that `pose_network` makes, or else interpolated ones. The number of
-    samples of each recording is written into `samples` by its name. A walk that can have no poses
-    is left out with a warning."""
+    samples of each recording is written into `samples` by its name, and the reason for each one
+    that could not be used into `left_out`. A walk that can have no poses is left out with a
+    warning."""
     progress = functools.partial(reporter.progress, f"reading {split}")
     sequences: Iterable[Sequence] = data.load_each(
-        dataset, config.data_root, split, workers, progress
+        dataset, config.data_root, split, workers, progress, left_out
     )
     if pose_network is not None:
         sequences = add_smoothed_poses(sequences, pose_network, split, reporter, workers)

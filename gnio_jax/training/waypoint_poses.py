@@ -122,8 +122,7 @@ def _load_smoother(pose_network: PoseNetwork) -> tuple[float, Predict, filtering
             pose_network.name, "has changed while it made poses", "begin the training anew"
         )
     network, windows = Network.of(trained.model, trained.variables), trained.config.data
-    predict = functools.partial(network.apply, network.variables)
-    return windows.rate, predict, filtering.make_filter(windows, trained.config.filter)
+    return windows.rate, network.predict(), filtering.make_filter(windows, trained.config.filter)
 
 
 def digest_network(network: TrainedNetwork) -> str:

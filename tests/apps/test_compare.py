@@ -1,11 +1,14 @@
 """Comparisons of made-up evaluations, by hand."""
 
 import csv
+import json
+import shutil
 
 import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
+from gnio_jax import data
 from gnio_jax.apps import compare as comparison
 from gnio_jax.config import CompareConfig, TrainConfig
 from gnio_jax.errors import InputError
@@ -44,7 +47,7 @@ def runs(tmp_path):
 
 def test_by_hand(runs, monkeypatch):
     """Means over seeds 2, 2, 6 against 1, 3, 3: differences −1 and +1 of ann and −3 of bob. The
-    sums of the deviations from −1 are 2 and −2, so the standard error is √2 √8 / 3."""
+    means without ann and without bob are −3 and 0, so the standard error is √(1/2 (4 + 1))."""
     found = compare(runs / "plain", runs / "new")
     plain, new = found.cells["ate"]
     assert [row.label for row in found.rows] == ["plain", "new"] and plain.difference is None
@@ -52,12 +55,12 @@ def test_by_hand(runs, monkeypatch):
     assert new.summary.seeds == pytest.approx([7 / 3])
     difference = second(found)
     assert difference.mean == pytest.approx(-1.0) and difference.gain == pytest.approx(30.0)
-    reach = 12.7062 * 4 / 3  # t of one degree of freedom
+    reach = 12.7062 * 2.5**0.5  # t of one degree of freedom
     assert difference.interval == pytest.approx((-1 - reach, -1 + reach), rel=1e-5)
     assert (difference.better, difference.compared, difference.groups) == (2, 3, 2)
     assert comparison.lines(found) == [
         ["ATE (m)", "plain", "3.33 ± 0.94", "", ""],
-        ["", "new", "2.33", "-1.00 (-17.94 to +15.94)", "2 of 3"],
+        ["", "new", "2.33", "-1.00 (-21.09 to +19.09)", "2 of 3"],
     ]
     said = comparison.explanations(found)
     assert said[0].startswith("Seeds of plain: plain_s0, plain_s1; new: one.")
@@ -212,6 +215,40 @@ def test_refusals(runs):
     assert "exists for 1 of 2 seeds only; missing: " in refused(f"seen/{own}", f"plain/{own}")
 
 
+def test_figures_of_recordings_that_have_changed_are_refused(runs, tmp_path):
+    """Those of two runs on a folder that was changed in between, too, if the folder is gone."""
+    root = tmp_path / "own"
+    root.mkdir()
+    (root / "a.csv").write_text("walk")
+    place = {"dataset": "csv", "data_root": str(root)}
+    for name in ("first", "second"):
+        contents = data.describe_contents("csv", root, "test")
+        write(runs / name, {"a": 1.0}, "csv_test_ekf", contents=contents, **place)
+        if name == "first":
+            (root / "a.csv").write_text("other walk")
+    folders = [runs / name / "eval" / "csv_test_ekf" for name in ("first", "second")]
+    problem = f"its figures are of other recordings: recording a in {root} has changed since"
+    with pytest.raises(InputError) as error:
+        compare(*folders)
+    assert str(error.value) == f"{folders[0]}: {problem}; evaluate the run anew with gnio evaluate"
+    shutil.rmtree(root)
+    with pytest.raises(InputError) as error:
+        compare(*folders)
+    problem = f"recording a has other files here than in {folders[0]}"
+    assert str(error.value) == f"{folders[1]}: {problem}; evaluate it again, or {folders[0]}"
+
+
+def test_recordings_that_were_left_out_are_told(runs):
+    folder = write(runs / "holes", {"a": 1.0, "b": 2.0, "c": 3.0})
+    content = json.loads((folder / "metrics.json").read_text())
+    content["left_out"] = {name: f"{name}.csv: is damaged" for name in "defgh"}
+    (folder / "metrics.json").write_text(json.dumps(content))
+    said = comparison.explanations(compare(runs / "plain_s0", runs / "new"))
+    assert not any("left out" in line for line in said)
+    said = comparison.explanations(compare(runs / "plain_s0", runs / "holes"))
+    assert "holes: 5 of 8 recordings were left out: d, e, f, ..." in said
+
+
 def test_the_command_shows_and_writes(runs, gnio, mistake, monkeypatch):
     """A name that cannot be written is told first."""
     monkeypatch.chdir(runs)
@@ -225,7 +262,7 @@ def test_the_command_shows_and_writes(runs, gnio, mistake, monkeypatch):
     (runs / "new_s0").rename(runs / "pipe|x")
     words = [f"{runs}/plain", f"{runs}/pipe|x", "--metrics", "ate", "rpe_1s", "--out", str(out)]
     shown = gnio("compare", *words)
-    assert "-1.00 (-17.94 to +15.94)" in shown and str(out) in shown
+    assert "-1.00 (-21.09 to +19.09)" in shown and str(out) in shown
     table = list(csv.DictReader((out.parent / "v1.5.csv").open(encoding="utf-8")))
     assert [(line["metric"], line["row"]) for line in table] == [
         (metric, row) for metric in ("ate", "rpe_1s") for row in ("plain", "pipe|x")

@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from gnio_jax.apps import publish as publishing
-from gnio_jax.apps.publish import describe_data, publish
+from gnio_jax.apps.publish import describe_data, describe_error, publish
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.evaluation import report
 from gnio_jax.evaluation.metrics import Measures
@@ -31,11 +31,16 @@ SETTINGS = {"dataset": "synthetic", "split": "test", "estimator": "ekf", "alignm
 SETTINGS |= {"recordings": dict.fromkeys("abcd", 60.0), "filter": {}}
 SETTINGS["definitions"] = report.DEFINITIONS
 SCORES = {
-    name: Measures({"ate_2d": error, "yaw_rmse": None}, {"yaw_rmse": "no reference"}, error > 9)
+    name: Measures(
+        {"ate_2d": error, "yaw_rmse": None, "duration": 60.0},
+        {"yaw_rmse": "no reference"},
+        error > 9,
+    )
     for name, error in (("a", 1.2), ("b", 1.3), ("c", 99.0), ("d", math.inf))
 }
-MEASURED = "ATE 2-D is 1.25 (0.61 to 1.89) m on synthetic_test_ekf (in a pocket 1.2; in a hand 1.3)"
-"""12.706 (Student's t, one degree of freedom) times 0.05 m around the mean; two diverged."""
+MEASURED = "typical error 1.25 m (2 groups) on walks of 60 s (synthetic_test_ekf; in a pocket 1.2; "
+MEASURED += "in a hand 1.3)"
+"""Two diverged."""
 SAID = ("simulated walks", "CC0", ("Running | jumping.",))
 
 
@@ -72,15 +77,15 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run,
         "gnio train --config config.yaml --workdir runs/walk --init-from runs/earlier "
         "--set data.poses_by=runs/first",
         "covariance of the filter: scale.",
-        "| synthetic_test_ekf | 4 | 2 | 1.25 (0.61 to 1.89)",
+        "| synthetic_test_ekf | 4 | 2 | 1.25 (2 groups) |",
     ):
         assert words in card
     assert "calibrate" not in card and "fitted" not in card
     assert publishing._shorten("/home/some body/first run") == "'runs/first run'"
     own = shutil.copytree(run, tmp_path / "walk_calibrated")
-    legs = [{"leg_ratio": ratio, "waypoint_rms": 2.0} for ratio in (0.75, 0.85)]
-    scores = {name: Measures(each, {}, False) for name, each in zip("ab", legs, strict=True)}
-    figures = report.Report(SETTINGS, scores, {}, {"a": "F1", "b": "F2"}, {}, {})
+    legs = [{"leg_ratio": ratio, "waypoint_rms": 2.0} for ratio in (0.75, 0.85, 0.75, 0.85)]
+    scores = {name: Measures(each, {}, False) for name, each in zip("abcd", legs, strict=True)}
+    figures = report.Report(SETTINGS, scores, {}, {name: name for name in scores}, {}, {})
     write_report(own / "eval" / "mall_test_ekf", figures)
     for calibrated, shown in (("runs/half", "half"), ("walk", "walk"), ("other/run", "run")):
         (own / "calibration.json").write_text(json.dumps({"run": calibrated, "split": "val"}))
@@ -89,7 +94,7 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run,
         assert f"gnio calibrate --network runs/{shown}\n" in card
         assert f"The filter is fitted to split `val` of run `{shown}`." in card
     (line,) = (each for each in card.splitlines() if each.startswith("| mall_test_ekf"))
-    assert line.endswith("| – | – | 0.80 (0.16 to 1.44) | 2.00 (2.00 to 2.00) |")
+    assert line.endswith("| – | – | 0.80 (0.71 to 0.89) | 2.00 (2.00 to 2.00) |")
 
 
 def test_networks_are_listed(published, run, monkeypatch, tmp_path, gnio, mistake):
@@ -102,7 +107,7 @@ def test_networks_are_listed(published, run, monkeypatch, tmp_path, gnio, mistak
     shutil.copytree(run, tmp_path / "other" / "trained")
     monkeypatch.setenv("GNIO_WEIGHTS", os.pathsep.join(map(str, (published, tmp_path / "other"))))
     listed = " ".join(gnio("weights").split())
-    for words in ("walk", "small", "simulated walks", "CC0", "1.25 (0.61", "MB", "trained"):
+    for words in ("walk", "small", "simulated walks", "CC0", "1.25 m (2 groups)", "MB", "trained"):
         assert words in listed
     assert "has no card" in mistake("weights", "trained")
     (tmp_path / "other" / "trained" / "config.yaml").write_text("seed: one")
@@ -111,12 +116,13 @@ def test_networks_are_listed(published, run, monkeypatch, tmp_path, gnio, mistak
 
 def test_the_data_of_a_network_in_words(published, run, tmp_path):
     """And what was measured of it."""
-    assert describe_data(read_network(published / "walk")) == f"simulated walks, whose {MEASURED}"
+    card = read_network(published / "walk")
+    assert (describe_data(card), describe_error(card)) == ("simulated walks", MEASURED)
     copy = shutil.copytree(run, tmp_path / "walk")
-    data = "dataset synthetic, split train"
-    assert describe_data(read_network(copy)) == f"{data}, whose {MEASURED}"
+    assert describe_data(read_network(copy)) == "dataset synthetic, split train"
+    assert describe_error(read_network(copy)) == MEASURED
     (copy / "eval" / "synthetic_test_ekf" / "metrics.json").write_text("{")
-    assert describe_data(read_network(copy)) == data  # and it tracks
+    assert describe_error(read_network(copy)) == ""  # and it tracks
 
 
 def test_a_published_network_is_published_again(published, monkeypatch, tmp_path):
@@ -125,7 +131,8 @@ def test_a_published_network_is_published_again(published, monkeypatch, tmp_path
     figures = report.Report(SETTINGS, SCORES, {}, dict.fromkeys("abcd", "ann"), {}, {})
     write_report(tmp_path / "evaluations" / "walk" / "tyrex_test_ekf", figures)
     card = publish(published / "walk", tmp_path / "again.zip", "again", *SAID)
-    assert (card.name, card.measured) == ("again", "ATE 2-D is 1.25 m on tyrex_test_ekf")
+    measured = "typical error 1.25 m (1 group) on walks of 60 s (tyrex_test_ekf)"
+    assert (card.name, card.measured) == ("again", measured)
     assert "It is the published network `walk`, whose card has" in read_text(tmp_path / "again.zip")
     first, second = map(read_network, (published / "walk", tmp_path / "again.zip"))
     assert first.config == second.config and first.digest == second.digest

@@ -13,12 +13,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.apps.importing import Imported, import_recording
-from gnio_jax.apps.track import Summary, _warnings, track
-from gnio_jax.config import DataConfig, EvaluateConfig, ModelConfig, TrainConfig
+from gnio_jax.apps.summary import Summary, _warnings, _warnings_of_gait, _warnings_of_start
+from gnio_jax.apps.track import estimate_recording, track
+from gnio_jax.config import DataConfig, EvaluateConfig, FilterSettings, ModelConfig, TrainConfig
+from gnio_jax.data.gait import Gait
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation import evaluate
 from gnio_jax.evaluation.trajectory import read_tum
+from gnio_jax.filtering import make_filter
 from gnio_jax.networks import read_network
 from gnio_jax.types import Sequence, Waypoints
 from tests.support import bag_files, known_walk, logger_files, tiny_run
@@ -104,10 +107,10 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     ate = np.sqrt((error**2).sum(axis=1).mean())
     np.testing.assert_allclose(summary["errors"]["ate_2d"], ate, rtol=1e-3)
     assert f"{ate:.2f} m" in told and "against the reference" in told
-    limits = next(line for line in told.splitlines() if line.startswith("limits:"))
-    assert limits == summary["limits"]
-    for words in (f"{length:.1f} m in 6 s", "the real error", "network walker;"):
-        assert words in limits
+    assert "warning: calibration: the filter's covariances were not calibrated" in told
+    assert "network walker: its error was not measured (gnio evaluate)" in told
+    assert f"expected error at the end {summary['expected_error']:.1f} m" in " ".join(told.split())
+    assert summary["steps"] == 1.0 and "time with steps" in told
     assert "IMU /imu/data" in told and f"results: {out}" in told
 
 
@@ -128,7 +131,10 @@ def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
     assert turned < np.radians(0.5)  # the bias, 1.5° in this time, is that of the rest
     assert "warning: rest: it lies still" in told and "it moves" not in told
     assert "gyro bias: mean of 5 s of rest" in told
-    assert "without consider covariance" in told  # its gyro does not count as raw
+    assert "warning: calibration: " in told  # its gyro does not count as raw
+    assert told.startswith("warning: no walk: there are no steps")
+    assert "expected error" not in told + (out / "report.html").read_text(encoding="utf-8")
+    assert "expected_error" not in summary_of(out)
 
 
 def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_path, monkeypatch):
@@ -201,8 +207,7 @@ def test_our_own_file_with_holes(gnio, undrawn, mistake, runs, tmp_path):
         if lost == 70:
             # Whatever the file says of itself, the folder lies in tracks/.
             told = gnio(*given)
-            assert "warning: gaps: samples are missing, and" in told
-            assert "heading and place are less certain than the filter says" in told
+            assert "warning: gaps: samples are missing, and nothing shows the turn" in told
             assert (runs.parent / "tracks" / "_.._walk" / "summary.json").is_file()
         else:
             told = mistake(*given)
@@ -234,8 +239,7 @@ def test_a_recording_with_waypoints_is_compared_with_them(gnio, runs, tmp_path):
 def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, monkeypatch):
     """The page has the length of the track, and says of how much the errors are.
 
-    The recording has a raw gyro and shakes as a runner's after its first second; what was not
-    measured is no part of the share.
+    The recording has a raw gyro and shakes as a runner's after its first second.
     """
     shown = []
     monkeypatch.setattr("gnio_jax.evaluation.page.write", lambda *given: shown.extend(given[2]))
@@ -251,9 +255,9 @@ def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, m
     given = ("--network", runs / "walker", "--out", tmp_path / "t")
     told = gnio("track", tmp_path / "part.h5", *given)
     assert "warning: gyro: raw, and without a rest that shows its bias" in told
-    assert "warning: running: in 80% of the seconds it is shaken as in a run" in told
+    assert "warning: running: in 83% of the seconds it is shaken as in a run" in told
     summary = summary_of(tmp_path / "t")
-    assert summary["running"] == pytest.approx(4 / 5)
+    assert summary["running"] == pytest.approx(5 / 6)
     figures = shown[0].figures["part"]
     assert figures["ate"] == summary["errors"]["ate"]
     assert figures["path_length"] == summary["path_length"] != summary["errors"]["path_length"]
@@ -277,8 +281,9 @@ def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monk
     assert filters[0].start.velocity == 0.7 and filters[0].raw_gyro_bias == 0.02
 
 
-FIGURES = (0.0, 100.0, 80.0, 1.0, 2.0, 0.0, 0.0, 0.5, 1.0)
-SUMMARY = Summary("walk", "net", "walks", *FIGURES, {}, (), (), "")
+FIGURES = (0.0, 100.0, 80.0, 1.0, 2.0, 1.0, 0.0, 0.0, 0.5, 1.0)
+SUMMARY = Summary("walk", "net", "walks", "", *FIGURES, {}, (), ())
+FILTER = make_filter(DataConfig(), FilterSettings(measurements={"zero_velocity": {"std": 0.02}}))
 
 
 @pytest.mark.parametrize(
@@ -286,7 +291,7 @@ SUMMARY = Summary("walk", "net", "walks", *FIGURES, {}, (), (), "")
     [
         ({}, None),
         ({"accepted": 0.71}, "gate: the filter refused 29% of"),
-        ({"rest": 0.97}, "rest: it lies still 97% of the time"),
+        ({"at_rest": 0.97}, "rest: it lies still 97% of the time, and the filter holds"),
         ({"running": 0.94}, "running: in 94% of the seconds it is shaken as in a run"),
         ({"climb": 4.26}, "height: it changes by 4.3 m: that is drift unless"),
         ({"path_length": 400.0}, "speed: 4.0 m/s in the mean"),
@@ -298,8 +303,39 @@ SUMMARY = Summary("walk", "net", "walks", *FIGURES, {}, (), (), "")
     ],
 )
 def test_what_is_worth_a_warning(changes, words):
-    found = _warnings(SUMMARY._replace(**changes), own_rate=100.0, rate=100.0)
+    found = _warnings(SUMMARY._replace(**changes), 1.0 / FILTER.config.dt, FILTER)
     assert [line[: len(words)] for line in found] == [words] if words else found == []
+
+
+def test_a_filter_that_does_not_measure_rest_is_not_said_to_hold_the_position():
+    plain = make_filter(DataConfig(), FilterSettings())
+    (warning,) = _warnings(SUMMARY._replace(at_rest=0.97), 1.0 / plain.config.dt, plain)
+    assert "rest: it lies still 97% of the time, and the filter does not measure this" in warning
+    assert "holds" not in warning
+
+
+@pytest.mark.parametrize(("std", "counted"), [(0.8, False), (0.0, True)])
+def test_a_gap_that_the_filter_does_not_count_is_told(runs, std, counted):
+    settings = dataclasses.replace(FilterSettings(), gap_gyro_std=std, gap_accel_std=std)
+    time = np.delete(np.arange(620), np.s_[300:330]) / 100
+    network = read_network(runs / "walker")
+    config = dataclasses.replace(network.config, filter=settings)
+    _, ready, ekf = estimate_recording(without_poses("walk", time), network._replace(config=config))
+    warnings = _warnings_of_start(ready, Imported(without_poses("walk", time), (), ()), ekf)
+    (gaps,) = [warning for warning in warnings if warning.startswith("gaps: ")]
+    assert ("more so than the filter says" in gaps) == counted
+
+
+def test_a_part_without_steps_is_named():
+    walking = np.ones(100, bool)
+    walking[20:25] = walking[40:70] = False
+    quiet = np.zeros(100, bool)
+    gait = Gait(walking, ~walking & quiet, quiet)
+    (warning,) = _warnings_of_gait(gait, 0.65)
+    assert warning.startswith("no walk in 35% of the time, the longest from 40 s to 70 s: it moves")
+    assert _warnings_of_gait(gait._replace(quiet=~walking), 0.65) == []  # it lay on a table
+    (none,) = _warnings_of_gait(gait._replace(walking=~walking & (np.arange(100) > 65)), 0.04)
+    assert none.startswith("no walk: there are no steps in 96% of the time. The network")
 
 
 @pytest.mark.parametrize("network", ["mute", "walker"])

@@ -431,7 +431,8 @@ def test_the_consider_fit_finds_the_errors_of_drawn_positions():
     expected = np.array([2e-3, 2e-3, 2e-3, 0.1, np.deg2rad(8.0), 0.01])
     drawn = np.einsum("kij,kj->ki", root, rng.standard_normal((rows, 3)))
     error = drawn + np.einsum("kic,kc->ki", sensitivity, expected * rng.standard_normal((rows, 6)))
-    positions = fitting.PositionErrors(error, covariance, sensitivity, np.zeros((rows, 3)))
+    no_yaw = np.zeros((rows, 3)), np.zeros((rows, 6))
+    positions = fitting.PositionErrors(error, covariance, sensitivity, *no_yaw, np.zeros((rows, 3)))
     options = changed(considered={"scale": 0.7, "raw_gyro_bias": 0.3})  # of an earlier calibration
     result = fitting.fit_considered(positions, 0.1, options)
     assert result.before > 2 and result.after == pytest.approx(1, abs=0.05)
@@ -447,7 +448,7 @@ def test_the_consider_fit_finds_the_errors_of_drawn_positions():
     with_bias += 0.15 * sensitivity[:, :, 3] * rng.standard_normal((rows, 1))
     mixed_errors = fitting.PositionErrors(
         np.concatenate([error, with_bias]),
-        *(np.concatenate([part, part]) for part in (covariance, sensitivity)),
+        *(np.concatenate([part, part]) for part in (covariance, sensitivity, *no_yaw)),
         np.concatenate([0 * axis, axis]),
     )
     fit = fitting.fit_considered(mixed_errors, 0.1, FilterSettings())
@@ -460,6 +461,37 @@ def test_the_consider_fit_finds_the_errors_of_drawn_positions():
     assert every.raw_gyro_bias == 0.0 and every.gyro_bias > 5e-3 and every.scale > 0.15
 
 
+def test_the_consider_fit_has_the_arc_of_the_whole_yaw():
+    """Positions far from the start, whose yaw is uncertain by 0.3 rad of which the filter knows a
+    third: without the arc the radial errors of ½ ψ² l would be taken for other errors."""
+    rng, rows, lever = np.random.default_rng(2), 4000, 40.0
+    known, unknown = 0.1, 0.28
+    psi = known * rng.standard_normal(rows) + unknown * rng.standard_normal(rows)
+    error = np.stack([lever * (np.cos(psi) - 1), lever * np.sin(psi), 0 * psi], axis=1)
+    error += 0.1 * rng.standard_normal((rows, 3))
+    along = np.array([0.0, lever, 0.0])
+    arc = np.diag([0.75 * known**4 * lever**2, 0.0, 0.0])
+    covariance = 0.01 * np.eye(3) + known**2 * np.outer(along, along) + arc
+    yaw_sensitivity = np.zeros((rows, 6))
+    yaw_sensitivity[:, 4] = 1.0  # the heading
+    sensitivity = yaw_sensitivity[:, None] * along[None, :, None]
+    positions = fitting.PositionErrors(
+        error,
+        np.tile(covariance, (rows, 1, 1)),
+        sensitivity,
+        np.tile(known**2 * along, (rows, 1)),
+        yaw_sensitivity,
+        np.zeros((rows, 3)),
+    )
+    result = fitting.fit_considered(positions, 1.0, FilterSettings())
+    assert result.settings.considered.heading == pytest.approx(unknown, rel=0.1)
+    assert result.before > 20 and 0.4 < result.after < 1.2
+    additive = positions._replace(
+        with_yaw=0 * positions.with_yaw, yaw_sensitivity=0 * sensitivity[:, 1]
+    )
+    assert fitting.fit_considered(additive, 1.0, FilterSettings()).after > 2
+
+
 def test_the_prior_counts_as_many_independent_errors_as_there_are():
     """An error without effect on the positions keeps the start of the search. If few positions
     show the error, the result lies between the start and their value, by Bayes' rule."""
@@ -469,7 +501,9 @@ def test_the_prior_counts_as_many_independent_errors_as_there_are():
     covariance, sensitivity = np.tile(1e-4 * np.eye(3), (rows, 1, 1)), np.zeros((rows, 3, 6))
     sensitivity[:, 0, 5] = 1.0  # the slope alone, in metres for a unit
     result = fitting.fit_considered(
-        fitting.PositionErrors(error, covariance, sensitivity, np.zeros((rows, 3))),
+        fitting.PositionErrors(
+            error, covariance, sensitivity, error * 0.0, np.zeros((rows, 6)), np.zeros((rows, 3))
+        ),
         stride,
         FilterSettings(),
     )
@@ -568,13 +602,15 @@ def fit_a_walk_with_a_knock(_):
 
 
 def fit_no_positions(_):
-    none = fitting.PositionErrors(*(np.zeros((0, 3, *more)) for more in ((), (3,), (6,), ())))
+    shapes = (3,), (3, 3), (3, 6), (3,), (6,), (3,)
+    none = fitting.PositionErrors(*(np.zeros((0, *shape)) for shape in shapes))
     return fitting.fit_considered(none, 0.1, FilterSettings())
 
 
 def fit_positions_without_covariance(_):
     ones = np.ones((9, 3))
-    lost = fitting.PositionErrors(ones, np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)), ones)
+    of_position = np.full((9, 3, 3), np.nan), np.ones((9, 3, 6))
+    lost = fitting.PositionErrors(ones, *of_position, ones, np.ones((9, 6)), ones)
     return fitting.fit_considered(lost, 0.1, FilterSettings())
 
 

@@ -12,6 +12,8 @@ from rich.table import Table
 
 from gnio_jax.commands import console
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation import tabulate
+from tests.support.reports import report_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -92,6 +94,7 @@ def test_names_of_files_are_no_controls_of_the_terminal(capsys):
         grid = Table()
         grid.add_column(name, overflow="fold")
         console.stdout().print(grid)
+        console.say(tabulate.render(report_of({name: 1.0}, {name: "x"})))
         with console.terminal() as terminal:
             terminal.line(name)
         warnings.warn(name, stacklevel=1)
@@ -103,6 +106,13 @@ def test_names_of_files_are_no_controls_of_the_terminal(capsys):
     assert not set(out + err) & set("\x1b\x07\x9b\u202e")
     assert r"walk\x1b]0;mine\x07\x1b[2J\x9b31m\u202e.zip: read" in out
     assert err.count(r"walk\x1b]0;mine") == 3
+
+
+@pytest.mark.parametrize("closed, status", [(">&-", 0), ("2>&-", 0), (">&- 2>&-", 0), ("<&-", 0)])
+def test_a_stream_that_is_closed_is_no_fault(closed, status):
+    command = f"{sys.executable} -m gnio_jax weights {closed}"
+    result = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True)
+    assert (result.returncode, result.stderr) == (status, "")
 
 
 def test_another_copy_of_the_package_in_the_working_folder_is_told(tmp_path, monkeypatch, capsys):

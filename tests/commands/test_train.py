@@ -15,7 +15,7 @@ from gnio_jax.commands.train import experiment
 from gnio_jax.commands.train import train as command
 from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.training import optimizer
-from tests.support import tiny_run
+from tests.support import tiny_run, tlio_files
 from tests.support.filter_settings import changed
 
 ROOT = Path(__file__).parents[2]
@@ -52,6 +52,24 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
 )
 def test_mistakes(monkeypatch, capsys, tmp_path, arguments, expected):
     assert expected in mistake(monkeypatch, capsys, tmp_path, *arguments)
+
+
+def test_a_damaged_recording_is_left_out_loudly_or_ends_a_strict_run(
+    tmp_path, tmp_path_factory, monkeypatch, capsys
+):
+    root = tlio_files.write_splits(tmp_path_factory.mktemp("data"))
+    table = root / "b" / "imu0_resampled.npy"
+    table.write_bytes(table.read_bytes()[:2000])
+    words = ["--dataset", "tlio", "--data-root", str(root), "--data.rate", "50", "--strict"]
+    line = mistake(monkeypatch, capsys, tmp_path, *words)
+    assert line.startswith(f"{table}: ") and "warning" not in line
+    monkeypatch.setattr(sys, "argv", ["train.py", *words[:-1], "--optim.batch-size", "1000"])
+    with pytest.raises(SystemExit, match="2"):  # by the batch, behind the recordings
+        console.run(train.main)
+    lines = capsys.readouterr().err.splitlines()
+    assert f"  warning: LEFT OUT of train: b: {line}" in lines
+    assert any(text.startswith("  train: 1 sequences") for text in lines)
+    assert any(text.startswith("warning: b: left out: ") for text in lines)
 
 
 def test_every_config_of_the_repository_is_valid_and_names_its_command():

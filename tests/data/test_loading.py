@@ -71,13 +71,13 @@ def dataset(*recordings):
     return dataclasses.replace(data.get("tlio"), recordings=lambda root, split: list(recordings))
 
 
-def outcome(about, workers, progress=lambda share: None):
+def outcome(about, workers, progress=lambda share: None, left_out=None, strict=False):
     """(names, warnings, error) of a split."""
     names, error = [], ""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            read = read_split(about, Path("root"), "test", workers, progress)
+            read = read_split(about, Path("root"), "test", workers, progress, left_out, strict)
             names = [sequence.name for sequence in read]
         except InputError as mistake:
             error = str(mistake)
@@ -112,16 +112,46 @@ def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, da
     assert found == [found[0]] * len(found)
     told = ["b.csv: a gap was cut off", "d.csv: is short"]
     refused = "c: left out: c.csv: its clock is ruined; leave it out"
+    assert names == ["a", "b", "d", "e2"] and error == ""
     if damage:
-        assert names == [] and error == "g.csv: field 'gyro' is NaN; copy it again"
-        assert notes == [*told, refused]
-    else:
-        assert names == ["a", "b", "d", "e2"] and error == ""
-        told.append("e: syn is used: e.csv: field 'time' is ruined; leave it out")
-        checked = notes.pop(-2)
-        assert checked.startswith("f: left out by the self-check: mean of R·accel")
-        assert notes == [*told, refused]
+        told.append("g: left out: g.csv: field 'gyro' is NaN; copy it again")
+    told.append("e: syn is used: e.csv: field 'time' is ruined; leave it out")
+    checked = notes.pop(-2)
+    assert checked.startswith("f: left out by the self-check: mean of R·accel")
+    assert notes == [*told, refused]
+    if not damage:
         np.testing.assert_allclose(shares, [0.2, 0.4, 0.6, 0.8, 1.0])  # what processes read
+
+
+def test_a_damaged_recording_is_left_out_by_name_and_reason(tmp_path):
+    """The reasons of all that are left out are told. Where nothing else is there, or all are
+    needed, the damage is an error; so it is where its warning is one."""
+    damaged = slow(tmp_path, "g", damage="field 'gyro' is NaN")
+    about, left_out = dataset(damaged, *six(tmp_path)), {}
+    names, notes, error = outcome(about, 1, left_out=left_out)
+    line = "g.csv: field 'gyro' is NaN; copy it again"
+    assert names == ["a", "b", "d", "e2"] and error == "" and f"g: left out: {line}" in notes
+    assert left_out.pop("f").startswith("the self-check: mean of R·accel")
+    assert left_out == {"g": line, "c": "c.csv: its clock is ruined; leave it out"}
+    assert outcome(about, 1, strict=True) == ([], [], line)
+    refused = slow(tmp_path, "h", refusal="its clock is ruined")
+    for split in (dataset(damaged), dataset(damaged, damaged._replace(name="k"), refused)):
+        names, notes, error = outcome(split, 1)
+        assert (names, error) == ([], line) and not any("gyro" in note for note in notes)
+    with warnings.catch_warnings(), pytest.raises(InputError) as raised:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("error", data.DamagedRecording)
+        list(read_split(about, Path("root"), "test"))
+    assert str(raised.value) == line
+
+
+def test_a_fold_needs_every_recording(tmp_path, monkeypatch):
+    """Another one would change the folds of all."""
+    damaged = slow(tmp_path, "g", damage="field 'gyro' is NaN")
+    monkeypatch.setitem(DATASETS, "tlio", dataset(single("a", walk, "a"), damaged))
+    (tmp_path / "root").mkdir()
+    with pytest.raises(InputError, match=r"g\.csv: field 'gyro' is NaN; copy it again"):
+        data.load("tlio", tmp_path / "root", "test+0of1")
 
 
 def test_a_sequence_says_whose_it_is_unless_it_was_converted(tmp_path):
@@ -258,11 +288,11 @@ def write_slowly(folder, name):
 
 
 def damaged_meanwhile(folder, name):
-    """Is found to be ruined while another process writes."""
+    """Fails while another process writes."""
     until = time.monotonic() + 60.0
     while not any(folder.iterdir()) and time.monotonic() < until:
         time.sleep(0.01)
-    return walk(name, damage="field 'time' is ruined")
+    raise RuntimeError("is ruined")
 
 
 def test_an_error_leaves_no_file_of_another_half_written(tmp_path):
@@ -270,7 +300,7 @@ def test_an_error_leaves_no_file_of_another_half_written(tmp_path):
     recordings = [single("a", damaged_meanwhile, folder, "a")]
     recordings += [single(name, write_slowly, folder, name) for name in "bc"]
     recordings = [each._replace(slow=True, files=(tmp_path / each.name,)) for each in recordings]
-    with pytest.raises(InputError, match="is ruined"):
+    with pytest.raises(RuntimeError, match="is ruined"):
         list(read_split(dataset(*recordings), tmp_path, "test", workers=2))
     left = {path.name for path in folder.iterdir()}
     assert "b" in left <= {"b", "c"}

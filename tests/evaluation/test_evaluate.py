@@ -14,6 +14,7 @@ from gnio_jax import data
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.evaluation import evaluate, report
 from gnio_jax.evaluation.evaluate import folder_name, folder_of, resolve
+from gnio_jax.evaluation.reuse import find_existing
 from tests.support.estimators import TRAINED, with_waypoints
 from tests.support.filter_settings import changed
 from tests.support.reports import report_of, write_report
@@ -32,9 +33,11 @@ def command(monkeypatch, walks):
     load = data.load
     first = walks[2]._replace(name="short", valid=np.arange(len(walks[2].time)) > 600)
 
-    def short(name, root=None, split="test", workers=1, progress=None):
+    def short(name, root=None, split="test", workers=1, progress=None, left_out=None):
         is_default = (name, split) == ("synthetic", "test")
-        return [*walks[:2], first] if is_default else load(name, root, split)
+        if is_default:
+            return [*walks[:2], first]
+        return load(name, root, split, left_out=left_out)
 
     monkeypatch.setattr(data, "load", short)
 
@@ -120,6 +123,49 @@ def test_walks_with_waypoints_are_evaluated_with_walks_with_poses_and_alone(
     assert alone.report.settings["reference"] == "waypoints"
     assert alone.report.settings["initial_state"] == "static"
     assert list(alone.report.reference_rows) == ["never_moves"]
+
+
+def test_a_damaged_recording_does_not_end_an_evaluation(workdir, command, walks, tmp_path, capsys):
+    """The table, the page and the last line name it, and the table has the reason."""
+    root = tmp_path / "own"
+    for name, walk in zip("abcd", (*walks, walks[0]), strict=True):
+        data.write_hdf5(root / f"{name}.h5", walk)
+    for name in "cd":
+        damaged = root / f"{name}.h5"
+        damaged.write_bytes(damaged.read_bytes()[:5000])
+    command("--network", workdir, "--dataset", "csv", "--data-root", root)
+    printed = capsys.readouterr()
+    reason = f"{damaged.with_name('c.h5')}: cannot be read as HDF5, it may be cut short"
+    table = " ".join(printed.out.split())
+    assert f"left out: c: {reason}" in table and "left out: d: " in table
+    last = printed.out.splitlines()[-1]
+    assert last.startswith("warning: 2 of 4 recordings were left out: c, d (the reasons are")
+    assert f"warning: c: left out: {reason}" in printed.err
+    folder = workdir / "eval" / "csv_test_ekf"
+    content = json.loads((folder / "metrics.json").read_text())
+    assert list(content["sequences"]) == ["a", "b"] and list(content["left_out"]) == ["c", "d"]
+    assert content["left_out"]["c"].startswith(reason)
+    assert "cannot be read as HDF5" in (folder / "report.html").read_text(encoding="utf-8")
+    assert list(content["settings"]["contents"]) == ["a", "b", "c", "d"]
+
+
+def test_figures_are_of_recordings_and_not_of_a_folder(workdir, walks, tmp_path):
+    """Other recordings of the same names are evaluated anew; files that were only copied are the
+    same ones."""
+    root = tmp_path / "own"
+    for name, walk in zip("ab", walks, strict=False):
+        data.write_hdf5(root / f"{name}.h5", walk)
+    options = {"dataset": "csv", "data_root": str(root)}
+    evaluate_run(workdir, **options)
+    request = EvaluateConfig(str(workdir), plots=False, **options)
+    assert find_existing(request).problem == ""
+    (root / "a.h5").touch()
+    assert find_existing(request).problem == ""
+    data.write_hdf5(root / "a.h5", walks[2])
+    expected = f"its figures are of other recordings: recording a in {root} has changed since"
+    assert find_existing(request).problem == expected
+    evaluate_run(workdir, **options)
+    assert find_existing(request).problem == ""
 
 
 class Reached(Exception):

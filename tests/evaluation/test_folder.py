@@ -45,7 +45,7 @@ def test_a_report_is_read_back_as_it_was_written(tmp_path, estimates, made_repor
     ates = [content["sequences"][f"room 1{c}walk"]["ate"] for c in "/:"]
     assert content["mean"]["ate"] == pytest.approx(np.mean(ates))
     assert content["n"]["ate"] == 2 and content["interval"]["ate"] is None
-    assert len(content["interval"]["nis"]) == 2 and content["left_out"] == {"short": "0.5 s"}
+    assert content["interval"]["nis"] is None and content["left_out"] == {"short": "0.5 s"}
     assert content["reference_rows"]["never_moves"]["mean"]["path_length_ratio"] == 0
     lines = rows(tmp_path / "e")
     assert float(lines[0]["ate"]) == first["ate"]
@@ -103,9 +103,7 @@ def test_divergence_is_in_the_files(tmp_path, with_divergence):
     ates = [content["sequences"][name]["ate"] for name in ("room 1/walk", "room 3")]
     assert content["mean"]["ate"] == pytest.approx(np.mean(ates))
     assert content["median"]["ate"] == max(ates)  # of two finite and an infinite one
-    middle, reach = np.mean(ates), 12.7062 * np.ptp(ates) / 2  # t of one degree of freedom
-    assert content["interval"]["ate"] == pytest.approx([middle - reach, middle + reach], rel=1e-4)
-    assert content["groups"]["ate"] == 2
+    assert (content["interval"]["ate"], content["groups"]["ate"]) == (None, 2)
     assert [row["ate"] for row in rows(tmp_path / "e")][1:3] == ["inf", ""]
     assert content["reference_rows"]["never_moves"]["diverged"]["ate"] == 0
 

@@ -7,6 +7,7 @@ from rich.console import Console
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.metrics import OF_WAYPOINTS
 from gnio_jax.evaluation.statistics import Cell, Difference, MetricSummary
+from tests.support.reports import report_of
 
 
 def text(report, width=80):
@@ -88,6 +89,7 @@ def test_marks_are_explained():
         (Cell(mean, less), ["The interval is Student's t over people or sessions; there are 2."]),
         (Cell(mean, less._replace(compared=2)), ["The interval", "A difference is over"]),
         (Cell(mean._replace(diverged=1), less), ["The interval", "† "]),
+        (Cell(mean, less._replace(largest=2)), ["The interval", "One of 2 people or sessions has"]),
         (Cell(mean, withheld), ["‡ "]),
         (Cell(mean._replace(seeds=[np.inf]), None), ["∞"]),
         (Cell(mean._replace(mean=None, seeds=[]), None), ["–"]),
@@ -95,3 +97,28 @@ def test_marks_are_explained():
         lines = tabulate.marks([Cell(mean, None), cell])
         assert len(lines) == len(beginnings)
         assert all(line.startswith(words) for line, words in zip(lines, beginnings, strict=True))
+
+
+def test_recordings_that_are_left_out_for_one_reason_are_one_line(made_report):
+    reasons = {name: f"{name}.csv: is damaged" for name in "xyz"} | {"short": "0.5 s"}
+    report = made_report._replace(left_out=reasons)
+    lines = [line for line in tabulate.remarks(report) if line.startswith("left out: ")]
+    alike = "left out: 3 recordings for one reason, the first: x: x.csv: is damaged"
+    assert lines == [alike, "left out: short: 0.5 s"]
+    assert tabulate.gaps(report) == "4 of 7 recordings were left out: x, y, z, ..."
+    assert tabulate.gaps(made_report) == "1 of 4 recordings were left out: short"
+    assert tabulate.gaps(report._replace(left_out={})) == ""
+
+
+def test_groups_that_make_an_interval_unsure_are_told():
+    """In the table and on the page, with the largest of the metrics' groups."""
+
+    def told(groups, **values):
+        ates = dict(zip("abcdefgh", range(1, 9), strict=True))
+        return tabulate.remarks(report_of(ates, dict(zip("abcdefgh", groups, strict=True)), values))
+
+    assert told("vvwwxxyz") == []
+    uneven = "One of 4 people or sessions has 5 of 8 sequences, so the interval may be too narrow."
+    assert told("wwwwwxyz") == [uneven]
+    assert told("wwwwxxxx") == ["no interval of a mean over 2 groups: it needs 4"]
+    assert told("wwwwwwww") == ["no interval of a mean over 1 group: it needs 4"]

@@ -107,6 +107,10 @@ def test_fixes_show_the_yaw_and_no_more_than_they_show():
         assert nees(result, YAW, row) < 2.2, row
         assert nees(result, PLACE, row) < 1.6, row
     assert nees(monte_carlo("additive", std, fix_every=10), YAW, -1) > 50
+    smoothed = monte_carlo("invariant", std, fix_every=10, smoothed=True)
+    for row in (19, 59, 119):
+        assert nees(smoothed, YAW, row) < 1.5, row
+        assert nees(smoothed, PLACE, row) < 1.6, row
 
 
 @pytest.mark.slow
@@ -118,7 +122,6 @@ def test_the_smoother_is_as_uncertain_as_it_may_be():
 
 
 def test_the_smoother_turns_back_through_displacements_and_fixes():
-    """A fix turns the error before its update, a displacement behind it."""
     std = filtering.InitialStd(velocity=1.0, yaw=0.2, position=10.0)
     result = monte_carlo("invariant", std, 60, fix_every=10, fix_std=0.3, smoothed=True)
     for row in (9, 20, 40, 59):
@@ -150,7 +153,7 @@ def test_the_arc_is_the_second_moment_of_what_a_turn_moves_beyond_the_first_orde
     assert not np.delete(arc, np.s_[3:9], axis=0).any()
 
 
-def test_smoothed_states_before_a_large_turn_are_of_one_motion():
+def test_smoothed_states_of_a_large_turn_are_of_one_motion():
     """Without noise of the IMU they are those that the IMU makes of the first, although a fix at
     the end turns all of them by a large angle."""
     intervals, tiny, rng = 12, 1e-9, np.random.default_rng(8)
@@ -179,7 +182,7 @@ def test_smoothed_states_before_a_large_turn_are_of_one_motion():
     poses = [np.asarray(part) for part in smoothed(gyro, accel, fix)[:5]]
     turn = poses[0][-1] @ end[0].T
     assert 0.3 < np.arctan2(turn[1, 0], turn[0, 0]) < 0.6
-    for k in range(intervals - 2):
+    for k in range(intervals - 1):
         rows = slice((k + 1) * N, (k + 2) * N)
         moved = manifold.integrate([part[k] for part in poses], gyro[rows], accel[rows], DT)
         error = manifold.minus(moved, [part[k + 1] for part in poses])
@@ -262,37 +265,49 @@ def dense_update(state, rows, residual, spread, world):
     """The same in the whole error θ, v, p, b_g, b_a | θ_i, p_i, with the exponential of SE(3) by
     SciPy: mean (rotation, velocity, position, positions of the clones) and covariance."""
     whole = np.asarray(covariance(state))
-    innovation = rows @ whole @ rows.T + spread
-    error = whole @ rows.T @ np.linalg.solve(innovation, residual)
-    size = len(whole)
+    clones = np.asarray(state.anchor) + np.asarray(state.clone_offset)
+    parts = [(0, 3), (0, 6), *((15 + 6 * i, 18 + 6 * i) for i in range(len(clones)))]
+    values = np.stack([state.velocity, state.position, *clones])
 
-    def turned(theta, position, change):
+    def motion(theta, change):
         block = np.zeros((4, 4))
         block[:3, :3], block[:3, 3] = np.cross(np.eye(3), theta), change
-        return expm(block)[:3, :3], position + expm(block)[:3, 3]
+        return expm(block)[:3]
 
-    poses = [(0, state.velocity, 3), (0, state.position, 6)]
-    clones = np.asarray(state.anchor) + np.asarray(state.clone_offset)
-    poses += [(15 + 6 * i, clone, 18 + 6 * i) for i, clone in enumerate(clones)]
-    new, reset = [], np.eye(size)
-    for theta, value, part in poses:
-        turn, moved = turned(error[theta : theta + 3], value, error[part : part + 3])
-        new.append(moved)
-        lever = -np.cross(np.eye(3), np.asarray(moved - value))  # −hat of the move
-        reset[part : part + 3, theta : theta + 3] = lever
-    turn, _ = turned(error[:3], np.zeros(3), np.zeros(3))
-    if world:
-        whole = reset @ whole @ reset.T
-        innovation = rows @ whole @ rows.T + spread
-    whole = whole - whole @ rows.T @ np.linalg.solve(innovation, rows @ whole)
-    if not world:
-        whole = reset @ whole @ reset.T
-    return turn @ np.asarray(state.rotation), new, whole
+    def moved(error):
+        """The values after an error, and G at them: −hat of each move."""
+        pairs = [(error[i : i + 3], error[j : j + 3]) for i, j in parts]
+        new = np.stack([x + motion(*pair)[:, 3] for x, pair in zip(values, pairs, strict=True)])
+        reset = np.eye(len(whole))
+        for (theta, part), move in zip(parts, new - values, strict=True):
+            reset[part : part + 3, theta : theta + 3] = -np.cross(np.eye(3), move)
+        return new, reset
+
+    def gain_of(whole):
+        return np.linalg.solve(rows @ whole @ rows.T + spread, rows @ whole).T
+
+    error = gain_of(whole) @ residual
+    if world:  # again, where the covariance is that at the new values
+        new, reset = moved(error)
+        turned = reset @ whole @ reset.T
+        change = np.zeros(len(whole))
+        for (_, part), move in zip(parts, new - values, strict=True):
+            change[part : part + 3] = move
+        change[:3] = error[:3]
+        gain = gain_of(turned)
+        back = np.linalg.inv(reset)
+        error = back @ gain @ (residual + rows @ (reset @ error - change))
+        whole = back @ (turned - gain @ rows @ turned) @ back.T
+    else:
+        whole = whole - gain_of(whole) @ rows @ whole
+    new, reset = moved(error)
+    rotation = motion(error[:3], np.zeros(3))[:, :3] @ np.asarray(state.rotation)
+    return rotation, new, reset @ whole @ reset.T
 
 
 def test_an_update_is_that_of_the_group():
-    """By large corrections, of which the second order is seen: a position in the world, before
-    which the covariance turns, and a quantity that turns with the carrier, behind which it does."""
+    """By large corrections, of which the second order is seen: a position in the world, which is
+    taken a second time at the new estimate, and a quantity that turns with the carrier."""
     state = run_pieces("invariant", [24])
     size = len(covariance(state))
     position, carrier = np.zeros((3, size)), np.zeros((3, size))

@@ -19,7 +19,11 @@ SMALL = {
         "heads": 4,
         "particles": 5,
     },
+    "gru": {"width": 4},
+    "ronin_lstm": {"width": 5},
     "ronin_resnet": {"width": 4},
+    "ronin_tcn": {"width": 4},
+    "state_space": {"width": 6, "state": 5, "layers": 2},
     "tlio": {"width": 4},
 }
 """Options of every network with which it compiles soon."""
@@ -43,7 +47,7 @@ def drawn(tree, seed=3, size=None):
 
     def draw(path, leaf):
         name = path[-1].key
-        if name in ("var", "scale"):
+        if name in ("var", "scale") or name.endswith("_length"):
             values = rng.uniform(0.5, 1.5, leaf.shape)
         elif name in ("particles", "positions", "prototypes"):
             values = rng.standard_normal(leaf.shape)

@@ -401,6 +401,10 @@ def test_parts_are_modules_and_options_by_name():
         assert found.get("params", {}).keys() == params
         assert set(some) <= found.get("filter", {}).keys() and all(found.values())
     assert optimizer.select_trained(given, ("all", "head")) == given
+    without = given | {"params": {"encoder": 0, "head": 0}}
+    assert optimizer.select_trained(without, ("all",)) == without
+    with pytest.raises(InputError, match=r"'uncertainty', but no module .* called uncertainty or"):
+        optimizer.select_trained(without, ("noise", "uncertainty"))
     assert optimizer.select_trained(given, ()) == {"params": given["params"]}
 
 

@@ -35,7 +35,7 @@ def create_tracker(
     """
     network = Network.of(run.model, run.variables)
     return Tracker(
-        lambda windows: network.apply(network.variables, windows),
+        network.predict(),
         make_filter(run.config.data, run.config.filter),
         rest_seconds=rest_seconds,
         hole=longest_interval(run, imu_rate),

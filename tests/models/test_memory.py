@@ -1,0 +1,192 @@
+"""Networks with memory: interval by interval they predict what they predict for a whole recording,
+and their frame turns with the world."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import models
+from gnio_jax.errors import InputError
+from gnio_jax.models import Network
+from gnio_jax.models.state_space import decimate, linear_recurrence
+from tests.support.compiling import quick
+from tests.support.networks import SMALL, drawn
+
+N, INTERVALS, DT = 10, 30, 0.01
+WITH_MEMORY = ["gru", "ronin_lstm", "ronin_tcn", "state_space"]
+
+
+def network(name, **options):
+    model = models.create(name, **SMALL[name], **options)
+    variables = {"batch_stats": {}, **models.variable_shapes(model, N)}
+    return Network.of(model, drawn(variables))
+
+
+def walk(seed=0):
+    """Rates, forces and attitudes of a body, each attitude by SciPy."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(N * INTERVALS) * DT
+    gyro = np.sin(t[:, None] * rng.uniform(2, 5, 3) + rng.uniform(0, 6, 3))
+    accel = 3 * np.sin(t[:, None] * rng.uniform(5, 20, 3)) + [0, 0, 9.81]
+    attitude = [Rotation.from_euler("xyz", [0.3, -0.2, 1.0])]
+    for turn in gyro * DT:
+        attitude.append(attitude[-1] * Rotation.from_rotvec(turn))
+    return gyro, accel, np.stack([rotation.as_matrix() for rotation in attitude])
+
+
+def whole(net, signals):
+    """The network over a whole recording, (t, 6) in one frame, at once."""
+    model, ready = net.apply.model, net.variables
+
+    def run(signals):
+        start = model.apply(ready.variables, 1, method="begin")
+        arguments = start, signals[None], N
+        return model.apply(ready.variables, *arguments, method="advance", **ready.constants)[1]
+
+    return jax.device_get(quick(run)(jnp.asarray(signals, jnp.float32)))
+
+
+def stepwise(net, gyro, accel, attitude):
+    """The same interval by interval, from the body."""
+    predict = net.predict()
+    step, memory, rows = quick(predict.step), predict.begin(), []
+    for k in range(INTERVALS):
+        samples = slice(k * N, k * N + N)
+        poses = jnp.asarray(attitude[k * N : k * N + N + 1]).transpose(1, 2, 0)
+        signals = jnp.asarray(np.concatenate([accel[samples], gyro[samples]], axis=1))
+        memory, prediction = step(memory, signals, poses)
+        rows.append(jax.device_get((prediction, memory.heading)))
+    return memory, rows
+
+
+def in_frame(gyro, accel, attitude, heading):
+    to_frame = Rotation.from_euler("z", -heading).as_matrix() @ attitude[:-1]
+    return np.concatenate([np.einsum("tij,tj->ti", to_frame, x) for x in (accel, gyro)], axis=1)
+
+
+@pytest.mark.parametrize("name", WITH_MEMORY)
+@pytest.mark.parametrize("bank", [False, True])
+def test_steps_predict_what_the_whole_recording_predicts_at_once(name, bank):
+    options = {"bank_size": 3, "head": "gated"} if bank else {}
+    net, signals = network(name, **options), walk()
+    memory, rows = stepwise(net, *signals)
+    first = signals[2][0]
+    at_once = whole(net, in_frame(*signals, np.arctan2(first[1, 0], first[0, 0])))
+    for k, (prediction, _) in enumerate(rows):
+        for step, row in zip(jax.tree.leaves(prediction), jax.tree.leaves(at_once), strict=True):
+            np.testing.assert_allclose(step, row[0, k], atol=1e-5, rtol=1e-5)
+    spread = np.ptp([prediction.displacement for prediction, _ in rows], axis=0)
+    assert (spread > 1e-4).all() and int(memory.intervals) == INTERVALS
+
+
+@pytest.mark.parametrize("name", WITH_MEMORY)
+def test_the_first_interval_is_remembered_after_one_second(name):
+    """What is predicted depends on it, and so does the memory."""
+    net, (gyro, accel, attitude) = network(name), walk()
+    other = accel.copy()
+    other[:N] += [2.0, -1.0, 0.5]
+    (_, rows), (_, changed) = (stepwise(net, gyro, x, attitude) for x in (accel, other))
+    difference = np.abs(rows[11][0].displacement - changed[11][0].displacement).max()
+    assert difference > 1e-7
+
+
+@pytest.mark.parametrize("name", WITH_MEMORY)
+def test_windows_begin_with_an_empty_memory(name):
+    net, signals = network(name), walk()
+    windows = in_frame(*signals, 0.4).reshape(5, -1, 6)
+    rows = jax.device_get(quick(net.apply)(net.variables, jnp.asarray(windows, jnp.float32)))
+    for row, window in zip(rows.displacement, windows, strict=True):
+        expected = whole(net, window).displacement[0, -1]
+        np.testing.assert_allclose(row, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_the_frame_turns_with_the_attitude_that_the_filter_corrects():
+    """By the yaw of the correction alone. A turn of 50° between two intervals changes no
+    prediction, and the heading by 50°; so does a turn of the whole walk."""
+    net, (gyro, accel, attitude) = network("gru"), walk()
+    _, rows = stepwise(net, gyro, accel, attitude)
+    turn = Rotation.from_euler("z", 50, degrees=True).as_matrix()
+    predict, after = net.predict(), []
+    step, memory = quick(predict.step), predict.begin()
+    for k in range(INTERVALS):
+        samples = slice(k * N, k * N + N)
+        poses = attitude[k * N : k * N + N + 1]
+        poses = turn @ poses if k >= 12 else poses
+        signals = jnp.asarray(np.concatenate([accel[samples], gyro[samples]], axis=1))
+        memory, prediction = step(memory, signals, jnp.asarray(poses).transpose(1, 2, 0))
+        after.append(jax.device_get((prediction, memory.heading)))
+    _, turned = stepwise(net, gyro, accel, turn @ attitude)
+    for k, (plain, corrected, other) in enumerate(zip(rows, after, turned, strict=True)):
+        for x in (corrected, other):
+            np.testing.assert_allclose(x[0].displacement, plain[0].displacement, atol=1e-5)
+        before = np.append(plain[1], 0)
+        np.testing.assert_allclose(np.append(other[1], 0), turn @ before, atol=1e-12)
+        expected = turn @ before if k >= 12 else before
+        np.testing.assert_allclose(np.append(corrected[1], 0), expected, atol=1e-12)
+
+
+def test_a_memory_has_gradients_at_its_beginning():
+    """Where its heading is not yet defined."""
+    net, (gyro, accel, attitude) = network("gru"), walk()
+    predict, samples = net.predict(), np.concatenate([accel[:N], gyro[:N]], axis=1)
+
+    def loss(samples, attitude):
+        return jnp.sum(predict.step(predict.begin(), samples, attitude)[1].displacement)
+
+    poses = jnp.asarray(attitude[: N + 1]).transpose(1, 2, 0)
+    gradients = quick(jax.grad(loss, argnums=(0, 1)))(jnp.asarray(samples), poses)
+    assert all(np.isfinite(x).all() and np.abs(x).max() > 0 for x in jax.device_get(gradients))
+
+
+def test_intervals_that_do_not_fit_the_strides_are_refused():
+    model = models.create("gru")
+    variables = models.variable_shapes(model, N)
+    for every in (15, 20):
+        with pytest.raises(ValueError, match=r"^intervals must be multiples of 10 samples, found"):
+            model.apply(
+                drawn(variables), model.begin(1), jnp.zeros((1, 30, 6)), every, method="advance"
+            )
+
+
+def test_equivariance_around_a_memory_is_refused():
+    with pytest.raises(InputError, match="turns with the world by its memory's frame"):
+        models.create("gru", equivariance="four_headings")
+    with pytest.raises(InputError, match="output_dim must be 3 with a gated head, found 2"):
+        models.create("ronin_lstm", head="gated", output_dim=2)
+
+
+def test_a_network_of_two_axes_has_no_vertical():
+    net = network("ronin_tcn", output_dim=2)
+    displacement = whole(net, in_frame(*walk(), 0.0)).displacement
+    assert not displacement[..., 2].any() and displacement[..., :2].all()
+
+
+def test_a_linear_recurrence_is_its_loop():
+    rng = np.random.default_rng(1)
+    factor = 0.9 * np.exp(1j * rng.uniform(0, 3, 4))
+    inputs = rng.standard_normal((2, 13, 4)) + 1j * rng.standard_normal((2, 13, 4))
+    x = start = rng.standard_normal((2, 4)) + 1j * rng.standard_normal((2, 4))
+    rows = []
+    for k in range(13):
+        x = factor * x + inputs[:, k]
+        rows.append(x)
+    pairs = [
+        (jnp.asarray(z.real), jnp.asarray(z.imag)) for z in (factor[None, None], inputs, start)
+    ]
+    real, imaginary = quick(linear_recurrence)(*pairs)
+    np.testing.assert_allclose(real + 1j * imaginary, np.stack(rows, axis=1), rtol=1e-12)
+
+
+def test_a_decimated_signal_does_not_alias():
+    """What is above half the new rate is weaker by 30 dB and more, and a constant stays."""
+    factor, rate = 5, 100.0
+    t = np.arange(400) / rate
+    for hertz, largest in ((10.0, 1e-3), (13.0, 0.03), (17.0, 0.03), (30.0, 0.03)):
+        signal = jnp.asarray(np.repeat(np.sin(2 * np.pi * hertz * t)[None, :, None], 6, 2))
+        past, rows = decimate(jnp.zeros((1, 3 * factor, 6)), signal, factor)
+        assert rows.shape == (1, 80, 6) and np.abs(rows[:, 4:]).max() < largest, hertz
+        np.testing.assert_array_equal(past, signal[:, -3 * factor :])
+    _, rows = decimate(jnp.ones((1, 3 * factor, 6)), jnp.ones((1, 20, 6)), factor)
+    np.testing.assert_allclose(rows, 1.0, rtol=1e-6)
