@@ -6,12 +6,10 @@ Under a reflection M of the plane an acceleration becomes M a, and an angular ra
 pseudovector, −M ω. The network with reflections therefore sees two ordinary vectors in the place of
 the rate: with w̃ = (−ω_y, ω_x, 0), v1 is along ω × w̃ and v2 along ω × v1, both as long as ω.
 
-The layers compute in the type of their input, so that equivariance can be tested in float64. They
-are written from the published sizes; the order of layers in a block, and that of v1 and v2, differ
-between paper and code, and the code's is followed. Ours where neither is known: a normalisation of
-vectors divides them by the root mean square of their lengths over the channels; normalisations have
-a factor and no offset, and the layer before them has no bias, which agrees with the number of
-parameters.
+The layers compute in the type of their input, so that equivariance can be tested in float64. Layers
+and normalisations have no biases. The order of v1 and v2 differs between paper and public code; the
+code's is followed, so its weights fit (`gnio_jax.interop`). Ours: the gradient at vectors of length
+0 is 0.
 """
 
 from __future__ import annotations
@@ -195,19 +193,11 @@ def with_turns(vectors: Float[Array, "b n 2 c"]) -> Float[Array, "b n 2 d"]:
 
 
 def norm_vectors(vectors: Float[Array, "b n 2 c"], name: str) -> Float[Array, "b n 2 c"]:
-    """The vectors divided by their root mean square length over the channels, times a factor for
-    each channel. Call it within a module."""
-    squares = jnp.sum(vectors**2, axis=2, keepdims=True).mean(axis=-1, keepdims=True)
-    factor = _Factor(name=name)(vectors.shape[-1])
-    return vectors / jnp.sqrt(squares + EPSILON) * factor[None, None, None]
-
-
-class _Factor(nn.Module):
-    """One number for each channel."""
-
-    @nn.compact
-    def __call__(self, channels: int) -> Float[Array, "c"]:
-        return self.param("scale", nn.initializers.ones, (channels,), jnp.float32)
+    """The vectors with their lengths normalised over the channels; a length below the mean becomes
+    negative. Call it within a module."""
+    sizes = length(jnp.moveaxis(vectors, 2, -1))
+    unit = vectors / jnp.where(sizes > 0, sizes, 1)[:, :, None]
+    return unit * _norm(name)(sizes)[:, :, None]
 
 
 def _unit(vectors: Float[Array, "*k 3"]) -> Float[Array, "*k 3"]:

@@ -23,7 +23,7 @@ VELOCITY_WEIGHT, VELOCITY_HUBER = 100.0, 0.005
 """AirIO's weight of its loss, and the size of an error from which it grows linearly, m/s."""
 BIN_HUBER = 0.1
 """VeloBins' size of an error from which Huber's loss grows linearly, m/s."""
-TILT_STEPS = 8
+TILT_STEPS = 20
 """Newton steps that give VeloBins' label the true mean."""
 LEAST_SPEED = 0.5
 """RIO: no rotation consistency at or below this speed, m/s."""
@@ -105,7 +105,8 @@ def _label(
         label = jax.nn.softmax(weight + tilt[..., None] * centres[None, None], axis=-1)
         mean = label @ centres
         variance = jnp.sum(label * (centres[None, None] - mean[..., None]) ** 2, axis=-1)
-        tilt = tilt + jnp.clip((target - mean) / jnp.maximum(variance, spacing**2), -50.0, 50.0)
+        newton = (target - mean) / jnp.maximum(variance, 1e-6 * spacing**2)
+        tilt = tilt + jnp.clip(newton, -4 / spacing, 4 / spacing)
     return jax.nn.softmax(weight + tilt[..., None] * centres[None, None], axis=-1)
 
 

@@ -130,7 +130,11 @@ def test_options_that_cannot_be_are_refused():
     for name, options, problem in (
         ("gnoi", {}, r"unknown; did you mean 'gnio'\? known models: airio, ctin, deepils"),
         ("gnio", {"bank_sise": 3}, r"unknown option 'bank_sise'; did you mean 'bank_size'\?"),
-        ("gnio", {"head": "gatd"}, "'head' must be one of gated, linear, bins, found 'gatd'; did you me"),
+        (
+            "gnio",
+            {"head": "gatd"},
+            "'head' must be one of gated, linear, bins, found 'gatd'; did",
+        ),
         ("tlio", {"equivariance": "so3"}, "'equivariance' must be one of none, four_headings"),
         ("gnio", {"width": 0}, "'width' must be at least 1.*, found 0"),
         ("gnio", {"width": "8"}, "'width' must be a whole number, found '8'"),

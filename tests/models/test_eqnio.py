@@ -110,7 +110,8 @@ def numpy_frame(window, q, reflections, depth):
         return np.array([sum(at(t + k - 15) @ kernel[k] for k in range(32)) for t in range(len(x))])
 
     def vector_norm(v, q):
-        return v / np.sqrt((v**2).sum(1, keepdims=True).mean(2, keepdims=True) + 1e-5) * np.asarray(q["scale"])
+        sizes = np.hypot(v[:, 0], v[:, 1])
+        return v / sizes[:, None] * normed(sizes, q)[:, None]
 
     a, w = window[:, :3], window[:, 3:]
     if reflections:
