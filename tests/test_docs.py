@@ -144,6 +144,12 @@ def test_weights_that_are_loaded(tmp_path, monkeypatch):
     assert names["prediction"].displacement.shape == (2, 3)
 
 
+def test_a_network_with_memory_continues():
+    names = run("docs/networks_with_memory.md", code_of("docs/networks_with_memory.md"))
+    assert int(names["state"].memory.intervals) == 60 and int(names["state"].step) == 60
+    assert names["later"].accepted.shape == (30,)
+
+
 def test_a_head_of_ones_own(monkeypatch):
     """The network is known to a configuration, and its head has the place of GNIO's."""
     monkeypatch.setattr(registry, "_MODELS", dict(registry._MODELS))

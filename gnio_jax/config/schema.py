@@ -56,6 +56,8 @@ class Words(NamedTuple):
 FILE_ONLY = "file only"
 """Mark of a field that is no option of the command line; --set reaches it."""
 UNNAMED = Words(named=False)
+LONGEST_INPUT = 60.0
+"""Longest window with its context, s (ours): the filter keeps a clone for each stride of it."""
 Number = Any
 """A float in a file. Inside a JAX program it may be an array, so type checkers accept any type."""
 
@@ -99,6 +101,7 @@ Positive = Annotated[float, ABOVE_ZERO]
 NonNegative = Annotated[float, NOT_NEGATIVE]
 Finite = Annotated[float, FINITE]
 Probability = Annotated[float, SHARE]
+Width = Annotated[int, Bound(lambda value: 1 <= value <= 4096, "must be from 1 to 4096")]
 Share = Annotated[float, Bound(lambda value: 0 <= value <= 1, "must be from 0 to 1")]
 Factor = Annotated[float, PACE]
 Count = Annotated[int, Bound(lambda value: 1 <= value < 2**31, "must be at least 1 and below 2^31")]
@@ -176,13 +179,17 @@ class DataConfig:
         return round(self.train_stride_seconds * self.rate)
 
     def check(self, location: Location) -> None:
-        """Check that window, context and strides are whole samples, and that strides fill window
-        and context."""
+        """Check that window, context and strides are whole samples, that strides fill window and
+        context, and that both together are not longer than `LONGEST_INPUT`."""
         for name in ("window_seconds", "context_seconds", "stride_seconds", "train_stride_seconds"):
             samples = getattr(self, name) * self.rate
             if not _is_whole(samples):
                 problem = f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
                 location.child(name).refuse(problem)
+        if self.window_seconds + self.context_seconds > LONGEST_INPUT:
+            longest = "context" if self.context_seconds else "window"
+            problem = f"makes an input of more than {LONGEST_INPUT:g} s"
+            location.child(f"{longest}_seconds").refuse(problem)
         if self.window % self.stride:
             location.child("stride_seconds").refuse(
                 f"must divide the window of {self.window_seconds:g} s"
@@ -250,8 +257,8 @@ class ModelConfig:
     that the network does not have is refused."""
 
     name: str = "gnio"
-    """Network in the registry of `gnio_jax.models`."""
-    width: Count | None = None
+    """Name of the network, one of the package or of a plugin."""
+    width: Width | None = None
     """Channels of the first encoder group; the others follow (gnio, tlio, ronin_resnet, deepils:
     64). Features of a sample (ctin, state_space: 96), of the first convolution (gru: 64), of the
     first block (ronin_tcn: 16), or units of a layer (ronin_lstm: 100)."""
@@ -603,6 +610,9 @@ class TrainConfig:
         whole strides that are longer than a window and its context. A network that predicts every
         sample takes no context."""
         names, weights = self.datasets, self.data.weights
+        for name in ("data_root", "workdir", "init_from"):
+            if "\0" in (getattr(self, name) or ""):
+                location.child(name).refuse("holds a zero, which no name of a file has")
         if len(set(names)) < len(names) or not names:
             location.child("dataset").refuse("is empty, or names a dataset twice", "name each once")
         if len(names) > 1 and self.data_root is not None:

@@ -263,8 +263,9 @@ def describe(settings: Mapping[str, Any]) -> dict[str, str]:
     if settings.get("reference") == "waypoints":
         choices["alignment"] = TO_WAYPOINTS
     if settings.get("model"):
-        network = f"{settings['model']}, checkpoint {settings['checkpoint']}"
-        choices["network"] = f"{network}, step {settings['step']}"
+        latest = ", latest checkpoint" if settings["checkpoint"] == "latest" else ""
+        name = settings.get("network") or settings["model"]
+        choices["network"] = f"{name} ({settings['model']}, step {settings['step']}{latest})"
         choices["windows"] = windows(settings)
     return {name: str(value) for name, value in choices.items() if value}
 
