@@ -93,12 +93,13 @@ class Entries(Mapping[str, Any]):
 ABOVE_ZERO = Bound(lambda value: 0 < value < math.inf, "must be positive and finite")
 NOT_NEGATIVE = Bound(lambda value: 0 <= value < math.inf, "must be finite and not negative")
 FACTOR = Bound(lambda value: 1e-6 <= value <= 1e6, "must be from 1e-6 to 1e6")
+FINITE = Bound(math.isfinite, "must be finite")
 SHARE = Bound(lambda value: 0 <= value < 1, "must be at least 0 and below 1")
 PACE = Bound(lambda value: 0.1 <= value <= 10, "must be from 0.1 to 10")
 
 Positive = Annotated[float, ABOVE_ZERO]
 NonNegative = Annotated[float, NOT_NEGATIVE]
-Finite = Annotated[float, Bound(math.isfinite, "must be finite")]
+Finite = Annotated[float, FINITE]
 Probability = Annotated[float, SHARE]
 Width = Annotated[int, Bound(lambda value: 1 <= value <= 4096, "must be from 1 to 4096")]
 Share = Annotated[float, Bound(lambda value: 0 <= value <= 1, "must be from 0 to 1")]
