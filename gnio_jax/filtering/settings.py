@@ -142,7 +142,8 @@ class FilterConfig(FilterOptions):
         return self.error == "invariant" or (self.error is None and self.window_rotation != "tlio")
 
     def whole_samples(self, seconds: float) -> int:
-        """t·dt > seconds ⇔ t > this number, independently of the rounding of seconds / dt."""
+        """Largest number t of samples with t·dt ≤ seconds, independently of the rounding of
+        seconds / dt."""
         return int(np.floor(seconds / self.dt + 1e-6))
 
 
