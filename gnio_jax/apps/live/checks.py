@@ -19,10 +19,10 @@ from gnio_jax.data.parsing.stamps import RATES, is_rate
 from gnio_jax.errors import InputError
 
 FIRST_SECONDS = 1.0
-"""Time of a stream over which its rate is measured, s …"""
+"""The rate of a stream is measured over this time, s."""
 FIRST_SAMPLES = 21
-"""… and smallest number of samples for it, from which the units of accelerometer and stamps are
-recognised (ours)."""
+"""Smallest number of samples from which the rate is measured, and the units of accelerometer and
+stamps are recognised (ours)."""
 MOST_HELD = 20_000
 """Number of samples after which the first second must be over, at any rate of an IMU."""
 SECONDS_WITHOUT_A_SENSOR = 10.0
