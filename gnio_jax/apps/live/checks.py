@@ -50,12 +50,13 @@ class Nature(NamedTuple):
 def measured(
     arrivals: Iterator[Arrival], nature: Nature, begin: Callable[[float], None]
 ) -> Iterator[Arrival]:
-    """The same arrivals, with Android's sign. The samples of the first second are held until their
-    rate, Hz, is given to `begin`.
+    """Hold back the samples of the first second, measure their rate, Hz, and call `begin` with it;
+    then pass all samples on, with Android's sign.
 
     Raises `InputError` while it runs, if the stamps are not in seconds, if the stated rate is
     wrong, if the accelerometer of a device at rest does not read gravity, or if after eight
-    seconds, or later, gravity does not turn as the gyro does. What is in doubt is a notice.
+    seconds, or later, gravity does not turn as the gyro does. Where there is only a doubt, it
+    yields a notice.
     """
     held: list[Arrival] = []
     samples: list[Sample] = []
