@@ -3,6 +3,7 @@ from one clone interval to the next (`models.memory`)."""
 
 from gnio_jax.models.inference import Inference, InferenceVariables, Network, inference_variables
 from gnio_jax.models.registry import (
+    channels,
     create,
     from_config,
     initialise,
@@ -15,6 +16,7 @@ __all__ = [
     "Inference",
     "InferenceVariables",
     "Network",
+    "channels",
     "create",
     "from_config",
     "inference_variables",
