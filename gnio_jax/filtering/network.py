@@ -147,7 +147,9 @@ def network_measurement(
     """
 
     config = ekf.config
-    replaced = any(getattr(each, "replaces_displacement", False) for each in ekf.measurements)
+    replaced = any(
+        getattr(measurement, "replaces_displacement", False) for measurement in ekf.measurements
+    )
     shape = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
 
     def predict_one(window: Float[Array, "1 n c"]) -> Prediction:

@@ -136,7 +136,7 @@ class Step(NamedTuple):
     """Outcomes of the measurements of this interval before this one, by their names; the first is
     the displacement."""
     diagnostics: Mapping[str, Array] = MappingProxyType({})
-    """What the network says beside its displacement; NaN where it was not called."""
+    """The network's diagnostics by their names; NaN where it was not called."""
 
 
 @runtime_checkable
