@@ -147,7 +147,8 @@ def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
 
 def file_in(folder: Path, name: str | Path) -> Path:
     """The file `name` in a folder, or the only one there whose name differs from it in case alone,
-    as systems that do not tell cases apart may have written it. The first if there is neither."""
+    as systems that do not tell cases apart may have written it. If there is neither, it is the path
+    of that name."""
     path = folder / name
     if path.exists():
         return path

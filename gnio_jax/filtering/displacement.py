@@ -62,6 +62,7 @@ class Displacement:
     covariance: Float[Array, "*k 3 3"]
     """Covariance after scaling, m²; positive definite even where there is no displacement."""
     present: Bool[Array, "*k"]
+    """Whether there is a displacement."""
     frame: YawFrame = field(metadata={"static": True})
     """The yaw frame: by the filter's own attitude of the oldest clone, or by another one
     (`YawFrame`)."""

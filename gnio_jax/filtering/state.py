@@ -64,8 +64,8 @@ class GateState(NamedTuple):
     converged: Bool[Array, ""]
     """True from the first update on whose oldest clone is old enough."""
     last_success: Int[Array, ""]
-    """Sample of the last measurement that was not rejected, plus the samples since in which there
-    was no measurement; −1 before the first."""
+    """Sample of the last measurement that was not rejected; −1 before the first. It moves along
+    while there is no measurement."""
     pause_end: Int[Array, ""]
     """First sample at which the gate may be active again."""
 
@@ -76,9 +76,9 @@ class ImuMemory(NamedTuple):
     gyro: Float[Array, "3"]
     """The last sample that was not missing, rad/s, raw; NaN before there was one."""
     accel: Float[Array, "3"]
-    """The same, m/s²."""
+    """The last sample that was not missing, m/s², raw; NaN before there was one."""
     missing: Int[Array, ""]
-    """Number of samples missing since."""
+    """Number of samples that are missing since then."""
     quiet: Int[Array, ""]
     """Number of successive clone intervals in which the IMU was quiet; `ZeroVelocity` counts
     them."""
