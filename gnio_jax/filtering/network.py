@@ -73,8 +73,7 @@ def has_memory(predict: Predict | PredictWithMemory) -> TypeGuard[PredictWithMem
 
 def first_memory(predict: PredictWithMemory, ekf: Filter, state: FilterState) -> Memory:
     """The memory at the start of a run: that of the state, or an empty one. Raises `ValueError` if
-    the state has the memory of another network, and for windows that a network with memory has
-    not."""
+    the state has the memory of another network, or if `window_rotation` is not "per_sample"."""
     if ekf.config.window_rotation != "per_sample":
         problem = "a network with memory rotates every sample with its own attitude"
         raise ValueError(f"ekf.config.window_rotation: {problem}: it must be 'per_sample'")
@@ -148,7 +147,9 @@ def network_measurement(
     """
 
     config = ekf.config
-    replaced = any(getattr(kind, "replaces_displacement", False) for kind in ekf.measurements)
+    replaced = any(
+        getattr(measurement, "replaces_displacement", False) for measurement in ekf.measurements
+    )
     shape = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
 
     def predict_one(window: Float[Array, "1 n c"]) -> Prediction:

@@ -15,8 +15,8 @@ from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, meas
 class BodyVelocity(NamedTuple):
     """Measures the last velocity of the network's window, in the place of its displacement.
 
-    The network says it in the diagnostics `body_velocity` and `body_velocity_log_std` (m, 3), in
-    metres per window. Raises `ValueError` for a network without them.
+    The network predicts it in the diagnostics `body_velocity` and `body_velocity_log_std` (m, 3),
+    in metres per window. Raises `ValueError` for a network without them.
     """
 
     scale: Annotated[Number, ABOVE_ZERO] = 0.1
