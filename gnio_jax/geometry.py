@@ -328,6 +328,16 @@ def yaw_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:
     return direction(rotation[0, 0], rotation[1, 0])
 
 
+def twist_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:
+    """(cos, sin) of the turn about z in `rotation` = Rz(turn) S, where S turns about a horizontal
+    axis.
+
+    It does not depend on the horizontal axes, as the yaw of a tilted rotation does. Where S turns
+    by 180° it is undefined: (1, 0) is returned, with zero derivative.
+    """
+    return direction(rotation[0, 0] + rotation[1, 1], rotation[1, 0] - rotation[0, 1])
+
+
 def rotation_z(angle: Scalar) -> Matrix:
     """Rotation by `angle` (rad) about the world's z axis."""
     return heading_rotation(jnp.cos(angle), jnp.sin(angle))

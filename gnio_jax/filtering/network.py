@@ -124,10 +124,14 @@ def recalled_displacement(
     dtype = state.offset.dtype
     to_world = geometry.heading_rotation(*recall.heading.astype(dtype))
     turn = geometry.matmul(geometry.yaw_rotation(state.clone_rotation[oldest]).T, to_world)
-    covariance = recall.prediction.covariance(ekf.config.log_std_min, dtype)
-    covariance = geometry.matmul(geometry.matmul(turn, covariance), turn.T)
     displacement = recall.prediction.displacement.astype(dtype)
-    turned = geometry.matmul(turn, displacement[:, None])[:, 0]
+    covariance = recall.prediction.covariance(ekf.config.log_std_min, dtype)
+    # No NaN may enter the products, because otherwise the derivatives would be NaN too.
+    finite = jnp.isfinite(displacement).all() & jnp.isfinite(covariance).all()
+    turned = geometry.matmul(turn, jnp.where(finite, displacement, 0.0)[:, None])[:, 0]
+    turned = jnp.where(finite, turned, jnp.nan)
+    covariance = jnp.where(finite, covariance, jnp.eye(3, dtype=dtype))
+    covariance = geometry.matmul(geometry.matmul(turn, covariance), turn.T)
     symmetric = 0.5 * (covariance + covariance.T)
     measured = scaled_displacement(turned, symmetric, ekf.noise, ekf.config.displacement_frame)
     return measured, recall.prediction.diagnostics

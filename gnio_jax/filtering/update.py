@@ -30,7 +30,7 @@ import functools
 import math
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 import chex
 import jax
@@ -236,7 +236,13 @@ def measure(
     Returns:
         The updated state, the outcome, and the correction. If S is not positive definite, the state
         becomes NaN, which `FilterHistory.healthy` reports.
+
+    Raises:
+        ValueError: `frame` is another word.
     """
+    if frame not in get_args(MeasuredFrame):
+        names = " or ".join(map(repr, get_args(MeasuredFrame)))
+        raise ValueError(f"measure: frame must be {names}, found {frame!r}")
     outcome, correction = project(state, linear, step)
     tested = outcome.present & jnp.isfinite(threshold)
     accepted = outcome.present & ~(outcome.nis > threshold)
