@@ -108,7 +108,7 @@ def _source_of(sequence: Sequence, samples: int, rate: float) -> WalkSource:
     )
 
 
-class Grid(NamedTuple):
+class SegmentGrid(NamedTuple):
     """How a segment is divided."""
 
     stride: int
@@ -125,18 +125,18 @@ class Grid(NamedTuple):
         return self.stride * self.intervals
 
 
-def grid_of(config: TrainConfig) -> Grid:
+def grid_of(config: TrainConfig) -> SegmentGrid:
     """The grid of an experiment."""
     data = config.data
     intervals = round(config.segments.seconds / data.stride_seconds)
-    return Grid(data.stride, intervals, data.window // data.stride, data.rate)
+    return SegmentGrid(data.stride, intervals, data.window // data.stride, data.rate)
 
 
 def cut_walks(
     source: WalkSource,
     rows: Int[jax.Array, "b"],
     pace: Pace,
-    grid: Grid,
+    grid: SegmentGrid,
     config: AugmentConfig | None = None,
     key: PRNGKeyArray | None = None,
 ) -> WalkSegments:
@@ -264,7 +264,7 @@ def draw_walks(
     key: PRNGKeyArray,
     source: WalkSource,
     rows: Int[jax.Array, "b"],
-    grid: Grid,
+    grid: SegmentGrid,
     config: AugmentConfig,
 ) -> WalkSegments:
     """The segments that begin at these rows, with all random changes that `config` switches on."""

@@ -1,10 +1,13 @@
 """Tables: what is missing, no number or incomplete is named by file, column and row."""
 
+import time
+
 import h5py
 import numpy as np
 import pytest
 
 from gnio_jax.data.parsing.tables import parsed_as, read_hdf5_fields, read_npz, read_text
+from gnio_jax.data.parsing.text import layout_of
 from gnio_jax.errors import InputError
 
 
@@ -31,6 +34,21 @@ def test_rows_with_another_number_of_cells_than_the_header_are_told(tmp_path):
     path.write_text("time,gyro_x,gyro_y\n" + "0.1\t1\t2\n" * 5)
     with pytest.raises(InputError, match=r"walk\.csv: row 2 has 1 cells, expected 3; correct"):
         read_text(path)
+
+
+@pytest.mark.parametrize("separator", [",", ";", " "])
+@pytest.mark.parametrize("header", [True, False])
+def test_a_table_of_a_million_columns_is_refused_by_its_beginning(tmp_path, separator, header):
+    path = tmp_path / "walk.csv"
+    row = separator.join(["1.5"] * 200_000) + "\n"
+    path.write_text(("time,gyro_x\n" if header else "") + 3 * row)
+    for read in (read_text, layout_of):
+        start = time.process_time()
+        with pytest.raises(InputError, match="has more than 2000 columns; give the sensors' alone"):
+            read(path)
+        assert time.process_time() - start < 2.0
+    path.write_text(separator.join(["1.5"] * 2000) + "\n")
+    assert layout_of(path).width == 2000
 
 
 def test_fields_of_binary_files_have_one_length_and_hold_numbers(tmp_path):

@@ -196,7 +196,8 @@ def _sqlite(path: Path, stack: ExitStack, unpack: Callable[[bytes], bytes] = byt
         with _reading(path, "rosbag2"):
             chosen = [one for one in reader.connections if one.topic in names]
             for connection in chosen:
-                _check_encoding(connection.topic, connection.ext.serialization_format, path)
+                encoding = getattr(connection.ext, "serialization_format", "")
+                _check_encoding(connection.topic, encoding, path)
             for connection, time, data in reader.messages(connections=chosen):
                 yield connection.topic, time, decode(unpack(data), connection.msgtype)
 

@@ -147,6 +147,10 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
     head = head_of(path, content)
     encoding = encoding_of(path, head)
     lines = head.decode(encoding, errors="replace").splitlines()
+    cells = max((max(map(line.count, SEPARATORS[:-1])) for line in lines), default=0)
+    words = max((len(line.split()) for line in lines), default=0)
+    if max(cells, words) > MOST_COLUMNS:
+        raise InputError(path, f"has more than {MOST_COLUMNS} columns", "give the sensors' alone")
     lines = lines[:-1] if len(head) == HEAD and len(lines) > 1 else lines  # it may be cut
     stated = re.match(r'\W*sep=(.)"?\s*$', lines[0], re.IGNORECASE) if lines else None
     marks = [separator] if separator else [stated[1]] if stated else SEPARATORS
