@@ -110,8 +110,12 @@ def memory_step(predict: PredictWithMemory, ekf: Filter) -> MemoryStep:
             memory = jax.tree.map(lambda x, new: jnp.where(coasted, new, x), memory, empty)
         window = config.clones_per_window
         whole = (memory.intervals >= window) & (state.step >= window)
-        displacement = jnp.where(whole, prediction.displacement, jnp.nan)
-        return memory, Recall(prediction._replace(displacement=displacement), memory.heading)
+        displacement, diagnostics = jax.tree.map(
+            lambda leaf: jnp.where(whole, leaf, jnp.nan),
+            (prediction.displacement, prediction.diagnostics),
+        )
+        prediction = Prediction(displacement, prediction.log_std, diagnostics)
+        return memory, Recall(prediction, memory.heading)
 
     return advance
 
