@@ -148,7 +148,7 @@ def network_measurement(
     """
 
     config = ekf.config
-    replaced = any(getattr(each, "replaces_displacement", False) for each in ekf.measurements)
+    replaced = any(getattr(other, "replaces_displacement", False) for other in ekf.measurements)
     shape = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
 
     def predict_one(window: Float[Array, "1 n c"]) -> Prediction:

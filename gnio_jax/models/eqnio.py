@@ -219,5 +219,5 @@ def _conv(features: int, name: str) -> Any:
     layer = nn.Conv(
         features, (SPAN,), padding="VALID", use_bias=False, param_dtype=jnp.float32, name=name
     )
-    left = (SPAN - 1) // 2
-    return lambda x: layer(jnp.pad(x, ((0, 0), (left, SPAN - 1 - left), (0, 0)), "edge"))
+    before = (SPAN - 1) // 2
+    return lambda x: layer(jnp.pad(x, ((0, 0), (before, SPAN - 1 - before), (0, 0)), "edge"))
