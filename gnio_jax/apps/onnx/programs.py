@@ -76,7 +76,7 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
     a filter that measures something else of the network than its displacement."""
     config, noise = ekf.config, ekf.noise
     for other in ekf.measurements:
-        if getattr(other, "replaces_displacement", False):
+        if getattr(other, "needs", ()):
             problem = "is not measured by an exported filter, which takes displacements"
             remedy = "set it to null: the filter then takes the network's displacement"
             raise InputError(f"filter.measurements.{other.name}", problem, remedy)
