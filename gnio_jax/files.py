@@ -15,7 +15,6 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from gnio_jax.errors import InputError
 
@@ -37,7 +36,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     path = _target(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent)
-    temporary, handle = _locked(lambda: tempfile.mkstemp(**_naming(path))[::-1])
+
+    def create() -> tuple[str, int]:
+        handle, name = tempfile.mkstemp(path.suffix, f".{path.stem}{PART}", path.parent)
+        return name, handle
+
+    temporary, handle = _locked(create)
     try:
         yield temporary
         os.fsync(handle)  # it has the errors that some file systems report late
@@ -62,11 +66,6 @@ def _target(path: str | os.PathLike[str]) -> Path:
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(path, "is a pipe or a device, not a file", "name a file")
     return path
-
-
-def _naming(path: Path) -> dict[str, Any]:
-    """The arguments with which `tempfile` makes the temporary file of a path."""
-    return {"prefix": f".{path.stem}{PART}", "suffix": path.suffix, "dir": path.parent}
 
 
 def _locked(create: Callable[[], tuple[str, int]]) -> tuple[Path, int]:
@@ -136,11 +135,25 @@ def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
     existing = next(parent for parent in parents if parent.exists())
     try:
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=existing)
+    except FileNotFoundError:  # /proc, or a disk that was unplugged
+        raise InputError(existing, "takes no files", "name another folder") from None
     except OSError as error:
         error.filename = str(existing)  # the user does not know the temporary file
         raise
     os.close(handle)
     Path(name).unlink()
+
+
+def file_in(folder: Path, name: str | Path) -> Path:
+    """The file `name` in a folder, or the only one there whose name differs from it in case alone,
+    as systems that do not tell cases apart may have written it. The first if there is neither."""
+    path = folder / name
+    if path.exists():
+        return path
+    alike: list[str] = []
+    with contextlib.suppress(OSError):
+        alike = [other for other in os.listdir(path.parent) if other.lower() == path.name.lower()]
+    return path.with_name(alike[0]) if len(alike) == 1 else path
 
 
 def with_ending(path: Path, ending: str) -> Path:
@@ -236,6 +249,11 @@ def replacing_folder(path: Path) -> Iterator[Path]:
             if old.exists():
                 old.rename(path)
             raise
+    except OSError as error:
+        # The user does not know the temporary folder.
+        if error.errno is not None:
+            error.filename = str(error.filename or path).replace(str(temporary / "new"), str(path))
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         os.close(handle)

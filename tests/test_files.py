@@ -183,6 +183,11 @@ def test_an_error_names_the_file_that_the_user_knows(tmp_path):
         temporary.write_text("1")
         raise OSError(28, "No space left on device")
     assert error.value.filename == str(tmp_path / "a.txt")
+    with pytest.raises(OSError) as error, replacing_folder(tmp_path / "eval") as folder:
+        (folder / "plots").mkdir()
+        with replacing(folder / "plots" / "a.png"):
+            raise OSError(28, "No space left on device")
+    assert error.value.filename == str(tmp_path / "eval" / "plots" / "a.png")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -203,7 +203,8 @@ def _warnings(summary: Summary, recorded_rate: float, ekf: Filter) -> list[str]:
         f"height: it changes by {summary.climb:.1f} m: that is drift unless the way goes up or "
         "down, which few networks have learnt": summary.climb > CLIMB,
         f"gate: the filter refused {1.0 - accepted:.0%} of the network's displacements: the motion "
-        "is unlike that in the network's training data": accepted < 1.0 - REFUSED,
+        "is unlike that in the network's training data, and the error may be many times the "
+        "expected one": accepted < 1.0 - REFUSED,
         f"speed: {speed:.1f} m/s in the mean is faster than people walk: the track is wrong": (
             speed > FASTEST
         ),

@@ -52,7 +52,7 @@ class Tracked(NamedTuple):
 def track(
     recording: Imported,
     trained: TrainedNetwork,
-    out: Path,
+    out: str | Path,
     formats: tuple[str, ...] = (),
     progress: Progress = silent,
     command: str = "",
@@ -76,7 +76,7 @@ def track(
         InputError: The results could not be written, or the recording is too short or has a hole
             that is too long.
     """
-    sequence, config = recording.sequence, trained.config
+    out, sequence, config = Path(out), recording.sequence, trained.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
     result, ready, ekf = estimate_recording(sequence, trained, progress)
@@ -189,9 +189,10 @@ def _draw(
         "command": command,
         "walked": f"{length}, ends {summary.from_start:.1f} m from the start",
         "expected error at the end": "" if np.isnan(error) else f"{error:.1f} m",
-        "steps": "" if summary.steps is None else f"in {summary.steps:.0%} of the time",
-        "network": f"{summary.network}, trained on {summary.trained_on}",
-        "its error": summary.measured,
+        "steps": "" if summary.steps is None else f"{summary.steps:.0%} of the time",
+        "network": summary.network,
+        "training data": summary.trained_on,
+        "measured error": summary.measured,
         "window orientation": "filter",
         "alignment": aligned if summary.errors else "",
         "reference": partly if 0 < share < 1 else "",
@@ -201,7 +202,7 @@ def _draw(
     # The figures are of the whole track, even if the reference covers only a part of it.
     figures |= summary.errors | {"duration": summary.seconds, "path_length": summary.path_length}
     run = page.PageRun(
-        "track",
+        "estimate",
         {name: text for name, text in facts.items() if text},
         [view],
         {view.name: figures},

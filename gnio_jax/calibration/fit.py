@@ -322,9 +322,10 @@ class PositionErrors(NamedTuple):
     sensitivity: Float[np.ndarray, "k 3 6"]
     """S of the position."""
     with_yaw: Float[np.ndarray, "k 3"]
-    """The filter's covariance of the position with the yaw, m·rad."""
+    """The filter's covariance of the position with the yaw, m·rad; 0 with additive errors, where
+    no covariance has an arc."""
     yaw_sensitivity: Float[np.ndarray, "k 6"]
-    """S of the yaw."""
+    """S of the yaw; 0 with additive errors."""
     raw_axis: Float[np.ndarray, "k 3"]
     """As `considered_covariance` takes it."""
 
@@ -344,7 +345,6 @@ def fit_considered(
         raise InputError("the filter", "is not healthy where these recordings have a reference")
     raw = positions.raw_axis.any(axis=1)
     mixed = raw.any() and not raw.all()
-    invariant = settings.error == "invariant"
     initial = CONSIDERED._replace(raw_gyro_bias=0.0)
     fitted = _fit_considered_below(
         PositionErrors(*(part[~raw] for part in positions)) if mixed else positions,
@@ -360,7 +360,7 @@ def fit_considered(
             dataclasses.replace(settings, considered=initial),
             "considered.raw_gyro_bias",
         )
-    with_fitted = _add_considered(positions, fitted.considered, invariant)
+    with_fitted = _add_considered(positions, fitted.considered)
     before, after = (
         float(jnp.mean(normalised_squares(positions.error, covariance))) / 3
         for covariance in (positions.covariance, with_fitted)
@@ -375,11 +375,10 @@ def _fit_considered_below(
     free = free_parameters(settings, [path])
     names, start = tuple(free), np.array(list(free.values()))
     independent = len(positions.error) * stride_seconds / INDEPENDENT_SECONDS
-    invariant = settings.error == "invariant"
 
     def objective(free: Float[Array, "u"]) -> Array:
         std = with_free_parameters(settings, dict(zip(names, free, strict=True))).considered
-        likelihood = gaussian_nll(positions.error, _add_considered(positions, std, invariant))
+        likelihood = gaussian_nll(positions.error, _add_considered(positions, std))
         return likelihood + _prior(free, start) / independent
 
     compiled = jax.jit(jax.value_and_grad(objective))
@@ -391,14 +390,12 @@ def _fit_considered_below(
     return with_written_parameters(settings, dict(zip(names, search.x, strict=True)), DIGITS)
 
 
-def _add_considered(positions: PositionErrors, std: ConsideredStd, invariant: bool) -> Array:
-    """The covariances of the positions, with the consider covariance as `with_considered` adds it;
-    `invariant` says whether the filter's error is."""
+def _add_considered(positions: PositionErrors, std: ConsideredStd) -> Array:
+    """The covariances of the positions, with the consider covariance as `with_considered` adds
+    it."""
     rows = jnp.concatenate([positions.yaw_sensitivity[:, None], positions.sensitivity], axis=1)
     added = considered_covariance(rows, std, positions.raw_axis)
     covariance = positions.covariance + added[:, 1:, 1:]
-    if not invariant:
-        return covariance
     arc, arc_before = (
         arc_of(yaw_lever(with_yaw))
         for with_yaw in (positions.with_yaw + added[:, 0, 1:], jnp.asarray(positions.with_yaw))
@@ -440,6 +437,8 @@ def _run_walks(
         covariance = history.covariance[:, POSITION, POSITION]
         of_position = covariance, derivatives[:, POSITION]
         of_yaw = history.covariance[:, POSITION, YAW], derivatives[:, YAW]
+        if not ekf.config.invariant:
+            of_yaw = jax.tree.map(jnp.zeros_like, of_yaw)
         axis = jnp.tile(start.raw_axis[None], (len(covariance), 1))
         return history.healthy, history.position, *of_position, *of_yaw, axis
 

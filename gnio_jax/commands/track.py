@@ -13,6 +13,7 @@ from rich.table import Table
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
 from gnio_jax.config.schema import UNNAMED
+from gnio_jax.errors import InputError
 from gnio_jax.files import file_stem
 
 ERRORS = ("ate", "ate_2d", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio")
@@ -50,6 +51,8 @@ def track(request: TrackOptions, call: options.Call) -> None:
       {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
           accel_z=az
     """
+    if not request.file.exists():
+        raise InputError(request.file, "no such file or folder")
     console.compile_quickly()
     import jax  # late, so that mistakes do not wait for it
 

@@ -41,6 +41,7 @@ from gnio_jax.config.schema import (
     ModelConfig,
     NoiseModel,
     OptimConfig,
+    SegmentTraining,
     ThroughFilter,
     TrainConfig,
 )
@@ -61,6 +62,7 @@ __all__ = [
     "ModelConfig",
     "NoiseModel",
     "OptimConfig",
+    "SegmentTraining",
     "TablesConfig",
     "ThroughFilter",
     "TrainConfig",

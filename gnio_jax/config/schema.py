@@ -56,6 +56,8 @@ class Words(NamedTuple):
 FILE_ONLY = "file only"
 """Mark of a field that is no option of the command line; --set reaches it."""
 UNNAMED = Words(named=False)
+LONGEST_INPUT = 60.0
+"""Longest window with its context, s (ours): the filter keeps a clone for each stride of it."""
 Number = Any
 """A float in a file. Inside a JAX program it may be an array, so type checkers accept any type."""
 
@@ -91,12 +93,17 @@ class Entries(Mapping[str, Any]):
 ABOVE_ZERO = Bound(lambda value: 0 < value < math.inf, "must be positive and finite")
 NOT_NEGATIVE = Bound(lambda value: 0 <= value < math.inf, "must be finite and not negative")
 FACTOR = Bound(lambda value: 1e-6 <= value <= 1e6, "must be from 1e-6 to 1e6")
+FINITE = Bound(math.isfinite, "must be finite")
 SHARE = Bound(lambda value: 0 <= value < 1, "must be at least 0 and below 1")
+PACE = Bound(lambda value: 0.1 <= value <= 10, "must be from 0.1 to 10")
 
 Positive = Annotated[float, ABOVE_ZERO]
 NonNegative = Annotated[float, NOT_NEGATIVE]
-Finite = Annotated[float, Bound(math.isfinite, "must be finite")]
+Finite = Annotated[float, FINITE]
 Probability = Annotated[float, SHARE]
+Width = Annotated[int, Bound(lambda value: 1 <= value <= 4096, "must be from 1 to 4096")]
+Share = Annotated[float, Bound(lambda value: 0 <= value <= 1, "must be from 0 to 1")]
+Factor = Annotated[float, PACE]
 Count = Annotated[int, Bound(lambda value: 1 <= value < 2**31, "must be at least 1 and below 2^31")]
 NonNegativeCount = Annotated[
     int, Bound(lambda value: 0 <= value < 2**31, "must not be negative and below 2^31")
@@ -173,13 +180,17 @@ class DataConfig:
         return round(self.train_stride_seconds * self.rate)
 
     def check(self, location: Location) -> None:
-        """Check that window, context and strides are whole samples, and that strides fill window
-        and context."""
+        """Check that window, context and strides are whole samples, that strides fill window and
+        context, and that both together are not longer than `LONGEST_INPUT`."""
         for name in ("window_seconds", "context_seconds", "stride_seconds", "train_stride_seconds"):
             samples = getattr(self, name) * self.rate
             if not _is_whole(samples):
                 problem = f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
                 location.child(name).refuse(problem)
+        if self.window_seconds + self.context_seconds > LONGEST_INPUT:
+            longest = "context" if self.context_seconds else "window"
+            problem = f"makes an input of more than {LONGEST_INPUT:g} s"
+            location.child(f"{longest}_seconds").refuse(problem)
         if self.window % self.stride:
             location.child("stride_seconds").refuse(
                 f"must divide the window of {self.window_seconds:g} s"
@@ -219,13 +230,25 @@ class AugmentConfig:
     """Half-widths of a window's uniform scale errors of gyro and accelerometer (ours)."""
     rest_share: Annotated[Probability, FILE_ONLY] = 0.0
     """Share of the windows that are replaced by windows of a phone at rest (ours)."""
+    walkway_share: Annotated[Share, FILE_ONLY] = 0.0
+    """Share of the segments that are walked on a moving walkway: the same gait at another speed
+    (`training.walkway`; ours)."""
+    walkway: Annotated[tuple[Factor, Factor], FILE_ONLY] = (0.45, 2.0)
+    """Smallest and largest factor of the mean speed on a walkway."""
+    alternating_gain: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
+    """Smallest and largest factor of what is not slow in position and acceleration, for segments
+    (ours)."""
+    time_stretch: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
+    """Smallest and largest factor of the pace at which a segment is played (ours)."""
 
     def check(self, location: Location) -> None:
-        """Check that the lowest cut-off is not above the highest."""
-        if self.low_pass_hertz[0] > self.low_pass_hertz[1]:
-            location.child("low_pass_hertz").refuse(
-                "has the higher frequency first", "give the lower one first"
-            )
+        """Check that no range has its ends in the wrong order."""
+        for name in ("low_pass_hertz", "walkway", "alternating_gain", "time_stretch"):
+            low, high = getattr(self, name)
+            if low > high:
+                location.child(name).refuse(
+                    "has the larger one first", "give the smaller one first"
+                )
 
 
 @dataclass(frozen=True)
@@ -235,8 +258,8 @@ class ModelConfig:
     that the network does not have is refused."""
 
     name: str = "gnio"
-    """Network in the registry of `gnio_jax.models`."""
-    width: Count | None = None
+    """Name of the network, one of the package or of a plugin."""
+    width: Width | None = None
     """Channels of the first encoder group; the others follow (gnio, tlio, ronin_resnet, deepils:
     64). Features of a sample (ctin, state_space: 96), of the first convolution (gru: 64), of the
     first block (ronin_tcn: 16), or units of a layer (ronin_lstm: 100)."""
@@ -540,6 +563,9 @@ class ThroughFilter:
     Options of the filter that are 0 are not trained."""
     piece_seconds: Positive = 60.0
     """Length of the segments of recordings that are filtered, s."""
+    truncate_seconds: NonNegative = 10.0
+    """The filter, and the memory of a network that has one, continues without gradient after every
+    interval of this length, s; 0: the gradient goes through the whole segment."""
     filter_learning_rate: Positive = 0.03
     """Peak learning rate of the logarithms of the filter's options; the network's is
     optim.learning_rate. Both have its schedule."""
@@ -554,6 +580,21 @@ class ThroughFilter:
     covariance."""
     window_weight: Annotated[NonNegative, FILE_ONLY] = 100.0
     """Weight of the squared error of each window's displacement."""
+
+
+@dataclass(frozen=True)
+class SegmentTraining:
+    """Training of a network with memory on segments of walks, with the attitude of the reference
+    (ours). The section `optim` counts segments instead of windows, and `augment` changes segments:
+    all but `shift_samples`."""
+
+    seconds: NonNegative = 0.0
+    """Length of the segments, s. 0 trains on windows (with a memory that begins anew in each)."""
+    truncate_seconds: NonNegative = 0.0
+    """The memory continues without gradient after every interval of this length, s; 0: the gradient
+    goes through the whole segment."""
+    horizon_weight: NonNegative = 0.0
+    """Weight of the relative squared error of displacements over 5, 10, 30 and 60 windows."""
 
 
 @dataclass(frozen=True)
@@ -581,6 +622,7 @@ class TrainConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     filter: Annotated[FilterSettings, FILE_ONLY] = field(default_factory=FilterSettings)
+    segments: SegmentTraining = field(default_factory=SegmentTraining)
     through_filter: ThroughFilter = field(default_factory=ThroughFilter)
 
     @property
@@ -595,6 +637,9 @@ class TrainConfig:
         whole strides that are longer than a window and its context. A network that predicts every
         sample takes no context."""
         names, weights = self.datasets, self.data.weights
+        for name in ("data_root", "workdir", "init_from"):
+            if "\0" in (getattr(self, name) or ""):
+                location.child(name).refuse("holds a zero, which no name of a file has")
         if len(set(names)) < len(names) or not names:
             location.child("dataset").refuse("is empty, or names a dataset twice", "name each once")
         if len(names) > 1 and self.data_root is not None:
@@ -615,7 +660,25 @@ class TrainConfig:
             problem = "is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"
             location.child("model.equivariance").refuse(problem, remedy)
+        self._check_segments(location)
         self._check_through_filter(location)
+
+    def _check_segments(self, location: Location) -> None:
+        segments, data = self.segments, self.data
+        if not segments.seconds:
+            return
+        for name in ("seconds", "truncate_seconds"):
+            if not _is_whole(getattr(segments, name) / data.stride_seconds):
+                problem = f"is not a whole number of strides of {data.stride_seconds:g} s"
+                location.child(f"segments.{name}").refuse(problem)
+        if segments.seconds < 2 * data.window_seconds:
+            problem = f"must be at least two windows of {data.window_seconds:g} s"
+            location.child("segments.seconds").refuse(problem)
+        if data.context_seconds or data.window_rotation != "per_sample":
+            problem = "are for networks whose windows have no context and rotate every sample"
+            location.child("segments").refuse(problem)
+        if self.loss.name != "weighted_sum":
+            location.child("segments").refuse(f"have no loss '{self.loss.name}'")
 
     def _check_through_filter(self, location: Location) -> None:
         through = self.through_filter
@@ -624,6 +687,9 @@ class TrainConfig:
         if not _is_whole(through.piece_seconds / self.data.stride_seconds):
             problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
             location.child("through_filter.piece_seconds").refuse(problem)
+        if not _is_whole(through.truncate_seconds / self.data.stride_seconds):
+            problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
+            location.child("through_filter.truncate_seconds").refuse(problem)
         if through.piece_seconds < SHORTEST_HORIZON:
             problem = f"must be at least {SHORTEST_HORIZON:g} s, the shortest horizon of its losses"
             location.child("through_filter.piece_seconds").refuse(problem)

@@ -11,6 +11,7 @@ import contextlib
 import functools
 import hashlib
 import json
+import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -31,6 +32,8 @@ _FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "vali
 _WAYPOINTS = tuple(f"waypoints/{field}" for field in Waypoints._fields)
 _BLOCK = 1 << 20
 """Bytes by which a file in memory grows."""
+_NUMBERS = {"start_time": -math.inf, "recorded_rate": 0.0, "accel_clipped": -1e-9}
+"""Attributes with which is computed, and the values above which they must be."""
 _ATTRIBUTE_TYPES = (str, bool, int, float, np.bool_, np.integer, np.floating)
 
 
@@ -135,9 +138,23 @@ def _stored_sequence(stored: _StoredGroup, path: Path) -> Sequence:
     if present.intersection(_WAYPOINTS):
         optional["waypoints"] = Waypoints(*map(field_values, _WAYPOINTS))
     name = str(header.get("name", path.stem))
-    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in attributes.items()}
+    plain = {key: _plain(key, value, path) for key, value in attributes.items()}
     required = map(field_values, _FIELDS)
     return validate(Sequence(name, *required, **optional, attributes=plain), path)
+
+
+def _plain(key: str, value: object, path: Path) -> str | bool | int | float:
+    """An attribute as a text, number or boolean. Raises `InputError` for anything else, and for one
+    of `_NUMBERS` that is no number."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    problem = f"attribute '{key}' is {shortened(ascii(plain))}"
+    if not isinstance(plain, str | bool | int | float):
+        raise InputError(path, f"{problem}, no text or number", "convert the recording again")
+    least = _NUMBERS.get(key)
+    if least is None or (isinstance(plain, int | float) and least < plain < math.inf):
+        return plain
+    remedy = "convert the recording again, or remove the attribute"
+    raise InputError(path, f"{problem}, no possible number", remedy)
 
 
 # --- the cache

@@ -18,6 +18,7 @@ import numpy as np
 
 from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.types import Sequence
 
 SEED = 20181130
@@ -51,7 +52,7 @@ def find_folders(root: Path, is_recording: Callable[[Path], bool]) -> dict[str, 
 def find_list(root: Path, name: str) -> Path:
     """The list file `name` at `root`, in its folder `lists`, or else anywhere below; `root / name`
     if there is none."""
-    for path in (root / name, root / "lists" / name):
+    for path in (file_in(root, name), file_in(root / "lists", name)):
         if path.is_file():
             return path
     return next(iter(sorted(root.rglob(name))), root / name)
@@ -94,6 +95,7 @@ def read_list(
     names no recording that is present.
     """
     layout = f"expected layout: {layout}"
+    path = file_in(path.parent, path.name)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

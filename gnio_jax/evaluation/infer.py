@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.config import DataConfig
+from gnio_jax.evaluation.infer_memory import remembered_displacements
 from gnio_jax.evaluation.prepare import PreparedRecording
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
@@ -71,6 +72,14 @@ def infer(
         least_std: Smallest standard deviation that the estimator uses, m
             (`FilterConfig.log_std_min` is its logarithm).
     """
+    if network.has_memory:
+        select = functools.partial(keep, names=diagnostics)
+        results = []
+        for number, recording in enumerate(recordings):
+            arguments = network, recording, windows, select, least_std
+            results.append(Displacements(*remembered_displacements(*arguments)))
+            progress((number + 1) / len(recordings))
+        return results
     parts, starts, turns = [], [], []
     for recording in recordings:
         assert recording.attitude is not None

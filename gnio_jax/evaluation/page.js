@@ -3,6 +3,7 @@
 const sequence = document.getElementById("sequence");
 const slider = document.getElementById("time");
 const readout = document.getElementById("readout");
+const whole = document.getElementById("whole");
 const rows = document.querySelectorAll("tr[data-sequence]");
 
 const shown = (run) => columns[run][Number(sequence.value)].data;
@@ -64,7 +65,7 @@ function choose() {
     y: columns.map((_, run) => shown(run).y[0]),
     colour: starts.data.colour,
   };
-  corners.data = frames[Number(sequence.value)];
+  corners.data = frames[Number(sequence.value)][Number(whole.checked)];
   slider.max = end;
   slider.step = end / Math.max(last, 1);
   slider.value = end;
@@ -77,6 +78,10 @@ function choose() {
 
 slider.addEventListener("input", move);
 window.addEventListener("resize", fit);
+whole.addEventListener("change", () => {
+  corners.data = frames[Number(sequence.value)][Number(whole.checked)];
+  plan.reset.emit();
+});
 sequence.addEventListener("change", () => { choose(); plan.reset.emit(); });
 rows.forEach((row) => row.addEventListener("click", () => {
   sequence.value = row.dataset.sequence;

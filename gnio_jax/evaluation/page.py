@@ -28,13 +28,13 @@ from gnio_jax import drawing
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.tabulate import COLUMNS
-from gnio_jax.evaluation.views import SIGMAS, View, ellipses
+from gnio_jax.evaluation.views import SIGMAS, View, ellipses, horizontal_speed, map_corners
 from gnio_jax.files import write_text
 
 ROWS, FEWEST_ROWS = 9000, 150
 """Largest number of rows of a page, over all runs and sequences, and smallest number of rows of a
 sequence. Fifteen minutes at ten rows per second are complete; longer sequences are thinned."""
-LATER = ("command", "weights")
+LATER = ("command", "weights", "training data", "measured error")
 """Facts about the first run that are not shown under the title."""
 STRIPS = {"gate": "gate γ (–)", "scale": "scale (–)", "std": "σ of network (m)"}
 """Curves with a value for each axis of the window's yaw frame, and their labels."""
@@ -178,6 +178,8 @@ def make_columns(view: View, rows: int) -> Columns:
         "reference_x": reference[:, 0],
         "reference_y": reference[:, 1],
         "error": np.linalg.norm((path - reference)[:, :2], axis=1),
+        "speed": horizontal_speed(path, view.step),
+        "reference_speed": horizontal_speed(reference, view.step),
         **ellipses(view.filtered.covariance)._asdict(),
     }
     quantities = {**view.network.diagnostics, "std": view.network.std}
@@ -202,22 +204,24 @@ def make_columns(view: View, rows: int) -> Columns:
     return {name: values.astype(np.float32) for name, values in curves.items()}
 
 
-def frame(runs: list[PageRun], sequence: str) -> dict[str, list[float]]:
-    """Corners of the map of a sequence: they enclose the paths of all runs, and the ellipses of the
-    first."""
+def frame(runs: list[PageRun], sequence: str, whole: bool = False) -> dict[str, list[float]]:
+    """Corners of the map of a sequence: they enclose the paths of all runs, and if it is the
+    `whole` map, the ellipses of the first."""
     views = [view for run in runs for view in run.views if view.name == sequence]
-    variance = np.diagonal(views[0].filtered.covariance, axis1=1, axis2=2)[:, :2]
-    reach = np.nan_to_num(SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
-    position = views[0].position[:, :2]
     parts = [
         part[:, :2]
         for view in views
         for part in (view.position, view.reference, view.waypoints.position)
     ]
-    points = np.concatenate([position - reach, position + reach, *parts])
-    points = points[np.isfinite(points).all(1)] if np.isfinite(points).any() else np.zeros((1, 2))
-    (low_x, low_y), (high_x, high_y) = points.min(0).tolist(), points.max(0).tolist()
-    return {"x": [low_x, high_x], "y": [low_y, high_y]}
+    corners = map_corners(np.concatenate(parts))
+    if whole:
+        variance = np.diagonal(views[0].filtered.covariance, axis1=1, axis2=2)[:, :2]
+        reach = np.nan_to_num(SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
+        position = views[0].position[:, :2]
+        ends = np.concatenate([position - reach, position + reach])
+        ends = np.concatenate([corners, ends[np.isfinite(ends).all(axis=1)]])
+        corners = np.stack([ends.min(axis=0), ends.max(axis=0)])
+    return {"x": corners[:, 0].tolist(), "y": corners[:, 1].tolist()}
 
 
 # --- the figures
@@ -261,8 +265,17 @@ def _draw(runs: list[PageRun], columns: list[list[Columns]]) -> tuple[Document, 
     figures: dict[str, Any] = {"map": _draw_map(paths, sources, has_reference, has_waypoints)}
     legend = "error" if len(runs) == 1 else ""  # for several runs the map names the colours
     errors = [(source, "error", legend, colour) for source, _, colour in paths if has_reference]
-    label = "error (m)" if has_reference or has_waypoints else "3σ (m)"
+    has_errors = has_reference or has_waypoints
+    label = f"horizontal {'error' if has_errors else '3σ'} (m)"
     strips = [_draw_strip(sources, times, label, errors, True, has_waypoints)]
+    if has_errors and all(view.has_reference or len(view.at_waypoints) for view in runs[0].views):
+        # The errors decide the scale: 3σ may be ten times as large, and is cut.
+        drawn = [glyph for glyph in strips[0].renderers if glyph.name != "major"]
+        strips[0].y_range = DataRange1d(renderers=drawn, start=0.0, range_padding=1.0)
+    speeds = [(first, "speed", "estimate", drawing.BLUE)]
+    if has_reference:
+        speeds.insert(0, (first, "reference_speed", "reference", drawing.REFERENCE))
+    strips.append(_draw_strip(sources, times, "speed (m/s)", speeds))
     for name, label in STRIPS.items():
         if f"{name}_x" in names:
             curves = [
@@ -292,7 +305,9 @@ def _draw(runs: list[PageRun], columns: list[list[Columns]]) -> tuple[Document, 
     arguments = {
         **sources._asdict(),
         "columns": [[*map(ColumnDataSource, run_columns)] for run_columns in columns],
-        "frames": [frame(runs, view.name) for view in runs[0].views],
+        "frames": [
+            [frame(runs, view.name, whole) for whole in (False, True)] for view in runs[0].views
+        ],
         "plan": figures["map"],
         "legends": [plot.legend[0] for plot in plots if plot.legend],
         "times": times,

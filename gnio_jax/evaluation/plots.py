@@ -21,7 +21,7 @@ from matplotlib.ticker import PercentFormatter
 from gnio_jax import drawing
 from gnio_jax.evaluation import metrics, statistics, tabulate
 from gnio_jax.evaluation.report import Report
-from gnio_jax.evaluation.views import SIGMAS, View, ellipses
+from gnio_jax.evaluation.views import SIGMAS, View, ellipses, horizontal_speed, map_corners
 from gnio_jax.files import file_stems, shown_name
 from gnio_jax.numerics import finite_rows
 from gnio_jax.reporting import Progress, silent
@@ -30,6 +30,8 @@ STANDING = "#E8E8E8"
 TAP: dict[str, Any] = {"marker": "x", "ls": "", "ms": 7, "mew": 1.8}
 MARKERS = "os^Dv"
 """Markers; the next one is used when there are more rows than colours."""
+CUT = 3.0
+"""Number of times the largest error up to which a strip shows the filter's 3σ."""
 ELLIPSES = 4
 """Number of outlines on a map, at equal times, the last at the end."""
 TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
@@ -37,16 +39,6 @@ TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
 
 
 # --- one sequence
-
-
-def speed(position: Float[np.ndarray, "n 3"], step: float) -> Float[np.ndarray, "n"]:
-    """Horizontal speed, m/s, as a mean over the second around each row."""
-    lag = max(1, round(1.0 / step))
-    speeds = np.full(len(position), np.nan)
-    if len(position) > lag:
-        distance = np.linalg.norm((position[lag:] - position[:-lag])[:, :2], axis=1)
-        speeds[lag // 2 :][: len(distance)] = distance / (lag * step)
-    return speeds
 
 
 def sequence(view: View, title: str = "") -> Figure:
@@ -100,7 +92,7 @@ def _draw_map(axes: Axes, view: View) -> None:
             size, angle = (2 * shapes.major[row], 2 * shapes.minor[row]), shapes.angle[row]
             shape = Ellipse(tuple(view.position[row, :2]), *size, angle=float(np.degrees(angle)))
             shape.set(fill=False, **outline)
-            axes.add_patch(shape)
+            axes.add_artist(shape)  # unlike a patch it does not change the map's frame
         axes.plot([], [], label="3σ", **outline)
     for path, colour in ((view.reference, drawing.REFERENCE), (view.position, drawing.BLUE)):
         points = path[finite_rows(path)]
@@ -109,8 +101,10 @@ def _draw_map(axes: Axes, view: View) -> None:
             axes.plot(*points[-1, :2], color=colour, zorder=4, **drawing.END)
     axes.plot([], [], color=drawing.GREY, label="start", **drawing.START)
     axes.plot([], [], color=drawing.GREY, label="end", **drawing.END)
+    paths = (view.position[:, :2], view.reference[:, :2], view.waypoints.position)
+    axes.update_datalim(map_corners(np.concatenate(paths)))
+    axes.margins(0.0)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.08)
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.legend(loc="best", ncols=2, fontsize=9, framealpha=0.9)
@@ -118,8 +112,8 @@ def _draw_map(axes: Axes, view: View) -> None:
 
 
 def _draw_error(axes: Axes, view: View, vertical: bool = False) -> None:
-    """Draw the error of the position, with the filter's 3σ behind it; without a reference only the
-    3σ."""
+    """Draw the error of the position, with the filter's 3σ behind it, which is cut where it is much
+    larger; without a reference only the 3σ."""
     bound, colour, name = ellipses(view.filtered.covariance).major, drawing.BLUE, "horizontal"
     error = np.linalg.norm((view.position - view.reference)[:, :2], axis=1)
     if vertical:
@@ -134,6 +128,11 @@ def _draw_error(axes: Axes, view: View, vertical: bool = False) -> None:
     if has_waypoints:
         style = {"color": drawing.REFERENCE, "label": "at waypoints", "clip_on": False, **TAP}
         axes.plot(view.waypoints.time, view.errors, **style)
+    errors = np.abs(np.concatenate([error, view.errors if has_waypoints else error[:0]]))
+    if np.isfinite(errors).any() and np.isfinite(bound).any():
+        largest = np.nanmax(errors[np.isfinite(errors)])
+        top = max(1.1 * largest, min(1.1 * np.nanmax(bound), CUT * largest))
+        axes.set_ylim(-top if vertical else 0.0, max(top, 1e-3))
     axes.axhline(0, color=drawing.REFERENCE, lw=0.6)
     axes.set_ylabel(f"{name}\n{'error' if view.has_reference or has_waypoints else '3σ'} (m)")
 
@@ -141,12 +140,14 @@ def _draw_error(axes: Axes, view: View, vertical: bool = False) -> None:
 def _draw_speed(axes: Axes, view: View) -> None:
     black = {"color": drawing.REFERENCE, "lw": 1.4}
     if view.has_reference:
-        axes.plot(view.time, speed(view.reference, view.step), label="reference", **black)
+        axes.plot(
+            view.time, horizontal_speed(view.reference, view.step), label="reference", **black
+        )
     if len(view.at_waypoints):
         times, positions = view.waypoints
         legs = np.linalg.norm(np.diff(positions, axis=0), axis=1) / np.diff(times)
         axes.stairs(legs, times, baseline=None, label="legs", **black)
-    estimated = speed(view.position, view.step)
+    estimated = horizontal_speed(view.position, view.step)
     axes.plot(view.time, estimated, color=drawing.BLUE, lw=1.1, label="estimate")
     axes.set_ylabel("horizontal\nspeed (m/s)")
     axes.set_ylim(bottom=0)
@@ -162,7 +163,7 @@ def _draw_gate(axes: Axes, view: View) -> None:
 
 
 def _draw_accepted(axes: Axes, view: View) -> None:
-    axes.plot(view.time, view.filtered.accepted, color=drawing.BLUE, lw=1.0, label="used")
+    axes.plot(view.time, view.filtered.accepted, color=drawing.BLUE, lw=1.0, label="accepted")
     axes.set_ylim(-0.05, 1.05)
     axes.set_ylabel("displacement")
 

@@ -19,6 +19,11 @@ SIGMAS = 3.0
 """Size of ellipses, ellipsoids and bands, in standard deviations."""
 
 
+ROOM, SMALLEST = 1.5, 2.0
+"""Size of a map relative to that of the paths on it, and smallest size, m. Ellipses are cut: those
+of an uncertain track may be ten times as large as its path."""
+
+
 class View(NamedTuple):
     """A trajectory and its reference in one frame, with the curves of network and filter.
 
@@ -98,3 +103,25 @@ def ellipses(covariance: Float[np.ndarray, "n 3 3"]) -> Ellipses:
     minor, major = SIGMAS * np.sqrt(np.maximum(variance, 0.0)).T
     angle = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
     return Ellipses(*(np.where(finite, part, np.nan) for part in (major, minor, angle)))
+
+
+def map_corners(points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "2 2"]:
+    """The lower left and the upper right corner of a map of paths, m. Points that are not finite do
+    not count."""
+    finite = points[finite_rows(points)] if len(points) else points
+    if not len(finite):
+        finite = np.zeros((1, 2))
+    low, high = finite.min(axis=0), finite.max(axis=0)
+    half = np.maximum(ROOM * (high - low), SMALLEST) / 2
+    return np.stack([(low + high) / 2 - half, (low + high) / 2 + half])
+
+
+def horizontal_speed(position: Float[np.ndarray, "n 3"], step: float) -> Float[np.ndarray, "n"]:
+    """Horizontal speed, m/s, as a mean over the second around each row, for rows that are `step`
+    apart, s."""
+    lag = max(1, round(1.0 / step))
+    speeds = np.full(len(position), np.nan)
+    if len(position) > lag:
+        distance = np.linalg.norm((position[lag:] - position[:-lag])[:, :2], axis=1)
+        speeds[lag // 2 :][: len(distance)] = distance / (lag * step)
+    return speeds

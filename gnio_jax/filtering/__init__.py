@@ -12,6 +12,8 @@ from gnio_jax.filtering.filter import Filter, make_filter
 from gnio_jax.filtering.fix import Fix, fixes_on_intervals
 from gnio_jax.filtering.history import FilterHistory, explain_failure
 from gnio_jax.filtering.measurements import register
+from gnio_jax.filtering.mounting import Mounting, find_mounting
+from gnio_jax.filtering.nonholonomic import NonHolonomic
 from gnio_jax.filtering.scan import run_filter, run_odometry
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth
@@ -34,7 +36,9 @@ __all__ = [
     "GateState",
     "InitialStd",
     "Linearised",
+    "Mounting",
     "NoiseModel",
+    "NonHolonomic",
     "Outcome",
     "Pose",
     "SmoothedHistory",
@@ -46,6 +50,7 @@ __all__ = [
     "cores_as_devices",
     "displacements",
     "explain_failure",
+    "find_mounting",
     "fixes_on_intervals",
     "initial_state",
     "level_state",

@@ -218,7 +218,7 @@ def _shrink(
         approximation = _filter(approximation, low, 2**level)
     for level in reversed(range(LEVELS)):
         parts = (approximation, low), (details[level], high)
-        approximation = sum(_filter(y, taps, -(2**level)) for y, taps in parts)
+        approximation = sum((_filter(y, taps, -(2**level)) for y, taps in parts), jnp.zeros_like(x))
     return approximation
 
 

@@ -156,7 +156,10 @@ def _read_files(path: Path) -> tuple[NetworkSettings, bytes]:
     if card is None and not (path / WEIGHTS).is_file():
         remedy = "let gnio train finish its first epoch, or name another network"
         raise InputError(path, f"holds no weights ({WEIGHTS} is missing)", remedy)
-    text, weights = _read_file(path, CONFIG), _read_file(path, WEIGHTS)
+    sizes = LARGEST if card is None else {name: card.files[name]["bytes"] for name in card.files}
+    text, weights = (
+        _read_file(path, name, min(sizes[name], LARGEST[name])) for name in (CONFIG, WEIGHTS)
+    )
     for name, content in ((CONFIG, text), (WEIGHTS, weights)):
         if card is not None and fingerprint(content) != card.files[name]:
             problem = f"'{name}' is not the file that the card describes (SHA-256 differs)"
@@ -191,7 +194,9 @@ def read_card(path: Path) -> Card:
         value = facts.get(name)
         if type(value) is not kind or (isinstance(value, int) and not 0 <= value < 2**31):
             raise InputError(where, f"has no '{name}', or a wrong one", DAMAGED)
-    if facts["files"].keys() != {CONFIG, WEIGHTS}:
+    files = facts["files"]
+    sizes = [entry.get("bytes") for entry in files.values() if isinstance(entry, dict)]
+    if files.keys() != {CONFIG, WEIGHTS} or [type(size) for size in sizes] != [int, int]:
         raise InputError(where, f"does not describe '{CONFIG}' and '{WEIGHTS}'", DAMAGED)
     return Card(*(facts[name] for name in Card._fields))
 
@@ -207,7 +212,7 @@ def read_text(path: Path) -> str:
 def _split_card(path: Path) -> tuple[dict[str, Any], str]:
     """The facts of a card and its text."""
     try:
-        content = _read_file(path, CARD).decode("utf-8")
+        content = _read_file(path, CARD, LARGEST[CARD]).decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(path / CARD, f"cannot be read ({error})", DAMAGED) from None
     _, *parts = content.split(BOUND, 2)
@@ -223,11 +228,11 @@ def _digest(facts: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(others, sort_keys=True).encode()).hexdigest()
 
 
-def _read_file(path: Path, name: str) -> bytes:
-    """The content of a file of a folder or zip, if it is not larger than `LARGEST`."""
-    content = _read_start(path, name, LARGEST[name] + 1)
-    if len(content) > LARGEST[name]:
-        raise InputError(path, f"'{name}' is larger than {LARGEST[name]} bytes", DAMAGED)
+def _read_file(path: Path, name: str, most: int) -> bytes:
+    """The content of a file of a folder or zip, if it has at most so many bytes."""
+    content = _read_start(path, name, max(most, 0) + 1)
+    if len(content) > most:
+        raise InputError(path, f"'{name}' is larger than {most} bytes", DAMAGED)
     return content
 
 
@@ -237,11 +242,15 @@ def _read_start(path: Path, name: str, count: int) -> bytes:
         if path.is_dir():
             with (path / name).open("rb") as file:
                 return file.read(count)
-        with zipfile.ZipFile(path) as archive, archive.open(name) as file:
-            return file.read(count)
+        with zipfile.ZipFile(path) as archive:
+            method = archive.getinfo(name).compress_type
+            if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise zipfile.BadZipFile(f"compression method {method}")  # none of `gnio publish`
+            with archive.open(name) as file:
+                return file.read(count)
     except (FileNotFoundError, KeyError):
         raise InputError(path, f"'{name}' is missing", DAMAGED) from None
-    except (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+    except (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError) as error:
         raise InputError(path, f"'{name}' cannot be read ({error})", DAMAGED) from None
 
 

@@ -35,6 +35,8 @@ METRICS = (
 )
 """Metrics of every table, if rows have them. Rows are compared by the first."""
 
+TITLES = {"ate_ronin_2d": tabulate.Column("RoNIN's ATE 2-D", "m")}
+"""Metrics that tables of evaluations do not show."""
 ABLATIONS = {
     "components": experiments.components,
     "gates": experiments.gates,
@@ -110,8 +112,9 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> s
         f"{base.datasets[0]} {options.split}, {options.estimator}; every row: "
         f"{base.optim.epochs} epochs of batches of {base.optim.batch_size}, learning rate "
         f"{base.optim.learning_rate:g}, width {base.model.width or 64}, {base.data.rate:g} Hz, "
-        f"{options.seeds} seeds{calibrated}; on {hardware()}. ± is the standard deviation over "
-        "seeds; the difference to the first row is over sequences.\n\n"
+        f"{options.seeds} {'seed' if options.seeds == 1 else 'seeds'}{calibrated}; on "
+        f"{hardware()}. ± is the standard deviation over seeds; the difference to the first "
+        "row is over sequences.\n\n"
         f"Published: {experiment.source}; the paper does not define its ATE."
     )
 
@@ -193,9 +196,9 @@ def figures_of(results: list[RowResult]) -> dict[str, list[Cell]]:
 
 def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
     """The table as Markdown, followed by the meaning of its marks."""
-    columns = {name: tabulate.column(name) for name in figures}
-    header = ["", *(column.title for column in columns.values()), "median ATE (m)", "gain"]
-    header += ["difference of ATE, m (95 %)", "published (m)", "its gain"]
+    columns = {name: TITLES.get(name) or tabulate.column(name) for name in figures}
+    header = ["", *(column.title for column in columns.values()), "median ATE (m)", "change of ATE"]
+    header += ["difference of ATE, m (95 %)", "published (m)", "its change"]
     table, first = [], experiment.rows[0].published
     for index, row in enumerate(experiment.rows):
         summary, difference = figures["ate"][index]

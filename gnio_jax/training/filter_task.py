@@ -49,8 +49,6 @@ from gnio_jax.types import Sequence
 
 CHECKPOINT_EVERY = 20
 """Clone intervals between the states that the backward pass keeps."""
-TRUNCATE_SECONDS = 10.0
-"""The filter's state continues without gradient after every interval of this length, s."""
 START_SPREAD = 1.0
 """Each segment starts with errors that are drawn from the filter's initial standard deviations
 times this factor."""
@@ -118,7 +116,9 @@ class FilterTask(Task):
             filter_config(self.config.data, self.config.filter),
             gate_softness=GATE_SOFTNESS,
             checkpoint_every=CHECKPOINT_EVERY,
-            truncate_every=round(TRUNCATE_SECONDS / self.config.data.stride_seconds),
+            truncate_every=round(
+                self.config.through_filter.truncate_seconds / self.config.data.stride_seconds
+            ),
         )
 
     def segments(

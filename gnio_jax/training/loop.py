@@ -17,9 +17,10 @@ import jax
 import jax.numpy as jnp
 
 from gnio_jax import config as configuration
-from gnio_jax import parallel
+from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.models.memory import NetworkWithMemory
 from gnio_jax.networks import TrainedNetwork
 from gnio_jax.reporting import Lines, Reporter, Silence
 from gnio_jax.training import checkpoint, optimizer, run_folder, support_vectors
@@ -28,6 +29,7 @@ from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.initial import load_initial_network
 from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.run_folder import Log
+from gnio_jax.training.segment_task import SegmentTask
 from gnio_jax.training.task import DispatchSums, Row, Task
 from gnio_jax.training.window_task import WindowTask
 
@@ -120,7 +122,7 @@ def train_all(
     with jax.enable_x64(through_filter), sharing, _record_signals() as signals:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
         start = None if resumed else load_initial_network(configs[0])
-        task_type = FilterTask if through_filter else WindowTask
+        task_type = choose_task(configs[0])
         task, data = set_up(task_type, configs[0], reporter, workers)
         for config, resume in zip(configs, resumes, strict=True):
             results.append(_train(task, data, config, start, resume, signals, reporter))
@@ -129,6 +131,23 @@ def train_all(
                 results[-1] = results[-1]._replace(stopped_by=signum)  # others are missing
                 break
     return results
+
+
+def choose_task(config: TrainConfig) -> type[Task]:
+    """The task of an experiment. Raises `InputError` for segments without a network with memory,
+    and for strides that do not fit such a network."""
+    model = models.from_config(config.model)
+    remembers = isinstance(model, NetworkWithMemory)
+    if config.segments.seconds and not remembers:
+        problem = f"is for a network with memory, and '{config.model.name}' has none"
+        raise InputError("segments.seconds", problem, "set it to 0")
+    if isinstance(model, NetworkWithMemory) and config.data.stride % model.multiple:
+        problem = f"is {config.data.stride} samples; '{config.model.name}' takes {model.multiple}"
+        remedy = f"make it a multiple of {model.multiple / config.data.rate:g} s"
+        raise InputError("data.stride_seconds", problem, remedy)
+    if config.through_filter.learn:
+        return FilterTask
+    return SegmentTask if config.segments.seconds else WindowTask
 
 
 def _train(

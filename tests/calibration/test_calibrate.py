@@ -461,6 +461,37 @@ def test_the_consider_fit_finds_the_errors_of_drawn_positions():
     assert every.raw_gyro_bias == 0.0 and every.gyro_bias > 5e-3 and every.scale > 0.15
 
 
+def test_the_consider_fit_has_the_arc_of_the_whole_yaw():
+    """Positions far from the start, whose yaw is uncertain by 0.3 rad of which the filter knows a
+    third: without the arc the radial errors of ½ ψ² l would be taken for other errors."""
+    rng, rows, lever = np.random.default_rng(2), 4000, 40.0
+    known, unknown = 0.1, 0.28
+    psi = known * rng.standard_normal(rows) + unknown * rng.standard_normal(rows)
+    error = np.stack([lever * (np.cos(psi) - 1), lever * np.sin(psi), 0 * psi], axis=1)
+    error += 0.1 * rng.standard_normal((rows, 3))
+    along = np.array([0.0, lever, 0.0])
+    arc = np.diag([0.75 * known**4 * lever**2, 0.0, 0.0])
+    covariance = 0.01 * np.eye(3) + known**2 * np.outer(along, along) + arc
+    yaw_sensitivity = np.zeros((rows, 6))
+    yaw_sensitivity[:, 4] = 1.0  # the heading
+    sensitivity = yaw_sensitivity[:, None] * along[None, :, None]
+    positions = fitting.PositionErrors(
+        error,
+        np.tile(covariance, (rows, 1, 1)),
+        sensitivity,
+        np.tile(known**2 * along, (rows, 1)),
+        yaw_sensitivity,
+        np.zeros((rows, 3)),
+    )
+    result = fitting.fit_considered(positions, 1.0, FilterSettings())
+    assert result.settings.considered.heading == pytest.approx(unknown, rel=0.1)
+    assert result.before > 20 and 0.4 < result.after < 1.2
+    additive = positions._replace(
+        with_yaw=0 * positions.with_yaw, yaw_sensitivity=0 * sensitivity[:, 1]
+    )
+    assert fitting.fit_considered(additive, 1.0, FilterSettings()).after > 2
+
+
 def test_the_prior_counts_as_many_independent_errors_as_there_are():
     """An error without effect on the positions keeps the start of the search. If few positions
     show the error, the result lies between the start and their value, by Bayes' rule."""

@@ -154,6 +154,19 @@ def test_the_folder_of_a_run_stands_for_its_config(tmp_path):
         configuration.load(tmp_path / "empty")
 
 
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ('workdir: "a\\0b"', "field 'workdir' holds a zero, which no name of a file has"),
+        ("data: {context_seconds: 59.5}", "'data.context_seconds' makes an input of more than 60"),
+        ("model: {width: 4097}", "field 'model.width' must be from 1 to 4096"),
+    ],
+)
+def test_what_no_machine_can_hold_is_refused(text, words):
+    with pytest.raises(InputError, match=words):
+        configuration.validate(configuration.parse(text, "x"), "x")
+
+
 def test_settings_are_assigned_by_name():
     config = configuration.assign(
         TrainConfig(),

@@ -88,6 +88,32 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize(
+    "key, value, shown",
+    [
+        ("start_time", "abc", "'abc', no possible number"),
+        ("start_time", np.nan, "nan, no possible number"),
+        ("start_time", np.inf, "inf, no possible number"),
+        ("start_time", np.arange(2.0), r"array\(\[0., 1.\]\), no text or number"),
+        ("recorded_rate", "fast", "'fast', no possible number"),
+        ("recorded_rate", 0.0, "0.0, no possible number"),
+        ("recorded_rate", -5, "-5, no possible number"),
+        ("accel_clipped", -0.5, "-0.5, no possible number"),
+        ("group", np.array(["a", "b"], "S1"), r"array\(.*\), no text or number"),
+        ("person", 1j, "1j, no text or number"),
+        ("person", h5py.Empty("f8"), r"Empty\(.*\), no text or number"),
+    ],
+)
+def test_an_attribute_of_another_program_is_named(tmp_path, key, value, shown):
+    path = tmp_path / "walk.h5"
+    write_hdf5(path, circle()._replace(attributes={"start_time": -12.5, "accel_clipped": 0.0}))
+    assert read_hdf5(path).attributes == {"start_time": -12.5, "accel_clipped": 0.0}
+    with h5py.File(path, "a") as file:
+        file["attributes"].attrs[key] = value
+    with pytest.raises(InputError, match=rf"walk\.h5: attribute '{key}' is .*{shown}; convert"):
+        read_hdf5(path)
+
+
 def limited(code, limit=120_000):
     """Run `code` in a process in which a file can have so many bytes, as on a full disk."""
     start = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))\n"

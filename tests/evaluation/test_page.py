@@ -62,17 +62,22 @@ def test_thinned_curves_keep_the_largest_innovation(walks):
     assert all(len(values) == 134 and values.dtype == np.float32 for values in curves.values())
 
 
-def test_the_map_has_room_for_the_ellipses(walks):
+def test_the_map_has_the_size_of_the_paths_or_of_the_ellipses(walks):
     walk = walks[0]
-    for size in (1.0, 1e6):
+    for size in (1e-4, 1.0, 1e6):
         run = run_of([with_covariance(walk, size * walk.filtered.covariance)])
         view = run.views[0]
-        wide, half = view.position[:, 0], 3 * np.sqrt(view.filtered.covariance[:, 0, 0])
+        paths = np.concatenate([view.position, view.reference])[:, 0]
+        middle, reach = (paths.min() + paths.max()) / 2, 1.5 * np.ptp(paths) / 2
         room = page.frame([run], "walk")["x"]
-        assert room == pytest.approx([(wide - half).min(), (wide + half).max()])
+        assert room == pytest.approx([middle - reach, middle + reach])
+        wide, half = view.position[:, 0], 3 * np.sqrt(view.filtered.covariance[:, 0, 0])
+        low, high = min((wide - half).min(), room[0]), max((wide + half).max(), room[1])
+        assert page.frame([run], "walk", whole=True)["x"] == pytest.approx([low, high])
     nowhere = Trajectory(walk.reference.time, *(part * np.nan for part in walk.reference[1:]))
     lost = walk._replace(trajectory=nowhere, reference=nowhere)
-    assert np.isfinite([*page.frame([run_of([lost])], "walk").values()]).all()
+    for whole in (False, True):
+        assert np.isfinite([*page.frame([run_of([lost])], "walk", whole).values()]).all()
 
 
 class Loads(html.parser.HTMLParser):
@@ -115,7 +120,7 @@ def test_a_page_without_a_reference_shows_no_error(estimates):
     assert text.count("of walks") == 1 and "warning: it &lt;moves&gt;" in text
     assert text.index("it &lt;moves&gt;") < text.index('class="figures"') < text.index("of walks")
     assert "error (m)" not in text
-    assert r"3\\u03c3 (m)" in text  # as JSON in a script has it
+    assert r"horizontal 3\\u03c3 (m)" in text  # as JSON in a script has it
     assert '"value":"start"' in text
     assert re.search(r"<label hidden>sequence", text)  # a single sequence needs no choice
     assert "<td>a&lt;b_<wbr>c-<wbr>d <wbr>e</td>" in text  # names break between their words
@@ -141,6 +146,11 @@ const waiting = setInterval(() => {
   const {x_range: x, y_range: y} = view.model;
   const found = {perMetre: [frame.width / (x.end - x.start), frame.height / (y.end - y.start)]};
   found.beyond = document.documentElement.scrollWidth - innerWidth;
+  const wide = () => view.model.x_range.end - view.model.x_range.start;
+  const before = wide();
+  document.getElementById("whole").click();
+  found.zoom = wide() / before;
+  document.getElementById("whole").click();
   found.first = readAt(12.04);
   document.querySelectorAll("tr[data-sequence]")[2].click();
   found.chosen = document.getElementById("sequence").selectedOptions[0].textContent;
@@ -165,6 +175,7 @@ def test_a_browser_shows_the_page(written, walks, tmp_path, width):
     shown = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
     readings = json.loads(html.unescape(re.search(r"<body[^>]*>(.*)</body>", shown, re.DOTALL)[1]))
     assert readings["perMetre"][0] == pytest.approx(readings["perMetre"][1], rel=0.02)
+    assert readings["zoom"] >= 1.0
     assert readings["beyond"] <= 0 and readings["problems"] == [] and readings["chosen"] == EVIL
     whole = make_view(walks[0])
     (x, y), shapes = whole.position[120, :2], ellipses(whole.filtered.covariance)

@@ -6,7 +6,7 @@ import pytest
 
 from gnio_jax import drawing
 from gnio_jax.evaluation import plots
-from gnio_jax.evaluation.views import make_view
+from gnio_jax.evaluation.views import horizontal_speed, make_view
 from tests.support.reports import LOST, report_of
 
 
@@ -36,6 +36,23 @@ def test_the_picture_of_a_sequence_has_its_curves(estimates):
     assert (shaded.get_x(), shaded.get_width()) == pytest.approx((15, 7), abs=1)
 
 
+def test_paths_and_errors_decide_the_scale_and_not_large_ellipses(estimates):
+    walk = estimates[0]
+    for size in (1.0, 1e4):
+        filtered = walk.filtered._replace(covariance=size * walk.filtered.covariance)
+        view = make_view(walk._replace(filtered=filtered))
+        figure = plots.sequence(view)
+        drawing.FigureCanvasAgg(figure).draw()
+        plan, horizontal, vertical, *_ = figure.axes
+        extent = np.ptp(np.concatenate([view.position, view.reference])[:, :2], axis=0)
+        shown = np.ptp(plan.get_xlim()), np.ptp(plan.get_ylim())
+        # One of the axes is filled to two thirds; the other one has the same scale.
+        assert max(extent / shown) == pytest.approx(1 / 1.5, rel=1e-6)
+        error = np.linalg.norm((view.position - view.reference)[:, :2], axis=1).max()
+        assert error < horizontal.get_ylim()[1] <= 3 * error + 1e-9
+        assert vertical.get_ylim()[0] == -vertical.get_ylim()[1]
+
+
 def test_a_picture_without_a_reference_shows_no_error(estimates):
     blind = estimates[2]
     blind = blind._replace(displacements=blind.displacements._replace(diagnostics={}))
@@ -44,7 +61,7 @@ def test_a_picture_without_a_reference_shows_no_error(estimates):
     assert "reference" not in labels(plan) and labels(horizontal) == ["3σ"]
     assert "error" not in horizontal.get_ylabel() + vertical.get_ylabel()
     assert labels(speed) == ["estimate"]
-    assert labels(used) == ["used"]
+    assert labels(used) == ["accepted"]
     bare = make_view(blind._replace(filtered=None))
     assert len(plots.sequence(bare).axes) == 2
 
@@ -68,7 +85,7 @@ def test_each_sequence_has_a_picture(tmp_path, estimates, made_report):
     view = make_view(estimates[0])._replace(name="a$x^$\udcff")  # any bytes
     fields = (x for x in view._fields if x not in ("name", "waypoints", "at_waypoints"))
     parts = {x: jax.tree.map(lambda rows: rows[:3], getattr(view, x)) for x in fields}
-    assert np.isnan(plots.speed(parts["position"], 0.1)).all()
+    assert np.isnan(horizontal_speed(parts["position"], 0.1)).all()
     drawing.save(tmp_path / "p.png", plots.sequence(view._replace(**parts)))
 
 

@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import struct
+import tracemalloc
 import zipfile
 
 import jax
@@ -164,6 +165,12 @@ def test_damaged_files_are_refused(package, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(folder.LARGEST, CARD, 100)
         refused(package, f"'{CARD}' is larger than 100 bytes")
+    entries = facts_of(package)["files"]
+    for sizes in ({"bytes": 5}, {"bytes": True}, {"bytes": "5"}, {}, 5):
+        with_facts(package, files=entries | {WEIGHTS: sizes})
+        problem = "is larger than 5 bytes" if sizes == {"bytes": 5} else "does not describe"
+        refused(package, problem)
+    (package / CARD).write_bytes(good)
     (package / WEIGHTS).unlink()
     refused(package, f"'{WEIGHTS}' is missing")
     with_file(package, WEIGHTS, b"")
@@ -172,6 +179,43 @@ def test_damaged_files_are_refused(package, tmp_path, monkeypatch):
     refused(package, "config.yaml", "'seed' must be a whole number")
     (tmp_path / "broken.zip").write_bytes(b"PK no zip")
     refused(tmp_path / "broken.zip", "cannot be read")
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_zip_of_another_compression_is_refused(published, tmp_path, method):
+    """Also one that is damaged, and every other network is still listed."""
+    path = tmp_path / "walk.zip"
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for file in (published / "walk").iterdir():
+            archive.write(file, file.name)
+    refused(path, "cannot be read (compression method")
+    content = bytearray(path.read_bytes())
+    content[60:200] = bytes(140)
+    path.write_bytes(content)
+    refused(path, "cannot be read")
+
+
+def test_a_zip_that_unpacks_to_more_than_its_card_says_is_not_unpacked(published, tmp_path):
+    path = tmp_path / "walk.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in (published / "walk").iterdir():
+            archive.writestr(file.name, file.read_bytes() + bytes(1 << 26) * (file.name == WEIGHTS))
+    size = (published / "walk" / WEIGHTS).stat().st_size
+    tracemalloc.start()
+    try:
+        refused(path, f"'{WEIGHTS}' is larger than {size} bytes")
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 1 << 22
+
+
+def test_weights_that_are_not_finite_are_refused(package):
+    """A package of NaN would track to nowhere."""
+    content = bytearray((package / WEIGHTS).read_bytes())
+    content[-4:] = np.float32(np.nan).tobytes()
+    with_file(package, WEIGHTS, bytes(content))
+    refused(package, "holds values that are not finite; take another network, or train it again")
 
 
 def test_weights_of_another_network_are_refused(package):

@@ -11,7 +11,7 @@ import os
 from fractions import Fraction
 from pathlib import Path
 
-from gnio_jax.apps.importing import loggers, ros, units
+from gnio_jax.apps.importing import bags, loggers, ros, units
 from gnio_jax.apps.importing.clocks import sensor_of
 from gnio_jax.apps.importing.columns import read_columns
 from gnio_jax.apps.importing.files import files_of
@@ -31,7 +31,7 @@ NOTHING_STATED = ImportOptions()
 _MAGIC = {
     b"#ROSBAG V2.0": "rosbag1",  # wiki.ros.org/Bags/Format/2.0
     b"SQLite format 3\x00": "rosbag2",  # sqlite.org/fileformat.html
-    ros.MCAP_MAGIC: "mcap",
+    bags.MCAP_MAGIC: "mcap",
     b"\x89HDF\r\n\x1a\n": "hdf5",
 }
 _NOTES, _WARNINGS = "import_notes", "import_warnings"
@@ -77,7 +77,7 @@ def _read(path: Path, options: ImportOptions) -> RawRecording:
     is_named = any((options.columns, options.accel_path, options.where, options.sample_rate))
     path = path if is_named else _whole(path)
     kind = "tables" if is_named else _recognised(path)
-    if kind in ros.KINDS:
+    if kind in bags.KINDS:
         return ros.read_bag(path, kind, options)
     if any((options.imu_topic, options.accel_topic, options.reference_topic)):
         remedy = "--imu-topic and the like are for ROS bags and MCAP"
@@ -105,8 +105,8 @@ def _whole(path: Path) -> Path:
 
 
 def _recognised(path: Path) -> str:
-    """tables, euroc or one of `ros.KINDS`, by the content of a file or folder, because names may be
-    wrong."""
+    """The kind of a file or folder, tables, euroc or one of `bags.KINDS`, by its content, because
+    names may be wrong."""
     if path.is_dir():
         if any((folder / "imu0" / "data.csv").is_file() for folder in (path, path / "mav0")):
             return "euroc"

@@ -3,11 +3,14 @@ workbook. Nothing is unpacked to the disk."""
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import functools
 import gzip
 import io
 import warnings
 import zipfile
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -25,6 +28,8 @@ LARGEST = 512 * 2**20
 """Largest unpacked size of a table, bytes: six hours of a sensor at 200 Hz are less (ours)."""
 MOST_TABLES = 200
 """Largest number of tables; a logger writes one for each sensor (ours)."""
+MOST_ROWS, MOST_CELLS = 1 << 20, 30_000_000
+"""Largest number of rows of a sheet, as in Excel, and of cells of a workbook (ours)."""
 _SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".gcsv", ".json")
 
 
@@ -92,6 +97,9 @@ def files_of(path: Path) -> list[LogFile]:
         return [log_file(path.name, path)]
     with parsed_as(path, "a zip"), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
+    names = Counter(member.filename for member in members if not member.is_dir())
+    if twice := [name for name, count in names.items() if count > 1]:
+        raise InputError(path, f"holds {parsing.shortened(twice[0])} twice", "leave one of them")
     if any(member.filename == "xl/workbook.xml" for member in members):  # ECMA-376, part 2
         _check_size(sum(member.file_size for member in members), path)
         return _sheets(path, "openpyxl")
@@ -136,11 +144,45 @@ def _check_size(size: int, file: Path) -> None:
 def _sheets(path: Path, engine: str) -> list[LogFile]:
     """The sheets of a workbook as texts."""
     require_packages(path, "excel", engine)
-    options: dict[str, Any] = {"engine": engine, "header": None}
-    if engine == "xlrd":  # it writes remarks about a damaged file to the standard output
-        options["engine_kwargs"] = {"logfile": io.StringIO()}
     with parsed_as(path, "a workbook"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # warnings about styles
-        sheets: dict[Any, pd.DataFrame] = pd.read_excel(path, sheet_name=None, **options)
-    texts = {str(n): one.to_csv(index=False, header=False).encode() for n, one in sheets.items()}
+        texts = _new_sheets(path) if engine == "openpyxl" else _old_sheets(path)
     return [log_file(n, path / n, partial(bytes, text)) for n, text in texts.items() if text]
+
+
+def _old_sheets(path: Path) -> dict[str, bytes]:
+    """Those of a workbook of Excel 97, whose sheets have at most 256 columns and 65,536 rows."""
+    # The library writes remarks about a damaged file to the standard output.
+    options: dict[str, Any] = {"engine": "xlrd", "engine_kwargs": {"logfile": io.StringIO()}}
+    sheets: dict[Any, pd.DataFrame] = pd.read_excel(path, sheet_name=None, header=None, **options)
+    return {str(n): one.to_csv(index=False, header=False).encode() for n, one in sheets.items()}
+
+
+def _new_sheets(path: Path) -> dict[str, bytes]:
+    """Those of a workbook of ECMA-376. A row has all cells before its last one, so that a small
+    file may have any number of them."""
+    from openpyxl import load_workbook
+
+    texts, count = dict[str, bytes](), 0
+    with contextlib.closing(load_workbook(path, read_only=True, data_only=True)) as book:
+        for sheet in book.worksheets:
+            rows, out = list[list[str]](), io.StringIO()
+            sheet.reset_dimensions()  # some programs state wrong ones
+            for row in sheet.iter_rows():
+                count += len(row) + 1
+                is_long = len(rows) >= MOST_ROWS or count > MOST_CELLS
+                if len(row) > parsing.MOST_COLUMNS or is_long:
+                    problem = f"sheet '{parsing.shortened(sheet.title)}' has a cell in column"
+                    problem += f" {len(row)} of row {len(rows) + 1}, which is too far out"
+                    raise InputError(path, problem, "export the sensors' columns alone")
+                rows.append([_cell_text(cell) for cell in row])
+            width = max(map(len, rows), default=0)
+            writer = csv.writer(out, lineterminator="\n")
+            writer.writerows([*row, *[""] * (width - len(row))] for row in rows)
+            texts[sheet.title] = out.getvalue().encode() if width else b""
+    return texts
+
+
+def _cell_text(cell: Any) -> str:
+    """The text of a cell; none for one that is empty or has an error."""
+    return "" if cell.value is None or cell.data_type == "e" else str(cell.value)

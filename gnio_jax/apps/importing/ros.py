@@ -1,9 +1,4 @@
-"""The IMU and the reference of a robot's recording: rosbag1, rosbag2 (a folder, or its .db3), MCAP.
-
-The library `rosbags` reads both kinds of bag and decodes messages, `mcap` reads MCAP, of ROS 1 too;
-both are in the extra `bags`. Messages are decoded by their standard definitions (ROS 1 Noetic, ROS
-2 Humble), which are the same in all distributions for the types that are read here, so the
-definitions inside a bag are not needed.
+"""The IMU and the reference of a robot's recording, from the messages of a bag.
 
 Conventions of ROS: `sensor_msgs/Imu` is in rad/s and m/s² with gravity (REP 145; a driver that
 gives g is recognised by its magnitude), poses map the body to a z-up world (REP 103). A first
@@ -14,10 +9,7 @@ bag.
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,22 +17,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from gnio_jax.apps.importing.bags import Bag, Topic, opened
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.config import ImportOptions
 from gnio_jax.data.parsing.stamps import FEW_SHARE, seconds
-from gnio_jax.data.parsing.tables import parsed_as, shortened
+from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.data.readers.euroc import SensorPose, moved_to
 from gnio_jax.data.reference import SHORTEST_RUN, Poses
 from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, check_unit_norm
-from gnio_jax.errors import InputError, require_packages
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, rotations
 
-KINDS = {"rosbag1": "a ROS 1 bag", "rosbag2": "a ROS 2 bag", "mcap": "an MCAP"}
-MCAP_MAGIC = b"\x89MCAP0\r\n"
-"""First and last bytes of a whole MCAP (mcap.dev/spec)."""
-LARGEST_CHUNK = 1 << 30
-"""Largest unpacked size of a chunk of an MCAP, bytes; recorders limit chunks to some MiB (ours)."""
 SLOWEST, FAST_TRACKER = 4.0, 20.0
 """Rates of a reference, Hz: below the first it describes a walk too coarsely; from the second on it
 is a tracker, whose poses are smoothed and whose attitude is carried by the gyro (ours)."""
@@ -57,7 +45,7 @@ def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
     `sensor_msgs/Imu` one must be named, and of several topics of poses none is taken that is not;
     "/tf:CHILD_FRAME" names transforms. Raises `InputError` that names the existing topics."""
     notes, warnings = list[str](), list[str]()
-    with _opened(path, kind) as bag:
+    with opened(path, kind) as bag:
         imu = _imu_topic(bag, options.imu_topic)
         other = _imu_topic(bag, options.accel_topic) if options.accel_topic else imu
         reference = _reference_topic(bag, options.reference_topic, notes)
@@ -87,135 +75,10 @@ def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
     return RawRecording(path, gyro, accel, notes, warnings, "android", track=track)
 
 
-# --- the libraries
-
-
-class _Topic(NamedTuple):
-    name: str
-    type: str  # as in ROS 2: sensor_msgs/msg/Imu
-    count: int
-
-
-class _Bag(NamedTuple):
-    """An open recording."""
-
-    path: Path
-    topics: dict[str, _Topic]
-    messages: Callable[[Collection[str]], Iterator[tuple[str, int, Any]]]
-    """A function from names to (topic, time of recording ns, decoded message) of each message. A
-    failure inside a library is an `InputError`."""
-
-
-@contextmanager
-def _opened(path: Path, kind: str) -> Iterator[_Bag]:
-    require_packages(path, "bags", "rosbags", "mcap")
-    with ExitStack() as stack:
-        with _reading(path, kind):
-            bag = _mcap(path, stack) if kind == "mcap" else _rosbag(path, kind, stack)
-        yield bag
-
-
-@contextmanager
-def _reading(path: Path, kind: str) -> Iterator[None]:
-    """Report errors of the libraries as damage of the file, for which rosbags uses assertions
-    too."""
-    with parsed_as(path, KINDS[kind]):
-        try:
-            yield
-        except AssertionError as error:
-            raise ValueError(f"unexpected content {error}".strip()) from error
-        except Exception as error:
-            if "not indexed" in str(error):
-                problem = "has no index, because its recorder was killed"
-                raise InputError(path, problem, f"make one: rosbag reindex {path.name}") from None
-            raise
-
-
-def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
-    from rosbags import rosbag1, rosbag2
-
-    if kind == "rosbag2" and path.is_dir():
-        text = (path / "metadata.yaml").read_text(encoding="utf-8")
-        if re.search(r"\bcompression_mode:\s*['\"]?file\b", text, re.IGNORECASE):
-            # The library would unpack its files to the disk, at any size. (It unpacks single
-            # messages in memory, one by one.)
-            remedy = "unpack its file (zstd -d FILE.zstd) and import that"
-            raise InputError(path, "is compressed as a whole (compression_mode FILE)", remedy)
-    elif kind == "rosbag2" and set("%?#") & set(path.name):  # SQLite would open another file
-        raise InputError(path, "has %, ? or # in its name", "rename it")
-    reader = stack.enter_context((rosbag1 if kind == "rosbag1" else rosbag2).Reader(path))
-    decode = _decoder("ros1" if kind == "rosbag1" else "cdr")
-
-    def messages(names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        with _reading(path, kind):
-            chosen = [one for one in reader.connections if one.topic in names]
-            for connection, time, data in reader.messages(connections=chosen):
-                yield connection.topic, time, decode(data, connection.msgtype)
-
-    connections = ((one.topic, one.msgtype, one.msgcount) for one in reader.connections)
-    return _Bag(path, _joined(connections), messages)
-
-
-def _mcap(path: Path, stack: ExitStack) -> _Bag:
-    from mcap.reader import make_reader
-
-    file = stack.enter_context(path.open("rb"))
-    file.seek(-min(len(MCAP_MAGIC), path.stat().st_size), os.SEEK_END)
-    if file.read() != MCAP_MAGIC:
-        raise InputError(path, "is cut short, its end is missing", "repair it with mcap recover")
-    file.seek(0)
-    reader = make_reader(file, validate_crcs=True)
-    summary = reader.get_summary()
-    if summary is None or summary.statistics is None:
-        raise InputError(path, "has no summary of its topics", "write one with mcap recover")
-    if any(chunk.uncompressed_size > LARGEST_CHUNK for chunk in summary.chunk_indexes):
-        raise InputError(path, "holds a chunk that unpacks to gigabytes", "record it anew")
-    counts = summary.statistics.channel_message_counts
-    names = {0: ""} | {number: schema.name for number, schema in summary.schemas.items()}
-    topics = _joined(
-        (channel.topic, names[channel.schema_id], counts.get(number, 0))
-        for number, channel in summary.channels.items()
-    )
-    encodings = {channel.topic: channel.message_encoding for channel in summary.channels.values()}
-
-    def messages(names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        for name in names:
-            if encodings[name] not in ("cdr", "ros1"):
-                problem = f"topic {name} is encoded as {encodings[name] or 'nothing known'}"
-                raise InputError(path, problem, "record it as ROS 2 (cdr) or ROS 1 messages")
-        decoders = {name: _decoder(encodings[name]) for name in names}
-        with _reading(path, "mcap"):
-            for _, channel, message in reader.iter_messages(names):
-                topic = channel.topic
-                decoded = decoders[topic](message.data, topics[topic].type)
-                yield topic, message.log_time, decoded
-
-    return _Bag(path, topics, messages)
-
-
-def _joined(connections: Iterable[tuple[str, str, int]]) -> dict[str, _Topic]:
-    """The topics of connections or channels, each (topic, type, messages). A topic may have
-    several."""
-    topics: dict[str, _Topic] = {}
-    for topic, kind, count in connections:
-        kind = re.sub("^([^/]+)/([^/]+)$", r"\1/msg/\2", kind)
-        count += topics[topic].count if topic in topics else 0
-        topics[topic] = _Topic(topic, kind, count)
-    return topics
-
-
-def _decoder(encoding: str) -> Callable[[bytes, str], Any]:
-    from rosbags.typesys import Stores, get_typestore
-
-    if encoding == "ros1":
-        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
-    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
-
-
 # --- topics
 
 
-def _imu_topic(bag: _Bag, name: str | None) -> _Topic:
+def _imu_topic(bag: Bag, name: str | None) -> Topic:
     topics = _topics(bag, name, (IMU,), "IMU")
     if not topics:
         remedy = f"its topics: {_listed(bag.topics.values())}"
@@ -226,7 +89,7 @@ def _imu_topic(bag: _Bag, name: str | None) -> _Topic:
     return topics[0]
 
 
-def _reference_topic(bag: _Bag, name: str | None, notes: list[str]) -> _Topic | None:
+def _reference_topic(bag: Bag, name: str | None, notes: list[str]) -> Topic | None:
     """The topic of a reference, or of "topic:frame"; None if there is none, or none is chosen."""
     topic = name.partition(":")[0] if name else None
     topics = _topics(bag, topic, (*POSES, *TRANSFORMS), "pose")
@@ -237,7 +100,7 @@ def _reference_topic(bag: _Bag, name: str | None, notes: list[str]) -> _Topic | 
     return poses[0] if len(poses) == 1 else None
 
 
-def _topics(bag: _Bag, name: str | None, types: tuple[str, ...], what: str) -> list[_Topic]:
+def _topics(bag: Bag, name: str | None, types: tuple[str, ...], what: str) -> list[Topic]:
     """The topics of these types that have messages, or the one of this name."""
     topics = [topic for topic in bag.topics.values() if topic.type in types and topic.count]
     if name is None:
@@ -251,7 +114,7 @@ def _topics(bag: _Bag, name: str | None, types: tuple[str, ...], what: str) -> l
     return [bag.topics[name]]
 
 
-def _listed(topics: Iterable[_Topic]) -> str:
+def _listed(topics: Iterable[Topic]) -> str:
     names = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in topics]
     return shortened(", ".join(names) or "none", 400)
 
@@ -312,7 +175,7 @@ _Mounts = dict[tuple[str, str], SensorPose]
 
 
 def _collected(
-    bag: _Bag, imus: set[str], reference: _Topic | None
+    bag: Bag, imus: set[str], reference: Topic | None
 ) -> tuple[dict[str, _Imu], list[_Pose], _Mounts]:
     """The IMU topics, the poses of the reference, and the static transforms."""
     static = {name for name in bag.topics if name.endswith("tf_static")}

@@ -86,6 +86,9 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     require_packages("gnio export", "onnx", *PACKAGES)
     run = load(which)
     network = Network.of(run.model, run.variables)
+    if network.has_memory:
+        problem = f"'{run.config.model.name}' has a memory, which the exported filter cannot carry"
+        raise InputError(which, problem, "export a network on windows")
     ekf = make_filter(run.config.data, run.config.filter)
     with replacing_folder(out) as folder, ExitStack() as at_end:
         at_end.callback(logging.disable, logging.root.manager.disable)

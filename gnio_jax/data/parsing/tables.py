@@ -8,6 +8,7 @@ included.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
@@ -54,6 +55,12 @@ def parsed_as(path: Path, kind: str) -> Iterator[None]:
             head_of(path)
         reason = f"it may be cut short ({shortened(error, 200)})"
         raise damaged(path, f"cannot be read as {kind}, {reason}") from None
+
+
+def _is_odd(cell: object) -> bool:
+    """Whether a cell is a text that Python reads as a number, though no logger writes it: `1_0`, or
+    digits of another script."""
+    return isinstance(cell, str) and ("_" in cell or not cell.isascii())
 
 
 class Table(NamedTuple):
@@ -180,9 +187,11 @@ class Table(NamedTuple):
         column, what = self._column(name), f"{self.kind} '{name}'"
         if not isinstance(column, np.ndarray):
             try:  # the columns of a frame have the same length
-                return column.to_numpy(dtype=np.float64, na_value=np.nan)
+                if column.dtype.kind != "O" or not column.map(_is_odd).any():
+                    return column.to_numpy(dtype=np.float64, na_value=np.nan)
+                raise ValueError
             except (TypeError, ValueError, OverflowError):  # Python's integers may be of any size
-                cells = pd.to_numeric(column.astype(str), errors="coerce")
+                cells = pd.to_numeric(column.where(~column.map(_is_odd), "").astype(str), "coerce")
                 bad = ~np.isfinite(pd.Series(cells, dtype=np.float64).to_numpy())
                 row = int(np.argmax(bad & column.notna().to_numpy()))
                 cell = f"'{shortened(column.iloc[row])}' in its row {self.row(row)}"
@@ -273,8 +282,10 @@ def hdf5_field(group: h5py.Group, name: str, path: Path) -> np.ndarray | None:
     if not isinstance(node, h5py.Dataset):
         return None
     most = LARGEST_RATIO * node.id.get_storage_size() + 1_000_000
-    if node.external or node.is_virtual or node.nbytes > most:
-        problem = f"would take {node.nbytes} bytes, which the file does not hold"
+    chunk = math.prod(node.chunks or ()) * node.dtype.itemsize  # it is unpacked as a whole
+    size = max(node.nbytes, chunk)
+    if node.external or node.is_virtual or size > most:
+        problem = f"would take {size} bytes, which the file does not hold"
         raise damaged(path, f"field '{name}' {problem}")
     return np.asarray(node)
 

@@ -60,7 +60,8 @@ class Layout(NamedTuple):
 def shortened(text: object, most: int = 80) -> str:
     """A text from a file in a form that a message can quote: one line of at most `most` printable
     characters."""
-    line = "".join(c if c.isprintable() else "\ufffd" for c in str(text).strip()[: 4 * most])
+    words = " ".join(str(text).strip()[: 4 * most].split())
+    line = "".join(c if c.isprintable() else "\ufffd" for c in words)
     return line if len(line) <= most else line[: most - 3] + "..."
 
 
@@ -146,6 +147,10 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
     head = head_of(path, content)
     encoding = encoding_of(path, head)
     lines = head.decode(encoding, errors="replace").splitlines()
+    cells = max((max(map(line.count, SEPARATORS[:-1])) for line in lines), default=0)
+    words = max((len(line.split()) for line in lines), default=0)
+    if max(cells, words) > MOST_COLUMNS:
+        raise InputError(path, f"has more than {MOST_COLUMNS} columns", "give the sensors' alone")
     lines = lines[:-1] if len(head) == HEAD and len(lines) > 1 else lines  # it may be cut
     stated = re.match(r'\W*sep=(.)"?\s*$', lines[0], re.IGNORECASE) if lines else None
     marks = [separator] if separator else [stated[1]] if stated else SEPARATORS

@@ -26,6 +26,7 @@ from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import damaged, read_hdf5_fields, read_text
 from gnio_jax.data.splits import read_list
 from gnio_jax.data.validation import FASTEST, check_unit_norm
+from gnio_jax.files import file_in
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
 from gnio_jax.types import Sequence
 
@@ -39,26 +40,28 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split's list that are present."""
     folders = read_list(
         root / f"{split}.txt",
-        lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
+        lambda entry: root / entry if file_in(root / entry, _TABLE).is_file() else None,
         root,
         DATASET.layout,
     )
     names = ["_".join(folder.relative_to(root).parts) for folder in folders]
     return [
-        RecordingSource(name, partial(read, folder, name), (folder / _TABLE, folder / _TRUTH))
+        RecordingSource(
+            name, partial(read, folder, name), (file_in(folder, _TABLE), file_in(folder, _TRUTH))
+        )
         for name, folder in zip(names, folders, strict=True)
     ]
 
 
 def read(folder: Path, name: str | None = None) -> list[Sequence]:
     """Read the sequence of a folder, in a z-up world. Raises `InputError` naming file and field."""
-    path = folder / _TABLE
+    path = file_in(folder, _TABLE)
     table = read_hdf5_fields(path, ("ts", "gyro_calib", "accel_calib", "traj_target"))
     time, start, _ = table.clock("ts", "s")
     gyro, accel = table.take("gyro_calib", width=3), table.take("accel_calib", width=3)
     pose = table.take("traj_target", width=7)
     wxyz = check_unit_norm(wxyz_from_xyzw(pose[:, 3:]), True, "traj_target", path)
-    attitude, velocity = rotations(wxyz), _velocity(folder / _TRUTH, time, start)
+    attitude, velocity = rotations(wxyz), _velocity(file_in(folder, _TRUTH), time, start)
 
     upside_down = attitude.apply(accel).mean(axis=0)[2] < 0
     turn = Rotation.from_rotvec([np.pi if upside_down else 0.0, 0.0, 0.0])

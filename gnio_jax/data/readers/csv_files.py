@@ -29,7 +29,7 @@ from gnio_jax.data.resampling import resample
 from gnio_jax.data.splits import read_list
 from gnio_jax.data.validation import check_gaps, check_increasing
 from gnio_jax.errors import InputError
-from gnio_jax.files import HDF5
+from gnio_jax.files import HDF5, file_in
 from gnio_jax.numerics import finite_rows, quaternions
 from gnio_jax.types import Sequence
 
@@ -46,11 +46,11 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
 
     Raises `InputError` if two files would have the same name.
     """
-    if split not in SPLITS and not _is_list(root / f"{split}.txt"):
+    if split not in SPLITS and not _is_list(file_in(root, f"{split}.txt")):
         remedy = f"known splits: {', '.join(SPLITS)}, or that of a list {split}.txt there"
         raise InputError(root, f"unknown split '{split}'", remedy)
     layout = f"expected layout: {DATASET.layout}"
-    if split not in SPLITS or any((root / f"{name}.txt").is_file() for name in SPLITS):
+    if split not in SPLITS or any(file_in(root, f"{name}.txt").is_file() for name in SPLITS):
         paths = read_list(root / f"{split}.txt", partial(_find, root), root, DATASET.layout)
     else:
         paths = files_of(root)
@@ -75,14 +75,16 @@ def files_of(root: Path) -> list[Path]:
 def list_splits(root: Path) -> tuple[str, ...]:
     """The splits that the lists <root>/<split>.txt define; only `test` if there is none. A text
     file with another name that lists no existing recording is not a list."""
-    lists = {path.stem for path in root.glob("*.txt") if _is_list(path)}
+    texts = (path for path in root.iterdir() if path.suffix.lower() == ".txt")
+    lists = {path.stem.lower() for path in texts if _is_list(path)}
     usual = [split for split in SPLITS if split in lists]
     return (*usual, *sorted(lists - set(SPLITS))) or ("test",)
 
 
 def _is_list(path: Path) -> bool:
-    if path.stem in SPLITS or not re.fullmatch("[a-z][a-z0-9_]*", path.stem):
-        return path.stem in SPLITS
+    name = path.stem.lower()
+    if name in SPLITS or not re.fullmatch("[a-z][a-z0-9_]*", name):
+        return name in SPLITS
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
         return any(_find(path.parent, line.strip()) for line in lines if line.strip())
@@ -92,7 +94,7 @@ def _is_list(path: Path) -> bool:
 
 def _find(root: Path, entry: str) -> Path | None:
     """The file of a list's entry, which may be without the suffix."""
-    candidates = [root / entry, *(root / f"{entry}{suffix}" for suffix in _FILES)]
+    candidates = [file_in(root, f"{entry}{suffix}") for suffix in ("", *_FILES)]
     files = (path for path in candidates if path.suffix.lower() in _FILES and path.is_file())
     return next(files, None)
 

@@ -41,6 +41,7 @@ from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text
 from gnio_jax.data.reference import LONGEST_BRIDGE, SHORTEST_RUN
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.numerics import finite_rows
 from gnio_jax.types import Sequence
 
@@ -96,7 +97,9 @@ def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording
 
 def _recording(folder: Path, dataset: str) -> RecordingSource:
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *REFERENCES)]
-    files = tuple(sensor / name for sensor in sensors for name in ("data.csv", "sensor.yaml"))
+    files = tuple(
+        file_in(sensor, name) for sensor in sensors for name in ("data.csv", "sensor.yaml")
+    )
     read_it = partial(read, folder, dataset)
     return RecordingSource(short_name(folder.name), read_it, files, slow=True, form=dataset)
 
@@ -111,7 +114,7 @@ def find_sequences(root: Path) -> dict[str, Path]:
     for depth in ("", "*/", "*/*/", "*/*/*/"):
         for mav in sorted(root.glob(f"{depth}mav0")):
             # TUM-VI's calibration recordings are of a camera in front of a board and have no walk.
-            if (mav / "imu0" / "data.csv").is_file() and not mav.parent.name.startswith(
+            if file_in(mav / "imu0", "data.csv").is_file() and not mav.parent.name.startswith(
                 "dataset-calib"
             ):
                 sequences.setdefault(short_name(mav.parent.name), mav.parent)
@@ -131,7 +134,7 @@ def read(folder: Path, dataset: str = "euroc") -> list[Sequence]:
     """Read the sequence of a folder (the one with `mav0`). Raises `InputError` naming file and
     field."""
     mav, name = folder / "mav0", short_name(folder.name)
-    path = mav / "imu0" / "data.csv"
+    path = file_in(mav / "imu0", "data.csv")
     table = read_table(path)
     time, start, _ = table.clock(STAMP, "ns", repeats="kept")
     poses = read_reference(mav, start)
@@ -162,10 +165,10 @@ def read_table(path: Path) -> Table:
 def read_reference(mav: Path, start: float | int) -> Poses | None:
     """Poses of the IMU from the first reference that exists, in s after the stamp `start` (ns);
     rows without a pose are left out."""
-    sensor = next((mav / name for name in REFERENCES if (mav / name / "data.csv").is_file()), None)
-    if sensor is None:
+    files = (file_in(mav / name, "data.csv") for name in REFERENCES)
+    path = next((file for file in files if file.is_file()), None)
+    if path is None:
         return None
-    path = sensor / "data.csv"
     table = read_table(path)
     time, *_ = table.clock(STAMP, "ns", start, "kept")
     position, quaternion = table.take(*_POSITION, gaps=True), table.take(*_QUATERNION, gaps=True)
@@ -187,8 +190,8 @@ def read_reference(mav: Path, start: float | int) -> Poses | None:
         noisy=velocity is None,
         source=str(path),
     )
-    tracked = sensor_pose(sensor / "sensor.yaml")
-    return moved_to(sensor_pose(mav / "imu0" / "sensor.yaml").seen_from(tracked), poses)
+    tracked = sensor_pose(file_in(path.parent, "sensor.yaml"))
+    return moved_to(sensor_pose(file_in(mav / "imu0", "sensor.yaml")).seen_from(tracked), poses)
 
 
 # --- where a sensor sits

@@ -37,6 +37,7 @@ from gnio_jax.data.reference import LONGEST_BRIDGE
 from gnio_jax.data.splits import draw_share
 from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE, WINDOW_SECONDS
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.numerics import finite_rows, levelling, stretches
 from gnio_jax.types import STANDARD_G, Sequence
 
@@ -90,9 +91,10 @@ def find_walks(root: Path, part: str) -> list[RecordingSource]:
         depths = ("", "*/", "*/*/")
         folders = [p for depth in depths for p in sorted(root.glob(f"{depth}{building}/{part}"))]
         for folder in folders[:1]:
-            metadata_path = folder / "metadata.json"
+            metadata_path = file_in(folder, "metadata.json")
             metadata = json_object(metadata_path) if metadata_path.is_file() else {}
-            for path in sorted(folder.glob("*.feather"), key=lambda p: (len(p.stem), p.stem)):
+            paths = [path for path in folder.iterdir() if path.suffix.lower() == ".feather"]
+            for path in sorted(paths, key=lambda path: (len(path.stem), path.stem)):
                 entry = metadata.get(path.stem)
                 entry = entry if isinstance(entry, dict) else {}
                 subject = _name(path)

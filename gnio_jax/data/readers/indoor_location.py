@@ -50,7 +50,8 @@ year 2286."""
 
 def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split: whole floors. `all` is every walk below the root."""
-    paths = sorted(root.glob("**/path_data_files/*.txt"), key=lambda path: path.parts[-3:])
+    paths = [path for path in root.glob("**/path_data_files/*") if path.suffix.lower() == ".txt"]
+    paths.sort(key=lambda path: path.parts[-3:])
     chosen = [path for path in paths if split in ("all", FLOORS.get(_floor(path)))]
     if paths and not chosen:
         floors = ", ".join(floor for floor, part in FLOORS.items() if part == split)

@@ -45,6 +45,7 @@ from gnio_jax.data.parsing.tables import damaged, read_npz, shortened, text_of
 from gnio_jax.data.splits import draw_share
 from gnio_jax.data.validation import FASTEST
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.numerics import stretches
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
@@ -87,7 +88,7 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
     sources, drives = [], find_drives(root)
     for drive, paths in drives.items():
         if split_of(drive) == split and paths[0].is_dir():
-            files = paths[0] / "timestamps.txt", paths[0] / "data"
+            files = file_in(paths[0], "timestamps.txt"), paths[0] / "data"
             sources.append(RecordingSource(drive, partial(read_packets, paths[0]), files))
         elif split_of(drive) == split:
             sources += [
@@ -141,7 +142,7 @@ def read_packets(oxts: Path) -> list[Sequence]:
     World: east, north, up from the first packet (`project`). Raises `InputError` naming file and
     field.
     """
-    times, drive = oxts / "timestamps.txt", _drive_of(oxts.parent.name)
+    times, drive = file_in(oxts, "timestamps.txt"), _drive_of(oxts.parent.name)
     rows, packets = _packets(oxts / "data")
     stamps = _stamps(times)
     if rows.max() >= len(stamps):

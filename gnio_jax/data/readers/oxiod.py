@@ -42,6 +42,7 @@ from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.parsing.tables import Table, damaged, read_text, shortened
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.numerics import quaternions
 from gnio_jax.types import STANDARD_G, Sequence
 
@@ -167,9 +168,9 @@ def _walks_of(scene: str, folder: Path) -> list[WalkFiles]:
     files: dict[int, dict[str, tuple[Path, Path]]] = {}
     # `raw` of the large scale is another format, without Tango's pairs.
     for kind in ("syn",) if scene == LARGE_SCALE else ("raw", "syn"):
-        for imu in sorted((folder / kind).glob("imu*.csv")):
-            if match := re.fullmatch(r"imu(\d+)\.csv", imu.name):
-                truths = (imu.with_name(f"{name}{match[1]}.csv") for name in _TRUTHS)
+        for imu in sorted((folder / kind).glob("*")):
+            if match := re.fullmatch(r"imu(\d+)\.csv", imu.name, re.IGNORECASE):
+                truths = (file_in(folder / kind, f"{name}{match[1]}.csv") for name in _TRUTHS)
                 if truth := next((path for path in truths if path.is_file()), None):
                     files.setdefault(int(match[1]), {})[kind] = (imu, truth)
                 else:
@@ -253,7 +254,8 @@ def _read_lists(walks: list[WalkFiles], name: str, root: Path) -> list[WalkFiles
     """The walks that the lists `name` of the single-user scenes name, by lines `dataN` (all its
     walks) and `dataN/imuK.csv`. The last line may be without a newline."""
     folders = {scene: folder for scene in SINGLE_USER for folder in _scene_folders(root, scene)}
-    lists = {s: folder / name for s, folder in folders.items() if (folder / name).is_file()}
+    lists = {scene: file_in(folder, name) for scene, folder in folders.items()}
+    lists = {scene: path for scene, path in lists.items() if path.is_file()}
     if not lists:
         raise InputError(root, f"no scene has its list {name}", f"expected layout: {LAYOUT}")
     chosen: list[WalkFiles] = []
@@ -291,7 +293,7 @@ def build(walk: WalkFiles, kind: str) -> list[Sequence]:
     try:
         # The syn files of the large scale still have the phone's stamps.
         phone = read_phone(imu_path, "raw" if walk.scene == LARGE_SCALE else kind)
-        on_tango = truth_path.name.startswith("tango")
+        on_tango = truth_path.name.lower().startswith("tango")
         attributes = walk.attributes(kind) | {"truth": "tango" if on_tango else "vicon"}
         phone = phone._replace(name=walk.name, attributes=attributes | phone.attributes)
         if on_tango:

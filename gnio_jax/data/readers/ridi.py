@@ -31,6 +31,7 @@ from gnio_jax.data.parsing.tables import Table, read_text
 from gnio_jax.data.splits import find_folders, find_list, hold_out, read_list
 from gnio_jax.data.validation import FASTEST_WALKER
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.numerics import quaternions, rotations
 from gnio_jax.types import Sequence
 
@@ -72,7 +73,7 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
 
 
 def _recording(folder: Path, attributes: dict[str, str]) -> RecordingSource:
-    files = tuple(folder / name for name in (_TABLE, *_TEXT_FILES))
+    files = tuple(file_in(folder, name) for name in (_TABLE, *_TEXT_FILES))
     return RecordingSource(folder.name, partial(read, folder), files, True, attributes)
 
 
@@ -84,9 +85,9 @@ def hold_out_of_train(path: Path) -> set[str]:
 
 
 def _is_recording(folder: Path) -> bool:
-    return (folder / _TABLE).is_file() or (
-        (folder / "acce.txt").is_file() and (folder / "gyro.txt").is_file()
-    )
+    if file_in(folder, _TABLE).is_file():
+        return True
+    return all(file_in(folder, name).is_file() for name in ("acce.txt", "gyro.txt"))
 
 
 def _name(entry: str) -> str:
@@ -108,7 +109,7 @@ def read(folder: Path) -> list[Sequence]:
     `device_orientation` is the game rotation vector, turned to begin at the reference's attitude,
     because its yaw is arbitrary. Raises `InputError` naming file and field.
     """
-    table, arcore = (folder / _TABLE).is_file(), (folder / _ARCORE).is_file()
+    table, arcore = (file_in(folder, name).is_file() for name in (_TABLE, _ARCORE))
     streams = _from_table(folder) if table else _from_text_files(folder, arcore)
     words = re.findall("|".join(_PLACEMENTS), folder.name)
     attributes = {
@@ -130,7 +131,7 @@ def read(folder: Path) -> list[Sequence]:
 
 
 def _from_table(folder: Path) -> Streams:
-    path = folder / _TABLE
+    path = file_in(folder, _TABLE)
     table = read_text(path)
     time, start, rows = table.clock("time", "ns", repeats="dropped")
     gyro, accel, position = (table.axes(name)[rows] for name in ("gyro_", "acce_", "pos_"))
@@ -148,7 +149,7 @@ def _from_text_files(folder: Path, arcore: bool) -> Streams:
     """Each file has a clock of its own; time 0 is the gyro's first stamp."""
 
     def text(name: str) -> Table:
-        return read_text(folder / name, separator=" ", header=False)
+        return read_text(file_in(folder, name), separator=" ", header=False)
 
     gyro, accel = text("gyro.txt"), text("acce.txt")
     pose = text(_ARCORE if arcore else "pose.txt")
@@ -168,7 +169,7 @@ def _from_text_files(folder: Path, arcore: bool) -> Streams:
         source=str(pose.path),
     )
     device = None
-    if (folder / "orientation.txt").is_file():
+    if file_in(folder, "orientation.txt").is_file():
         game = text("orientation.txt")
         time, _, rows = game.clock(0, "ns", start, "dropped")
         attitude = game.rotations(1, 2, 3, 4, scalar_first=False)[rows]

@@ -28,6 +28,7 @@ from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import damaged, json_object, read_hdf5_fields, shortened
 from gnio_jax.data.splits import find_folders, find_list, read_list
 from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE
+from gnio_jax.files import file_in
 from gnio_jax.numerics import integrate_gyro, quaternions, rotations
 from gnio_jax.types import Sequence
 
@@ -58,12 +59,14 @@ _ERRORS = {
 def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split's list that are present, anywhere below the root; `test` is
     `seen`."""
-    folders = find_folders(root, lambda folder: (folder / _TABLE).is_file())
+    folders = find_folders(root, lambda folder: file_in(folder, _TABLE).is_file())
     chosen = read_list(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
     choose = split in ("train", "val")
     return [
         RecordingSource(
-            folder.name, partial(read, folder, choose), (folder / _TABLE, folder / _INFO)
+            folder.name,
+            partial(read, folder, choose),
+            (file_in(folder, _TABLE), file_in(folder, _INFO)),
         )
         for folder in chosen
     ]
@@ -76,7 +79,7 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
     training; without it the source is the game rotation vector. `device_orientation` is the game
     rotation vector of the phone. Raises `InputError` naming file and field.
     """
-    path, info_path = folder / _TABLE, folder / _INFO
+    path, info_path = file_in(folder, _TABLE), file_in(folder, _INFO)
     info = json_object(info_path, f"it belongs beside {_TABLE}")
     table = read_hdf5_fields(path, (_TIME, _GYRO, _ACCEL, _GAME, _POSITION, _CHEST, _EKF))
     time, start, _ = table.clock(_TIME, "s")

@@ -18,6 +18,7 @@ from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import json_object, read_npy, shortened
 from gnio_jax.data.splits import read_list
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.types import Sequence
 
 RATE = 200.0
@@ -35,13 +36,15 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The recordings of a split's list that are present."""
     folders = read_list(
         root / _LISTS[split],
-        lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
+        lambda entry: root / entry if file_in(root / entry, _TABLE).is_file() else None,
         root,
         DATASET.layout,
     )
     return [
         RecordingSource(
-            folder.name, partial(read, folder), (folder / _TABLE, folder / _DESCRIPTION)
+            folder.name,
+            partial(read, folder),
+            (file_in(folder, _TABLE), file_in(folder, _DESCRIPTION)),
         )
         for folder in folders
     ]
@@ -49,8 +52,8 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
 
 def read(folder: Path) -> list[Sequence]:
     """Read the sequence of a folder. Raises `InputError` naming file and field."""
-    path = folder / _TABLE
-    table = read_npy(path, *_columns(folder / _DESCRIPTION))
+    path = file_in(folder, _TABLE)
+    table = read_npy(path, *_columns(file_in(folder, _DESCRIPTION)))
     time, start, _ = table.clock(_STAMPS, "us")
     attitude = table.rotations(_ATTITUDE, width=4, scalar_first=False)
     gyro, accel, position, velocity = (

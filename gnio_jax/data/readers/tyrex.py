@@ -43,6 +43,7 @@ from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text, shortened, text_of
 from gnio_jax.data.splits import find_folders
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.numerics import finite_rows
 from gnio_jax.types import STANDARD_G, Sequence
 
@@ -106,7 +107,7 @@ class WalkFolder(NamedTuple):
     @property
     def track(self) -> Path:
         """The tracker's file."""
-        return self.folder.parents[1] / "qualisys" / f"{self.folder.name}.mat"
+        return file_in(self.folder.parents[1] / "qualisys", f"{self.folder.name}.mat")
 
 
 def walk_of(folder: Path) -> WalkFolder | None:
@@ -144,7 +145,7 @@ def _split(walk: WalkFolder) -> str:
 
 
 def _recording(walk: WalkFolder) -> RecordingSource:
-    files = *(walk.folder / name for name in _TEXT_FILES), walk.track
+    files = *(file_in(walk.folder, name) for name in _TEXT_FILES), walk.track
     return RecordingSource(walk.folder.name, partial(read, walk.folder), files, slow=True)
 
 
@@ -191,10 +192,10 @@ def read_phone(walk: WalkFolder) -> Streams:
     """Read both sensors: SI units, the phone's axes, time in s of the record. Raises
     `InputError`."""
     apple = walk.device.startswith("iPhone")
-    start = _boot_time(walk.folder / "description.txt") if apple else 0.0
+    start = _boot_time(file_in(walk.folder, "description.txt")) if apple else 0.0
     sensors = []
     for name, widths in (("gyroscope.txt", (4,) if apple else (7,)), ("accelerometer.txt", (4,))):
-        path = walk.folder / name
+        path = file_in(walk.folder, name)
         table = read_text(path, separator=" ", header=False, widths=widths)
         (time, _, rows), values = table.clock(0, "s", start, "dropped"), table.take(1, 2, 3)
         if 7 in widths:
@@ -223,7 +224,7 @@ def _boot_time(path: Path) -> float:
 
 def _offset(folder: Path) -> float:
     """The tracker's time minus the record's, s."""
-    path = folder / "timeAlignment.txt"
+    path = file_in(folder, "timeAlignment.txt")
     text = text_of(path).strip()
     try:
         offset = float(text)

@@ -1,5 +1,8 @@
 """The exports of phone loggers must tell of the known walk again, or be refused in one line."""
 
+import datetime
+import zipfile
+
 import numpy as np
 import openpyxl
 import pytest
@@ -183,6 +186,53 @@ def test_phyphox_as_a_workbook(tmp_path, monkeypatch):
     refused(tmp_path / "walk.xlsx", "walk.xlsx: unpacks to 0 MiB; no table may exceed 0 MiB")
     (tmp_path / "cut.xls").write_bytes((tmp_path / "walk.xls").read_bytes()[:3000])
     refused(tmp_path / "cut.xls", "cut.xls: cannot be read as a workbook")
+
+
+def test_a_workbook_that_unpacks_to_more_than_a_logger_writes_is_refused(tmp_path, monkeypatch):
+    """A cell far out makes all cells before it, and a row far down all rows."""
+    for place, words in (
+        ("XFD2", "sheet 'far' has a cell in column 16384 of row 2, which is too far out; export"),
+        ("A1048577", "sheet 'far' has a cell in column 1 of row 1048577, which is too far out"),
+    ):
+        book = openpyxl.Workbook()
+        sheet = book.create_sheet("far")
+        sheet.append(["time", *"xyz"])
+        sheet["A2"] = 1.0
+        book.save(tmp_path / "near.xlsx")
+        with zipfile.ZipFile(tmp_path / "near.xlsx") as near:
+            members = {name: near.read(name).decode() for name in near.namelist()}
+        name = "xl/worksheets/sheet2.xml"
+        row = place.lstrip("ABCDEFGHIJKLMNOPQRSTUVWXYZ")
+        assert '<row r="2"><c r="A2"' in members[name]
+        members[name] = members[name].replace(
+            '<row r="2"><c r="A2"', f'<row r="{row}"><c r="{place}"'
+        )
+        refused(zipped(tmp_path / "far.xlsx", members), f"far.xlsx: {words}")
+    workbooks(tmp_path, phyphox_sets())
+    monkeypatch.setattr(files, "MOST_CELLS", 1000)
+    refused(tmp_path / "walk.xlsx", "has a cell in column 4 of row 201")
+
+
+def test_cells_of_a_workbook_are_what_they_show(tmp_path):
+    """An error and an empty cell have no value; rows may end early."""
+    book = openpyxl.Workbook()
+    book.active.append(["time", "a", "b"])
+    book.active.append([datetime.datetime(2024, 5, 3, 9, 15, 2, 250000), 1, 2.5])
+    book.active.append([3, "#N/A"])
+    book.active.append([])
+    book.active.append([True, None, "x"])
+    book.save(tmp_path / "walk.xlsx")
+    (log,) = files.files_of(tmp_path / "walk.xlsx")
+    text = "time,a,b\n2024-05-03 09:15:02.250000,1,2.5\n3,,\n,,\nTrue,,x\n"
+    assert log.content().decode() == text
+
+
+def test_a_zip_with_two_files_of_one_name_is_refused(tmp_path):
+    members = sensor_logger("android", False)
+    path = zipped(tmp_path / "walk.zip", members)
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("Gyroscope.csv", members["Gyroscope.csv"])
+    refused(path, "walk.zip: holds Gyroscope.csv twice; leave one of them")
 
 
 def test_phyphox_that_was_paused_is_refused(tmp_path):

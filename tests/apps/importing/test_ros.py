@@ -10,7 +10,7 @@ from rosbags import rosbag2
 from rosbags.rosbag2.reader import zstd
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.apps.importing import ros
+from gnio_jax.apps.importing import bags, ros
 from tests.support import bag_files, known_walk
 from tests.support.bag_files import EPOCH, KINDS, LOGGED, Maker, imu, poses, text, write
 from tests.support.importing import compare_reference, import_recording, imported, refused
@@ -243,7 +243,7 @@ def test_what_no_bag_is_read_for(tmp_path, monkeypatch):
     refused(path, r"has no topic of sensor_msgs/Imu; its topics: /chatter \(std_msgs/String\)")
     path = write(tmp_path, "mcap", entries)
     with monkeypatch.context() as patch:
-        patch.setattr(ros, "LARGEST_CHUNK", 20_000)
+        patch.setattr(bags, "LARGEST_CHUNK", 20_000)
         refused(path, "walk.mcap: holds a chunk that unpacks to gigabytes")
     monkeypatch.setitem(sys.modules, "mcap", None)
     refused(path, r"walk.mcap: needs the package mcap; pip install 'gnio-jax\[bags\]'")
