@@ -46,7 +46,8 @@ def test_predictions_are_those_of_scikit_learn(count):
     data, held_out = (windows_of(90, ("hand", "leg", "bag")[:count]) for _ in range(2))
     network = support_vectors.fit(data, held_out, CONFIG)
     found = jax.jit(network.model.apply)(network.variables, jnp.asarray(held_out.windows))
-    x, other = (np.asarray(ridi.features(jnp.asarray(d.windows)), float) for d in (data, held_out))
+    smooth = jax.jit(ridi.features)  # to the bit, because the fits stop at a tolerance
+    x, other = (np.asarray(smooth(jnp.asarray(d.windows)), float) for d in (data, held_out))
     names, gamma = sorted(set(data.placement)), 1 / 60
     labels = np.array([names.index(name) for name in data.placement])
     classes = np.zeros(90, int)
@@ -64,7 +65,7 @@ def test_predictions_are_those_of_scikit_learn(count):
     np.testing.assert_allclose(found.displacement, wanted, atol=1e-4)
     rms = np.sqrt(np.mean((held_out.displacement - wanted[:, :2]) ** 2, axis=0))
     np.testing.assert_allclose(np.exp(found.log_std[0, :2]), rms, rtol=1e-3)
-    assert rms.max() < 0.3  # it has learnt
+    assert rms.max() < 0.3 * held_out.displacement.std()  # it has learnt
 
 
 def score(machine, x, y):
