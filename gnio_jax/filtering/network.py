@@ -155,9 +155,7 @@ def network_measurement(
     """
 
     config = ekf.config
-    replaced = any(
-        getattr(measurement, "replaces_displacement", False) for measurement in ekf.measurements
-    )
+    needs = {name: other for other in ekf.measurements for name in getattr(other, "needs", ())}
     shape = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
 
     def predict_one(window: Float[Array, "1 n c"]) -> Prediction:
@@ -166,6 +164,10 @@ def network_measurement(
         return jax.tree.map(lambda leaf: _make_floating(leaf[0]), prediction)
 
     shapes = jax.eval_shape(predict_one, shape)
+    for name, other in needs.items():
+        if name not in shapes.diagnostics:
+            problem = f"needs the diagnostics '{name}', which this network does not give"
+            raise ValueError(f"filter.measurements: '{other.name}' {problem}")
 
     def predict_nothing() -> Prediction:
         return jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
@@ -180,9 +182,12 @@ def network_measurement(
             gyro, accel, gap = latest()
             prediction = predict_one(network_window(state, oldest, gyro, accel, config))
             whole = gap is None or jnp.all(gap.used > 0)
-            whole = whole & (not replaced)
+            says = prediction.diagnostics
+            measured = {name: jnp.where(whole, says[name], jnp.nan) for name in needs}
+            if needs:  # they are measured in its place
+                whole = jnp.bool_(False)
             displacement = jnp.where(whole, prediction.displacement, jnp.nan)
-            return prediction._replace(displacement=displacement)
+            return prediction._replace(displacement=displacement, diagnostics=says | measured)
 
         prediction = jax.lax.cond(has_window, infer, predict_nothing)
         dtype, frame = state.offset.dtype, config.displacement_frame

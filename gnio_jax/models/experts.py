@@ -50,9 +50,9 @@ class Experts(nn.Module):
             h = encoder(windows, train).mean(axis=1)
             displacements.append(LinearHead(name=f"expert{number + 1}_displacement")(h)[0])
             log_stds.append(UncertaintyHead(name=f"expert{number + 1}_log_std")(h, train))
-        means, u = jnp.stack(displacements, axis=1), jnp.stack(log_stds, axis=1)
-        mean = jnp.einsum("bk,bki->bi", shares, means)
-        spread = jnp.log((means - mean[:, None]) ** 2 + 1e-12)
+        of_experts, u = jnp.stack(displacements, axis=1), jnp.stack(log_stds, axis=1)
+        mean = jnp.einsum("bk,bki->bi", shares, of_experts)
+        spread = jnp.log((of_experts - mean[:, None]) ** 2 + 1e-12)
         logs = jnp.logaddexp(2 * u, spread) + jnp.log(shares + 1e-12)[..., None]
         return Prediction(mean, 0.5 * jax.nn.logsumexp(logs, axis=1), {"router": shares})
 
