@@ -36,7 +36,7 @@ SMALLER = {
     "docs/notebooks/learn_noise.py": {"SECONDS = 30": "SECONDS = 2", "STEPS = 150": "STEPS = 2"},
 }
 """Fewer samples and steps than on the page: page -> what stands there -> what runs."""
-HELP = {"--help", "--completion", "COMMAND"}
+HELP = {"--help", "-H", "--completion", "--version", "COMMAND"}
 """Words that leave with a text; COMMAND stands for any command."""
 NEW_FILES = {"gnio_jax/data/readers/mine.py", "tests/support/mine_files.py"}
 """What CONTRIBUTING asks a reader to write."""

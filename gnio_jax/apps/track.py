@@ -52,7 +52,7 @@ class Tracked(NamedTuple):
 def track(
     recording: Imported,
     trained: TrainedNetwork,
-    out: Path,
+    out: str | Path,
     formats: tuple[str, ...] = (),
     progress: Progress = silent,
     command: str = "",
@@ -76,7 +76,7 @@ def track(
         InputError: The results could not be written, or the recording is too short or has a hole
             that is too long.
     """
-    sequence, config = recording.sequence, trained.config
+    out, sequence, config = Path(out), recording.sequence, trained.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
     result, ready, ekf = estimate_recording(sequence, trained, progress)

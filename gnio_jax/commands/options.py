@@ -247,8 +247,8 @@ def _parser(
         )
 
     names = dict.fromkeys(dest.partition(".")[0] for dest in options if dest in hidden)
-    more = f"{prog} -H explains {len(hidden)} more options of {', '.join(names)}.\n\n"
-    more = more if hidden else ""
+    more = f"{prog} -H explains {len(hidden)} more options of {', '.join(names)}."
+    more = f"{paragraphs(more)}\n\n" if hidden else ""
     parser = argparse.ArgumentParser(
         prog=prog,
         usage=" ".join([prog, *usage, "[OPTIONS]"]),

@@ -148,13 +148,15 @@ def network_measurement(
     """
 
     config = ekf.config
+    replaced = any(getattr(kind, "replaces_displacement", False) for kind in ekf.measurements)
+    shape = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
 
-    def predict_one(window: Float[Array, "1 n 6"]) -> Prediction:
+    def predict_one(window: Float[Array, "1 n c"]) -> Prediction:
         prediction = predict(window)
         _check(prediction)
         return jax.tree.map(lambda leaf: _make_floating(leaf[0]), prediction)
 
-    shapes = jax.eval_shape(predict_one, jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32))
+    shapes = jax.eval_shape(predict_one, shape)
 
     def predict_nothing() -> Prediction:
         return jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
@@ -169,6 +171,7 @@ def network_measurement(
             gyro, accel, gap = latest()
             prediction = predict_one(network_window(state, oldest, gyro, accel, config))
             whole = gap is None or jnp.all(gap.used > 0)
+            whole = whole & (not replaced)
             displacement = jnp.where(whole, prediction.displacement, jnp.nan)
             return prediction._replace(displacement=displacement)
 
@@ -190,6 +193,8 @@ def _check(prediction: Any) -> None:
     for name, value in {**prediction._asdict(), **prediction.diagnostics}.items():
         if name in ("displacement", "log_std") and value.shape != (1, 3):
             raise ValueError(f"predict: {name} must be (1, 3) for one window, found {value.shape}")
+        if name == "axes" and value is not None and value.shape != (1, 2):
+            raise ValueError(f"predict: axes must be (1, 2) for one window, found {value.shape}")
         if name in prediction.diagnostics and value.shape[:1] != (1,):
             problem = f"must have a leading axis of one window, found {value.shape}"
             raise ValueError(f"predict: diagnostics['{name}'] {problem}")
@@ -201,7 +206,7 @@ def network_window(
     gyro: Float[Array, "r 3"],
     accel: Float[Array, "r 3"],
     config: FilterConfig,
-) -> Float[Array, "1 n 6"]:
+) -> Float[Array, "1 n c"]:
     """The network's window from the clone in slot `oldest` to the present, float32.
 
     gyro and accel are the last `config.reach` raw samples.

@@ -294,7 +294,7 @@ def clone_step(
     outcomes: dict[str, Outcome] = {}
     corrections: tuple[Correction, ...] = ()
     for measurement in (displacement, *ekf.measurements, *measurements):
-        step = Step(imu, slot, oldest, config, noise, outcomes)
+        step = Step(imu, slot, oldest, config, noise, outcomes, diagnostics)
         update = jax.checkpoint(
             lambda measurement, state, step=step: measurement.update(state, step),
             policy=_keep,

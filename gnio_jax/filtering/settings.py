@@ -61,7 +61,7 @@ class FilterConfig(FilterOptions):
     """IMU samples C before a measurement's window that the network sees too (ours)."""
     history: Literal["diagonal", "core"] = "diagonal"
     """Keep the diagonal of the core covariance at every interval, or the whole 15×15 block too."""
-    window_rotation: Literal["per_sample", "single", "tlio"] = "per_sample"
+    window_rotation: Literal["per_sample", "single", "body_axes", "tlio"] = "per_sample"
     """Rotate each sample of the network's window with its own attitude, or all with that of the
     start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
     earlier, and without subtracting the biases."""
@@ -100,6 +100,11 @@ class FilterConfig(FilterOptions):
     def seen(self) -> int:
         """IMU samples C + N that the network sees: the context and the window."""
         return self.context_samples + self.window
+
+    @property
+    def channels(self) -> int:
+        """Channels of a window."""
+        return 12 if self.cut.body_axes else 6
 
     @property
     def first_measured(self) -> int:

@@ -2,6 +2,7 @@
 
 from gnio_jax.models.inference import Inference, InferenceVariables, Network, inference_variables
 from gnio_jax.models.registry import (
+    channels,
     create,
     from_config,
     initialise,
@@ -14,6 +15,7 @@ __all__ = [
     "Inference",
     "InferenceVariables",
     "Network",
+    "channels",
     "create",
     "from_config",
     "inference_variables",

@@ -4,6 +4,7 @@ and whether its gyro and its accelerometer belong together."""
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -137,6 +138,13 @@ def _sign_of(accel: Float[np.ndarray, "n 3"], nature: Nature, notices: list[str]
     return -1.0 if (signed * accel).sum() < 0 else 1.0
 
 
+def _for_streams(remedy: str) -> str:
+    """The remedy for a recording without the options of an import, which a stream does not have."""
+    remedy = re.sub(r",? (or|as by) --columns.*", "", remedy)
+    remedy = re.sub(r"give --time-unit.*", "stamps must be in seconds", remedy)
+    return re.sub(r" as by --gyro-unit (?!deg/s$).*", " or send it in rad/s", remedy)
+
+
 class _Turning:
     """Compares the rotation of gravity with the gyro, until it is certain or a minute is over."""
 
@@ -154,8 +162,14 @@ class _Turning:
         self._due.pop(0)
         rows = np.array(self._rows)
         imu = physics.ImuSamples(rows[:, 0] - rows[0, 0], rows[:, 1:4], rows[:, 4:7])
-        warnings = physics.check_turning(imu, self._name)
-        yield from (Arrival(arrival.clock, notice=f"warning: {text}") for text in warnings)
+        try:
+            warnings = physics.check_turning(imu, self._name)
+        except InputError as error:
+            _, problem, remedy = error.parts
+            raise InputError(self._name, problem, _for_streams(remedy)) from None
+        yield from (
+            Arrival(arrival.clock, notice=f"warning: {_for_streams(text)}") for text in warnings
+        )
         if warnings or physics.is_supported(*physics.agreement(imu)):
             self._due.clear()
         if not self._due:

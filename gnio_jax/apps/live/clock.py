@@ -98,6 +98,8 @@ class Clock:
     def late(self, arrival: Arrival) -> str:
         """Why a sample whose stamp does not continue this clock is refused."""
         assert arrival.sample is not None
+        if not self.is_running:
+            return f"time: must increase, found {arrival.sample.time!r}, far from the next stamps"
         ahead = arrival.sample.time + self._offset - self.newest
         words = f"{ahead:.3g} s ahead of" if ahead > 0 else f"{-ahead:.3g} s behind"
         return f"time: must increase, found {arrival.sample.time!r}, {words} the newest sample"

@@ -180,9 +180,17 @@ def follow(
     """Feed the samples to a tracker, until the source ends or its samples are no longer accepted
     (`Followed.lost`).
 
-    `result` is updated with each sample, and `on_pose` is called after each clone step. `say` gets
-    messages, and, before there is a pose, each second what is needed for it. Raises `InputError`
-    if no line is a sample, or if no sample has both sensors.
+    Args:
+        tracker: A `filtering.Tracker`.
+        arrivals: What comes from the source, on one clock, in order and checked.
+        nature: What is known about the source.
+        result: The results, which are updated with each sample.
+        on_pose: A function that is called after each clone step.
+        say: A function that gets messages, and, before there is a pose, each second what is needed
+            for it.
+
+    Raises:
+        InputError: No line is a sample, or no sample has both sensors.
     """
     begin = time.monotonic()
     latest, spoken, is_silent = begin, 0, False
@@ -204,7 +212,10 @@ def follow(
         if result.lost:
             break
         if pose is not None:
+            is_first = result.pose is None
             result.add(pose)
+            if is_first and result.rough:
+                say(f"warning: {result.warnings()[0]}")
             on_pose(result)
         now = time.monotonic()
         if result.pose is None:

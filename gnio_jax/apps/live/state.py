@@ -40,8 +40,8 @@ def describe(
     if pose is None:
         return shown
     begin = result.path[0] if result.path else pose.time
-    is_finite = bool(np.isfinite(pose.position).all() and np.isfinite(pose.covariance).all())
-    if not pose.healthy or not is_finite:
+    numbers = (pose.position, pose.velocity, pose.rotation, pose.covariance)
+    if not pose.healthy or not all(np.isfinite(values).all() for values in numbers):
         return shown | {"state": "diverged", "reason": pose.failure}
     covariance = pose.covariance[6:8, 6:8]
     return shown | {

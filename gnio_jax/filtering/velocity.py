@@ -1,0 +1,45 @@
+"""The velocity in the body that a network predicts, as a measurement (AirIO): h = Rᵀ v."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import jax.numpy as jnp
+
+from gnio_jax import geometry
+from gnio_jax.config.schema import ABOVE_ZERO, Number
+from gnio_jax.filtering.state import FilterState
+from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
+
+
+class BodyVelocity(NamedTuple):
+    """Measures the last velocity of the network's window, in the place of its displacement.
+
+    The network says it in the diagnostics `body_velocity` and `body_velocity_log_std` (m, 3), in
+    metres per window. Raises `ValueError` for a network without them.
+    """
+
+    scale: Annotated[Number, ABOVE_ZERO] = 0.1
+    """Factor of the predicted variance (AirIO: 0.1)."""
+    name = "body_velocity"
+    replaces_displacement = True
+
+    def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
+        if not {"body_velocity", "body_velocity_log_std"} <= step.diagnostics.keys():
+            raise ValueError(
+                "filter.measurements: 'body_velocity' needs a network that predicts a velocity "
+                "in the body, such as airio"
+            )
+        dtype, config = state.velocity.dtype, step.config
+        seconds = config.window * config.dt
+        velocity, log_std = (
+            step.diagnostics[name][-1].astype(dtype)
+            for name in ("body_velocity", "body_velocity_log_std")
+        )
+        present = jnp.isfinite(velocity) & jnp.isfinite(log_std)
+        variance = self.scale * jnp.exp(2 * jnp.where(present, log_std, 0.0)) / seconds**2
+        to_body = state.rotation.T
+        residual = jnp.where(present, velocity / seconds - to_body @ state.velocity, jnp.nan)
+        jacobian = {"velocity": to_body, "rotation": to_body @ geometry.hat(state.velocity)}
+        linear = linearise(state, residual, jnp.diag(variance), **jacobian)
+        return measure(state, linear, step)
