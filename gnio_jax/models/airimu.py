@@ -122,7 +122,7 @@ def correct_recording(
     variables: Any, accel: Float[np.ndarray, "n 3"], gyro: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """The corrected acceleration (m/s²) and rate (rad/s) of a recording at the corrector's rate,
-    for the filter. `variables` are those of a network behind a corrector."""
+    for the filter. `variables` are those of a network after a corrector."""
     corrector = {name: tree["corrector"] for name, tree in variables.items()}
     imu = jnp.asarray(np.concatenate([accel, gyro], axis=1)[None], jnp.float32)
     correction = np.asarray(jax.jit(AirIMU().apply)(corrector, imu).imu[0], float)

@@ -112,7 +112,7 @@ class Decoder(nn.Module):
 
 
 def norm(name: str, train: bool) -> nn.BatchNorm:
-    """A batch normalisation that inference does not fold: behind a layer with a bias, or before
+    """A batch normalisation that inference does not fold: after a layer with a bias, or before
     one."""
     options = {"momentum": MOMENTUM, "epsilon": EPSILON, "name": name, **FLOAT32}
     return nn.BatchNorm(use_running_average=not train, **options)
