@@ -20,8 +20,8 @@ A measurement is an object with a `name` and a method
 
     update(state, step) -> (state, Outcome, Correction),
 
-which linearises it (`linearise`) and applies it (`measure`); see `Displacement`, `ZeroVelocity`,
-and "A measurement of your own" in docs/differentiable_filter.md.
+which linearises it (`linearise`) and applies it (`measure`); see `Displacement`, `ZeroVelocity`
+and docs/measurements.md.
 """
 
 from __future__ import annotations
@@ -112,9 +112,9 @@ class Correction(NamedTuple):
     residual: Float[Array, "m"]
     """L⁻¹ r."""
     core: Float[Array, "m n"]
-    """Y against the core …"""
+    """Rows of Y for the error of the core."""
     clones: Float[Array, "m c"]
-    """… and against the clones."""
+    """Rows of Y for the errors of the clones."""
     jacobian: dict[str, Float[Array, "m 3"]]
     """The blocks of L⁻¹ H."""
 
@@ -128,7 +128,7 @@ class Step(NamedTuple):
     """The clone interval at whose end a measurement is taken."""
 
     imu: Imu
-    """Its samples."""
+    """The samples of the interval."""
     newest: Array | int
     """Slot of the newest clone in the ring."""
     oldest: Array | int
@@ -138,6 +138,8 @@ class Step(NamedTuple):
     before: Mapping[str, Outcome] = MappingProxyType({})
     """Outcomes of the measurements of this interval before this one, by their names; the first is
     the displacement."""
+    diagnostics: Mapping[str, Array] = MappingProxyType({})
+    """The network's diagnostics by their names; NaN where it was not called."""
 
 
 @runtime_checkable
