@@ -58,14 +58,14 @@ class NonHolonomic(NamedTuple):
         dtype = state.offset.dtype
         across = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)[1:]
         lever = jnp.stack([jnp.asarray(x, dtype) for x in self[-3:]])
-        rate = step.imu.gyro[-1] - state.gyro_bias
+        rate, present = step.imu.gyro[-1] - state.gyro_bias, jnp.bool_(True)
         if step.imu.gap is not None:
-            rate = jnp.where(step.imu.gap.gyro_variance[-1] == 0, rate, jnp.nan)
+            present = step.imu.gap.gyro_variance[-1] == 0
         velocity = matmul(state.rotation.T, state.velocity[:, None])[:, 0] + jnp.cross(rate, lever)
         of_velocity = matmul(across, state.rotation.T)
         linear = linearise(
             state,
-            -matmul(across, velocity[:, None])[:, 0],
+            jnp.where(present, -matmul(across, velocity[:, None])[:, 0], jnp.nan),
             jnp.diag(jnp.stack([jnp.asarray(std, dtype) ** 2 for std in self[:2]])),
             velocity=of_velocity,
             rotation=matmul(of_velocity, hat(state.velocity)),

@@ -56,6 +56,9 @@ from gnio_jax.filtering.state import (
     VELOCITY,
     FilterState,
     Shift,
+    additive_core,
+    with_position,
+    yaw_lever,
 )
 from gnio_jax.geometry import contract_left, contract_right, matmul
 from gnio_jax.types import Array
@@ -229,7 +232,7 @@ def measure(
             before there are W + 1 of them.
         step: The clone interval.
         threshold: Largest rᵀ S⁻¹ r of a measurement that is used, e.g. a quantile of χ² with m
-            degrees of freedom.
+            degrees of freedom. In the world S has the arc of an uncertain yaw (`with_arc`).
         frame: The frame to which the measured quantity is fixed, "carrier" or "world". A position
             in the world that is measured with "carrier" would show a yaw that nobody measured.
 
@@ -244,6 +247,8 @@ def measure(
         names = " or ".join(map(repr, get_args(MeasuredFrame)))
         raise ValueError(f"measure: frame must be {names}, found {frame!r}")
     outcome, correction = project(state, linear, step)
+    if frame == "world" and step.config.invariant:
+        outcome = with_arc(outcome, correction, state)
     tested = outcome.present & jnp.isfinite(threshold)
     accepted = outcome.present & ~(outcome.nis > threshold)
     weight = accepted.astype(outcome.nis.dtype)
@@ -275,6 +280,25 @@ def project(state: FilterState, linear: Linearised, step: Step) -> tuple[Outcome
     weight = present.astype(volume.dtype)
     outcome = Outcome(present, present, residual, jnp.sum(white**2), volume, weight, present)
     return outcome, Correction(white[:, 0], core, clones, by_part)
+
+
+def with_arc(outcome: Outcome, correction: Correction, state: FilterState) -> Outcome:
+    """The outcome of a measurement in the world, S with the second order of an uncertain yaw in
+    velocity and position (`state.arc_covariance`), which the reported covariance has too.
+
+    Otherwise a correct fix would be refused where it lies on the arc, beside its tangent, and so
+    would all later ones. With a = √¾ J σ² l, S becomes S + a aᵀ.
+    """
+    with_yaw = additive_core(state, with_position(state.core_covariance[:, THETA.stop - 1, None]))
+    whitened = jnp.zeros_like(correction.residual)  # L⁻¹ a
+    for part, entries in (("velocity", VELOCITY), ("position", OFFSET)):
+        if part in correction.jacobian:
+            lever = math.sqrt(0.75) * yaw_lever(with_yaw[entries, 0])
+            whitened += matmul(correction.jacobian[part], lever[:, None])[:, 0]
+    growth = 1 + jnp.sum(whitened**2)  # of det S
+    explained = jnp.sum(whitened * correction.residual) ** 2 / growth
+    volume = jnp.where(outcome.present, outcome.volume * jnp.sqrt(growth), outcome.volume)
+    return outcome._replace(nis=outcome.nis - explained, volume=volume)
 
 
 def with_turns(

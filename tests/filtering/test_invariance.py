@@ -12,7 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.state import arc_covariance, invariant_errors, unroll_clones
+from gnio_jax.filtering.state import (
+    arc_covariance,
+    core_covariance,
+    invariant_errors,
+    unroll_clones,
+)
 from gnio_jax.filtering.update import Step
 from tests.support import manifold
 from tests.support.compiling import optimised, quick
@@ -369,3 +374,69 @@ def test_a_second_update_knows_what_the_first_has_moved():
         np.testing.assert_allclose(places, expected_places, atol=1e-10)
         np.testing.assert_allclose(covariance(after), covariance(expected), atol=1e-10)
         assert np.abs(covariance(after) - covariance(unroll_clones(first, 0))).max() > 1e-4
+
+
+@quick
+def outcomes_of(state, residual, spread):
+    """Outcomes of one measurement of velocity and position by its frame, and the covariance that
+    the filter reports before it."""
+    config = config_of("invariant")
+    step = Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), CLONES, 0, config, NOISE)
+    inside, eye, outcomes = invariant_errors(state, config), np.eye(3), {}
+    blocks = {"since_oldest": eye, "oldest_rotation": eye}
+    moving = filtering.linearise(inside, residual, spread, **blocks)
+    inside, _, _ = filtering.measure(inside, moving, step)
+    linear = filtering.linearise(inside, residual, spread, velocity=-0.4 * eye, position=eye)
+    for frame in ("carrier", "world"):
+        outcomes[frame] = filtering.measure(inside, linear, step, frame=frame)[1]
+    return outcomes, core_covariance(inside, config)
+
+
+def test_a_measurement_in_the_world_is_tested_against_the_reported_covariance():
+    """Which has the arc of the yaw. A quantity of the carrier turns with it and has none."""
+    state = run_pieces("invariant", [24])
+    residual, spread = np.array([0.8, -0.6, 0.2]), 0.01 * np.eye(3)
+    outcomes, reported = jax.device_get(outcomes_of(state, residual, spread))
+    rows = np.zeros((3, 15))
+    rows[:, 3:6], rows[:, 6:9] = -0.4 * np.eye(3), np.eye(3)
+    whole = rows @ reported @ rows.T + spread
+    nis, volume = residual @ np.linalg.solve(whole, residual), np.sqrt(np.linalg.det(whole))
+    assert outcomes["world"].nis == pytest.approx(nis, rel=1e-9)
+    assert outcomes["world"].volume == pytest.approx(volume, rel=1e-9)
+    assert outcomes["carrier"].nis > 1.001 * nis
+
+
+@quick
+def walked_straight(position):
+    """Where a walk of 16 m and later, from rest and straight ahead by the filter's first yaw, ends
+    with these fixes, 1 m each and each tested: positions, rotations, and whether they were
+    taken."""
+    intervals = len(position)
+    std = filtering.InitialStd(1e-4, 0.5, 0.01, 0.1, accel_bias=1e-3)
+    noise = filtering.NoiseModel(1e-4, 1e-3, 1e-6, 1e-5)
+    ekf = filtering.Filter(config_of("invariant"), noise, std)
+    state = filtering.initial_state(ekf, np.eye(3), np.zeros(3), np.zeros(3))
+    accel = np.tile([0.0, 0.0, 9.81], (intervals * N, 1))
+    accel[:100, 0] = 1.0  # for 2 s
+    spread = np.tile(np.eye(2), (intervals, 1, 1))
+    threshold = np.full(intervals, 9.21)
+    fix = filtering.Fix(position, spread, *np.zeros((2, intervals)), threshold)
+    nothing = np.full((intervals, 3), np.nan), np.tile(np.eye(3), (intervals, 1, 1))
+    signals = np.zeros_like(accel), accel, *nothing
+    _, history = filtering.run_filter(ekf, state, *signals, measurements=(fix,))
+    return history.position, history.rotation, history.outcomes["fix"].accepted
+
+
+@pytest.mark.parametrize("yaw, taken", [(0.8, True), (3.0, False)])
+def test_a_fix_on_the_arc_of_an_uncertain_yaw_is_taken(yaw, taken):
+    """With a standard deviation of 0.5 rad, one at 0.8 rad lies 5 m beside the tangent of the arc,
+    five times its own standard deviation. One in the opposite direction is refused."""
+    rows, position = np.arange(79, 100, 5), np.full((100, 2), np.nan)
+    distance = 2.0 + 2.0 * ((rows + 1) * N * DT - 2.0)
+    position[rows] = distance[:, None] * [np.cos(yaw), np.sin(yaw)]
+    places, rotations, accepted = walked_straight(position)
+    assert (np.asarray(accepted)[rows] == taken).all()
+    if taken:
+        np.testing.assert_allclose(places[-1, :2], position[-1], atol=0.2)
+        turned = np.arctan2(rotations[-1, 1, 0], rotations[-1, 0, 0])
+        assert turned == pytest.approx(yaw, abs=0.02)

@@ -143,12 +143,13 @@ def test_no_velocity_is_measured_where_the_rate_is_missing():
 
 
 def test_derivatives_are_finite_at_rest_and_with_the_axis_ahead_upright():
-    """Also where the measurement is refused."""
+    """Also where the measurement is refused, and where the rate is missing (variance above 0)."""
     ekf = filtering.Filter(CONFIG)
 
-    def loss(numbers, velocity):
+    def loss(numbers, velocity, variance=0.0):
         state = filtering.initial_state(ekf, jnp.eye(3), velocity, jnp.zeros(3))
-        imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), None)
+        gap = Gap(jnp.full(N, variance), jnp.zeros(N), jnp.ones(N))
+        imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), gap)
         step = filtering.Step(imu, 0, 1, CONFIG, NOISE)
         after, outcome, _ = NonHolonomic(*numbers).update(state, step)
         return jnp.sum(after.velocity**2) + outcome.nis
@@ -157,8 +158,9 @@ def test_derivatives_are_finite_at_rest_and_with_the_axis_ahead_upright():
     for velocity in (np.zeros(3), np.array([0.0, 100.0, 0.0]), np.array([10.0, 0.5, -0.2])):
         for pitch in (0.0, np.pi / 2, np.pi):
             numbers = np.array([*MOUNTED[:3], pitch, *MOUNTED[4:]])
-            slopes = gradient(numbers, velocity)
-            assert all(np.isfinite(slope).all() for slope in slopes)
+            for variance in (0.0, 1e-6):
+                slopes = gradient(numbers, velocity, variance)
+                assert all(np.isfinite(slope).all() for slope in slopes)
 
 
 def test_it_is_a_measurement_of_the_settings():
