@@ -8,6 +8,7 @@ setup(
     package_data={
         "gnio_jax": ["py.typed"],
         "gnio_jax.configs": ["*.yaml", "*/*.yaml"],
+        "gnio_jax.apps.live": ["*.html"],
         "gnio_jax.evaluation": ["*.html", "*.js"],
         "gnio_jax.weights": ["*.zip", "*/*"],
     },

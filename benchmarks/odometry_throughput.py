@@ -1,6 +1,6 @@
-"""Speed of the whole odometry: the full-width network inside the filter's loop.
+"""Speed of the whole odometry: a network of full width inside the filter's loop.
 
-    python -m benchmarks.odometry_throughput [--batches 1 8 32] [--seconds 20] [--repeats 3]
+    python -m benchmarks.odometry_throughput [--network gru] [--batches 1 8 32] [--seconds 20]
 
 The figure is seconds of recording per second of computing, for one sequence and for many side by
 side. Compile time is measured apart, and the best of the repeats counts. The same filter with given
@@ -38,7 +38,9 @@ def best(program, arguments, repeats: int) -> float:
     return min(times)
 
 
-def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[str, float]:
+def measure(
+    network: str, clone_rate: int, batch: int, seconds: float, repeats: int
+) -> dict[str, float]:
     """Times real time of the whole odometry and of the filter alone, and the network's share."""
     config = filtering.FilterConfig(DT, round(1 / DT) // clone_rate, clone_rate)
     gyro, accel, displacement, covariance = (
@@ -48,14 +50,13 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
         filtering.Filter(config), np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3)
     )
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
-    model = models.create("gnio")
+    model = models.create(network)
     variables = models.initialise(model, jax.random.key(0), config.seen)
     apply, frozen = models.Inference(model), models.inference_variables(model, variables)
 
     def with_network(frozen, gyro, accel):
-        def predict(windows):
-            return apply(frozen, windows)._replace(diagnostics={})
-
+        plain = lambda prediction: prediction._replace(diagnostics={})  # noqa: E731
+        predict = models.Network(apply, frozen).predict(plain)
         return filtering.run_odometry(predict, filtering.Filter(config, noise), state, gyro, accel)[
             1
         ].position
@@ -116,11 +117,15 @@ def torch_forward(windows: int, batch: int, repeats: int) -> float | None:
     return min(times) / (calls * batch) * windows
 
 
-def report_row(rate: int, batch: int, seconds: float, repeats: int) -> dict[str, float]:
+def report_row(
+    network: str, rate: int, batch: int, seconds: float, repeats: int
+) -> dict[str, float]:
     """Measure and print one row; its figures by their names in the baseline."""
-    row = measure(rate, batch, seconds, repeats)
+    row = measure(network, rate, batch, seconds, repeats)
     torch_seconds = torch_forward(int(row["windows"]), batch, repeats)
     name = f"{rate} Hz clones, batch {batch}"
+    if network != "gnio":
+        name = f"{network}, {name}"
     figures = {f"times real time, {name}": row["whole"]}
     share = ""
     if torch_seconds is not None:
@@ -137,6 +142,7 @@ def report_row(rate: int, batch: int, seconds: float, repeats: int) -> dict[str,
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--network", default="gnio", choices=models.names())
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 8, 32])
     parser.add_argument(
         "--clone-rates",
@@ -150,7 +156,7 @@ def main() -> None:
     arguments = parser.parse_args()
     filtering.cores_as_devices()
     device = jax.devices()[0].device_kind
-    print(f"{device}, jax {jax.__version__}, 200 Hz IMU, network of full width; times real time\n")
+    print(f"{device}, jax {jax.__version__}, 200 Hz IMU, {arguments.network}; times real time\n")
     print(
         f"{'clones':>7} {'batch':>6} {'whole':>9} {'filter':>9} "
         f"{'ms/window':>10} {'compile s':>10} {'TLIO in PyTorch, forward':>25}"
@@ -158,7 +164,8 @@ def main() -> None:
     figures: dict[str, float] = {}
     for rate in arguments.clone_rates:
         for batch in arguments.batches:
-            figures |= report_row(rate, batch, arguments.seconds, arguments.repeats)
+            row = arguments.network, rate, batch, arguments.seconds, arguments.repeats
+            figures |= report_row(*row)
     baseline.compare("odometry_throughput", figures)
 
 

@@ -79,10 +79,10 @@ def read(path: Path) -> ImuSamples:
 
 def create_tracker(run, recorded: ImuSamples, rest_seconds: float):
     """The compiled tracker of a trained run, which starts from rest."""
-    from gnio_jax.apps import live
+    from gnio_jax.apps.live.tracking import create_tracker as create
 
     try:
-        return live.create_tracker(run, 1 / recorded.interval, rest_seconds)
+        return create(run, 1 / recorded.interval, rest_seconds)
     except ValueError as error:
         raise InputError("--rest-seconds", str(error)) from None
 

@@ -74,7 +74,7 @@ LONGEST = (
     "filtering/test_run_odometry.py",
     "models/test_contract.py",
     "evaluation/test_evaluate.py",
-    "apps/test_live.py",
+    "apps/live/test_command.py",
     "data/readers/test_oxiod.py",
     "test_docs.py",
     "data/test_fuzz.py",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
 
 from gnio_jax.commands import console, options
 
@@ -55,5 +57,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if argv is None else argv)
     if words == ["--completion"]:
         print(options.completion(GNIO, "gnio"))
-        return
-    console.run(lambda: options.run(GNIO, options.Call("gnio", words)))
+    elif words in (["--version"], ["version"]):
+        print(f"gnio-jax {version('gnio-jax')}")
+    else:
+        console.run(lambda: options.run(GNIO, options.Call(_program(), words)))
+
+
+def _program() -> str:
+    """How this program was started: a script that registers a network of its own knows that
+    network, which `gnio` does not."""
+    script = Path(sys.argv[0])
+    is_script = script.suffix == ".py" and script.name != "__main__.py"
+    return f"python {script}" if is_script else "gnio"

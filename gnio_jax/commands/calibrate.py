@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from rich import box
 from rich.table import Table
 
 from gnio_jax import config as configuration
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from gnio_jax.calibration.comparison import Effect
 
 
-def calibrate(request: CalibrateConfig, _call: options.Call) -> None:
+def calibrate(request: CalibrateConfig, call: options.Call) -> None:
     """Fit the filter of a run to its validation split, and write a run with it.
 
     A network's errors are smaller on its training walks than on other walks, so the filter is
@@ -38,7 +39,7 @@ def calibrate(request: CalibrateConfig, _call: options.Call) -> None:
     console.prepare_filter()
     with console.terminal() as terminal:
         result = calibration.calibrate(request, terminal.progress, usable_cores())
-    table, before = Table("filter", "before", "calibrated"), configuration.flatten(result.before)
+    table, before = _table_of("filter"), configuration.flatten(result.before)
     for name, value in configuration.flatten(result.consider_fit.settings).items():
         if value != before.get(name):
             table.add_row(name, _spell(before.get(name)), _spell(value))
@@ -58,14 +59,24 @@ def calibrate(request: CalibrateConfig, _call: options.Call) -> None:
     )
     for warning in result.warnings:
         console.warn(warning)
-    console.say(f"look at it with: gnio evaluate --network {result.folder}")
+    following = f"{call.sibling('evaluate')} --network {console.shown_path(result.folder)}"
+    console.say(f"look at it with: {following}")
+
+
+def _table_of(subject: str) -> Table:
+    """An empty table of values before and after the calibration."""
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column(subject, overflow="fold")
+    table.add_column("before", justify="right")
+    table.add_column("calibrated", justify="right")
+    return table
 
 
 def _trajectories(effect: Effect) -> Table:
     """The errors of the trajectories of the recordings before and after the calibration."""
     from gnio_jax.evaluation.tabulate import column, number  # as late as the calibration
 
-    table = Table("trajectories", "before", "calibrated")
+    table = _table_of("trajectories")
     for metric, change in effect.errors.items():
         shown = column(metric)
         table.add_row(shown.title, *(number(mean, shown.digits) for mean in change))

@@ -18,7 +18,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.segment import Segment
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 import gnio_jax
@@ -169,8 +169,21 @@ def stdout() -> Console:
 
 
 def say(result: Any) -> None:
-    """Print a line of any length, or a table, on the console of results."""
-    stdout().print(result, soft_wrap=isinstance(result, str))
+    """Print a line of any length, or a table, on the console of results. Into a file or a pipe,
+    lines of tables have no blanks at their ends."""
+    console = stdout()
+    if isinstance(result, str) or console.is_terminal:
+        console.print(result, soft_wrap=isinstance(result, str))
+        return
+    with console.capture() as capture:
+        console.print(result)
+    for line in capture.get().splitlines():
+        console.print(line.rstrip(), soft_wrap=True)
+
+
+def shown_path(path: Path) -> Path:
+    """A path as people write it: below the working folder without that folder's name."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def columns(*names: str, **options: Any) -> Table:
@@ -229,18 +242,19 @@ def terminal(shown: bool = True) -> Iterator[Terminal]:
     from rich import progress  # late, because neither help nor errors need it
 
     console = _Plain(stderr=True)
+    # The times stand before the numbers, which are cut where a terminal is narrow.
+    cut = Column(ratio=1, no_wrap=True, overflow="ellipsis")
     columns = (
         progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
+        progress.BarColumn(bar_width=10),
         progress.TaskProgressColumn(),
-        progress.TextColumn("{task.fields[numbers]}"),
         progress.TimeElapsedColumn(),
         progress.TimeRemainingColumn(elapsed_when_finished=True),
+        progress.TextColumn("{task.fields[numbers]}", table_column=cut),
     )
     disable = not (shown and console.is_terminal)
-    with progress.Progress(
-        *columns, console=console, transient=True, disable=disable, speed_estimate_period=120
-    ) as bars:
+    settings = {"transient": True, "disable": disable, "speed_estimate_period": 120, "expand": True}
+    with progress.Progress(*columns, console=console, **settings) as bars:
         yield Terminal(bars)
 
 

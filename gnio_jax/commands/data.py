@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from gnio_jax.commands import console, options
+from gnio_jax.commands.names import check_names
 from gnio_jax.config.schema import UNNAMED, Folder, NewFile, Rate
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
@@ -105,9 +106,9 @@ def check(request: CheckOptions, _call: options.Call) -> None:
       {prog} tlio --data-root ~/tlio --split test
       {prog} csv --data-root ~/walks --plots pictures --json figures.json
     """
+    dataset, root = _find(request.name, request.data_root)
     from gnio_jax.data import conversion  # late: mistakes do not wait for JAX
 
-    dataset, root = _find(request.name, request.data_root)
     with console.terminal() as terminal:
         progress = partial(terminal.progress, "checking")
         rows, notes = conversion.check(dataset, root, request.split, request.plots, None, progress)
@@ -184,9 +185,9 @@ def convert(request: ConvertOptions, _call: options.Call) -> None:
       {prog} tlio ~/converted/tlio_100 --data-root ~/tlio --rate 100
       gnio train --dataset csv --data-root ~/converted/oxiod
     """
+    dataset, root = _find(request.name, request.data_root)
     from gnio_jax.data import conversion  # late: mistakes do not wait for JAX
 
-    dataset, root = _find(request.name, request.data_root)
     with console.terminal() as terminal:
         progress = partial(terminal.progress, "converting")
         result = conversion.convert(
@@ -202,6 +203,7 @@ def convert(request: ConvertOptions, _call: options.Call) -> None:
 
 def _find(name: str, data_root: str | None) -> tuple[Any, Path]:
     """A dataset and its folder."""
+    check_names(datasets=[name])
     from gnio_jax import data
 
     dataset = data.get(name)

@@ -6,12 +6,15 @@ import contextlib
 import importlib.metadata
 import json as json_format
 import platform
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from gnio_jax.commands import console, options
 from gnio_jax.errors import InputError
 
+EXTRAS = ("bags", "excel", "idol", "onnx", "rerun", "torch")
+"""Extras of gnio-jax that a user may want."""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy", "h5py")
 
 
@@ -24,8 +27,8 @@ class DoctorOptions:
 def doctor(request: DoctorOptions, _call: options.Call) -> None:
     """Show what is installed and found here: packages, devices, datasets, networks, caches.
 
-    A missing part is not an error. Include the output when you ask for help. A dataset is looked
-    for in $GNIO_DATA/NAME, then in data/NAME.
+    A missing part is not an error. Extras are parts of gnio-jax that need further packages. Include
+    the output when you ask for help. A dataset is looked for in $GNIO_DATA/NAME, then in data/NAME.
 
     examples:
       {prog}
@@ -36,6 +39,7 @@ def doctor(request: DoctorOptions, _call: options.Call) -> None:
         "gnio_jax": f"{_version('gnio-jax')} in {Path(__file__).parents[1]}",
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
         "packages": ", ".join(map(_version, PACKAGES)),
+        **_extras(),
         **_devices(),
         **_find_places(),
     }
@@ -52,6 +56,19 @@ def _version(name: str) -> str:
         return f"{name} is not installed"
 
 
+def _extras() -> dict[str, str]:
+    """Whether the packages of each extra are installed, or how to install them."""
+    requirements = importlib.metadata.requires("gnio-jax") or []
+    facts = {}
+    for extra in EXTRAS:
+        marked = [line for line in requirements if re.search(rf"extra == ['\"]{extra}['\"]", line)]
+        names = [re.split(r"[^\w.-]", line)[0] for line in marked]
+        missing = [name for name in names if "not installed" in _version(name)]
+        remedy = f"lacks {', '.join(missing)}: pip install 'gnio-jax[{extra}]'"
+        facts[f"extra {extra}"] = remedy if missing else ", ".join(map(_version, names))
+    return facts
+
+
 def _devices() -> dict[str, str]:
     import jax
     import jax.numpy as jnp
@@ -59,7 +76,9 @@ def _devices() -> dict[str, str]:
     jax.config.update("jax_enable_x64", True)  # as in every command with the filter
     if problem := console.lacking_device():
         return {"devices": f"none: {problem}"}
-    kinds = [f"{device.platform} {device.device_kind}" for device in jax.devices()]
+    kinds = [
+        " ".join(dict.fromkeys((device.platform, device.device_kind))) for device in jax.devices()
+    ]
     third = float(jnp.asarray(1.0, jnp.float64) / 3.0)
     counts = ", ".join(f"{kinds.count(kind)} × {kind}" for kind in dict.fromkeys(kinds))
     facts = {"devices": counts, "float64": "works" if third == 1 / 3 else "does not work"}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from gnio_jax.commands import console, options
+from gnio_jax.commands.names import check_names
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.config.schema import UNNAMED
 from gnio_jax.cores import usable_cores
@@ -43,6 +44,7 @@ def evaluate(request: EvaluateConfig, call: options.Call) -> None:
       {prog} --network runs/tlio --estimator integrate --orientation device
       {prog} --network runs/tlio --set filter.noise.measurement_scale=1
     """
+    check_names(datasets=[request.dataset] if request.dataset else [])
     from gnio_jax import evaluation  # late: mistakes do not wait for JAX
     from gnio_jax.apps import rerun
     from gnio_jax.evaluation import tabulate

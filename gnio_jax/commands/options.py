@@ -29,8 +29,25 @@ from gnio_jax.errors import InputError, did_you_mean
 
 HELP, HELP_VERBOSE = ("-h", "--help"), ("-H", "--help-verbose")
 MANY = 24
-"""Number of options above which the help lists only names and defaults; --help-verbose explains
-them."""
+"""Number of options above which the help explains only those of no section and the `MAIN` ones of
+the class; --help-verbose explains all."""
+SYNONYMS = {
+    **dict.fromkeys(("lr", "rate-of-learning"), "learning-rate"),
+    **dict.fromkeys(("bs", "batch", "batchsize"), "batch-size"),
+    **dict.fromkeys(("epoch", "num-epochs", "n-epochs", "max-epochs"), "epochs"),
+    **dict.fromkeys(("gpu", "gpus", "num-gpus", "device", "cuda"), "devices"),
+    **dict.fromkeys(("channels", "hidden-size"), "width"),
+    **dict.fromkeys(("weights", "run", "model", "ckpt", "checkpoint-path"), "network"),
+    **dict.fromkeys(("arch", "architecture"), "name"),
+    **dict.fromkeys(("output", "out-dir", "output-dir", "save-dir"), "out"),
+    **dict.fromkeys(("data", "data-dir", "dataroot", "root"), "data-root"),
+    **dict.fromkeys(("wd", "l2"), "weight-decay"),
+    **dict.fromkeys(("freq", "imu-freq", "frequency", "hz"), "rate"),
+    **dict.fromkeys(("unit", "gyro-units"), "gyro-unit"),
+    "accel-units": "accel-unit",
+    "continue": "resume",
+}
+"""Names of options in other programs, and ours without the section."""
 WIDTH = 100
 """Largest number of columns of a help text."""
 
@@ -55,6 +72,12 @@ class Call(NamedTuple):
 
     def __str__(self) -> str:
         return shlex.join([*self.prog.split(), *self.argv])
+
+    def sibling(self, command: str) -> str:
+        """Another command of the same program: `gnio evaluate` of `gnio train`, and
+        `python evaluate.py` of `python train.py`."""
+        program, _, word = self.prog.rpartition(" ")
+        return f"{program} {command}{'.py' if word.endswith('.py') else ''}"
 
 
 Command = Callable[[Any, Call], None]
@@ -83,17 +106,17 @@ class Option(NamedTuple):
 
 
 def run(program: Group | str | Command, call: Call) -> None:
-    """Find the command that the words name, read its options and run it. Raises `InputError` for a
-    command that is unknown or missing, and as `read`."""
+    """Find the command that the words name, read its options and run it. Without a command the help
+    is shown. Raises `InputError` for a command that is unknown, and as `read`."""
     while isinstance(program, Group):
-        word = call.argv[0] if call.argv else ""
+        word = call.argv[0] if call.argv else HELP[0]
         if word in HELP:
             print(_overview(program, call.prog))
             return
         if word not in program.commands:
             choices = f"give one of {', '.join(program.commands)}; --help explains them"
             remedy = did_you_mean(word, program.commands).strip() or choices
-            raise InputError("command", f"unknown '{word}'" if word else "is missing", remedy)
+            raise InputError("command", f"unknown '{word}'", remedy)
         program, call = program.commands[word], Call(f"{call.prog} {word}", call.argv[1:])
     command = function(program) if isinstance(program, str) else program
     command(read(command, call), call)
@@ -141,14 +164,16 @@ def read(command: Command, call: Call, default: Any = None) -> Any:
     one), that has no value or one of the wrong type or beyond its bounds, or that is missing.
     `--help` prints the help and exits with status 0: the command's docstring up to its line
     "examples:", the options with the comments of their fields, and last the examples. If there are
-    many options, it lists names and defaults, and `--help-verbose` explains them.
+    many options, it explains the main ones, and `--help-verbose` all.
     """
     kind = options_type(command)
     options = {".".join(option.path): option for option in options_of(kind)}
     verbose = any(word in HELP_VERBOSE for word in call.argv)
     explained = verbose or any(word in HELP for word in call.argv)
-    brief = not explained or (len(options) > MANY and not verbose)
-    parser = _parser(command, call.prog, options, brief)
+    hidden: set[str] = set()
+    if len(options) > MANY and not verbose:
+        hidden = {dest for dest in options if "." in dest and dest not in kind.MAIN}
+    parser = _parser(command, call.prog, options, explained, hidden)
     if explained:
         print(parser.format_help(), end="")
         raise SystemExit(0)
@@ -187,24 +212,24 @@ def _normalise_word(word: str, names: set[str]) -> str:
         return word
     spelled = name.replace("_", "-")
     if spelled not in names:
-        inner = {
-            option_name.rpartition(".")[2]: option_name
-            for option_name in names
-            if "." in option_name
-        }
-        hint = did_you_mean(spelled, names, cutoff=0.5) or did_you_mean(
-            spelled.lstrip("-"), inner, inner.get
-        )
+        inner = {option_name.lstrip("-").rpartition(".")[2]: option_name for option_name in names}
+        word = spelled.lstrip("-")
+        if (meant := inner.get(SYNONYMS.get(word, word))) is not None:
+            hint = f"did you mean '{meant}'?"
+        else:
+            hint = did_you_mean(spelled, names, cutoff=0.5) or did_you_mean(word, inner, inner.get)
         raise InputError(name, "unknown option", hint.strip() or "--help lists the known ones")
     return f"{spelled}{equals}{value}"
 
 
 def _parser(
-    command: Command, prog: str, options: dict[str, Option], brief: bool
+    command: Command, prog: str, options: dict[str, Option], explained: bool, hidden: set[str]
 ) -> argparse.ArgumentParser:
-    """The parser that splits the words of these options and writes their help."""
-    configs = ", ".join(configuration.experiment_names())
-    text = (inspect.getdoc(command) or "").format(prog=prog, configs=configs)
+    """The parser that splits the words of these options and writes their help, if it is to be
+    `explained`, without the `hidden` options."""
+    words_of_help = {"configs": ", ".join(configuration.experiment_names())}
+    words_of_help |= getattr(options_type(command), "WORDS_OF_HELP", {})
+    text = (inspect.getdoc(command) or "").format(prog=prog, **words_of_help)
     description, _, examples = text.partition("\nexamples:\n")
     width = min(WIDTH, shutil.get_terminal_size().columns)
     words = (option for option in options.values() if not option.words.named)
@@ -214,41 +239,48 @@ def _parser(
     )
 
     def paragraphs(text: str) -> str:
-        filled = (" ".join(paragraph.split()) for paragraph in text.strip().split("\n\n"))
         return "\n\n".join(
-            textwrap.fill(paragraph, width - 2, break_on_hyphens=False) for paragraph in filled
+            paragraph  # a list
+            if paragraph.startswith("  ")
+            else textwrap.fill(" ".join(paragraph.split()), width - 2, break_on_hyphens=False)
+            for paragraph in text.strip().split("\n\n")
         )
 
+    names = dict.fromkeys(dest.partition(".")[0] for dest in options if dest in hidden)
+    more = f"{prog} -H explains {len(hidden)} more options of {', '.join(names)}."
+    more = f"{paragraphs(more)}\n\n" if hidden else ""
     parser = argparse.ArgumentParser(
         prog=prog,
         usage=" ".join([prog, *usage, "[OPTIONS]"]),
         description=paragraphs(description),
-        epilog=(f"{prog} -H explains the options.\n\n" if brief else "") + f"examples:\n{examples}",
+        epilog=more + f"examples:\n{examples}",
         formatter_class=partial(
             argparse.RawDescriptionHelpFormatter,
             width=width,
-            max_help_position=44 if brief else 28,
+            max_help_position=28,
         ),
         argument_default=argparse.SUPPRESS,
         allow_abbrev=False,
         exit_on_error=False,
     )
+    if hidden:
+        parser.add_argument(*HELP_VERBOSE, action="help", help="explain all options and exit")
     sections: dict[str, Any] = {}
     for dest, option in options.items():
         name, *inner = option.path
         if inner and name not in sections:
-            description = paragraphs(option.section.__doc__ or "")
+            description = None if hidden else paragraphs(option.section.__doc__ or "")
             sections[name] = parser.add_argument_group(f"{name} options", description)
-        _add(sections[name] if inner else parser, option, dest, brief)
+        _add(sections[name] if inner else parser, option, dest, explained, dest in hidden)
     return parser
 
 
-def _add(group: Any, option: Option, dest: str, brief: bool) -> None:
+def _add(group: Any, option: Option, dest: str, explained: bool, hidden: bool) -> None:
     """Add an option to the group of its section."""
     kind = kind_of(option.hint)
     items = typing.get_args(kind) if typing.get_origin(kind) is tuple else ()
     item = kind_of(items[0]) if items else kind
-    text = "" if brief else comment(option)
+    text = comment(option) if explained and not hidden else ""
     if option.negation:
         text += f" (on by default; {option.negation} switches it off)"
         group.add_argument(option.negation, action="store_false", dest=dest, help=argparse.SUPPRESS)
@@ -257,8 +289,9 @@ def _add(group: Any, option: Option, dest: str, brief: bool) -> None:
     elif not any(option.default is nothing for nothing in (None, False, ())):
         default_words = option.default if isinstance(option.default, tuple) else (option.default,)
         text += f" (default: {' '.join(map(str, default_words))})"
+    text = argparse.SUPPRESS if hidden else text.strip().replace("%", "%%")
     if kind is bool:
-        group.add_argument(option.name, action="store_true", dest=dest, help=text.strip())
+        group.add_argument(option.name, action="store_true", dest=dest, help=text)
         return
     choices = ",".join(map(str, typing.get_args(item)))
     placeholder = (
@@ -267,7 +300,7 @@ def _add(group: Any, option: Option, dest: str, brief: bool) -> None:
         else {int: "INT", float: "FLOAT", Path: "PATH"}.get(item, "TEXT")
     )
     settings = {
-        "help": text.strip().replace("%", "%%"),
+        "help": text,
         "metavar": option.words.metavar or placeholder,
     }
     if not option.words.named:
@@ -316,7 +349,8 @@ def _overview(group: Group, prog: str) -> str:
     for name, command in group.commands.items():
         is_group = isinstance(command, Group)
         text = command.help if is_group else inspect.getdoc(function(command)) or ""
-        lines.append(f"  {name:<11}{text.partition(chr(10))[0]}")
+        indents = {"initial_indent": f"  {name:<11}", "subsequent_indent": " " * 13}
+        lines.append(textwrap.fill(text.partition("\n")[0], WIDTH, **indents))
     return "\n".join(
         [
             f"{description}\nusage: {prog} COMMAND [OPTIONS]\n",

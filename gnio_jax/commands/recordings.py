@@ -64,8 +64,10 @@ def import_file(request: ImportFile, _call: options.Call) -> None:
     importing.write_imported(request.out, recording)
     sequence = recording.sequence
     lines = [*recording.notes, *_impressions(sequence)]
-    start = "" if sequence.valid.any() else " --init static"
-    following = f"gnio evaluate --dataset csv --data-root {folder} --split test{start}"
+    following = f"gnio track {request.out}"
+    if sequence.valid.any():
+        following = f"gnio evaluate --network pedestrian --dataset csv --data-root {folder} "
+        following += "--split test"
     lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
     neighbours = [path for path in csv_files.files_of(folder) if path.name != request.out.name]
     others = [

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 import sys
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import TablesConfig
 from gnio_jax.cores import usable_cores
+
+MOST_COLUMNS = 7
+"""Number of columns that a terminal of 80 columns can show."""
 
 
 def tables(request: TablesConfig, _call: options.Call) -> None:
@@ -36,4 +45,25 @@ def tables(request: TablesConfig, _call: options.Call) -> None:
     except runs.Interrupted as interruption:
         print("stopped and saved; the same command continues from here", file=sys.stderr)
         sys.exit(128 + interruption.args[0])
-    console.say(text)
+    if not console.stdout().is_terminal:
+        console.say(text)
+        return
+    for is_table, group in itertools.groupby(text.splitlines(), lambda line: line[:1] == "|"):
+        block = list(group)
+        console.say(_table(block) if is_table else "\n".join(block).replace("## ", ""))
+
+
+def _table(lines: list[str]) -> Table:
+    """A table of Markdown for a terminal. One with many columns is turned: the rows become
+    columns."""
+    split = re.compile(r"(?<!\\)\|").split  # a bar in a cell is escaped
+    cells = [[cell.strip().replace("\\|", "|") for cell in split(line)[1:-1]] for line in lines]
+    header, _, *rows = cells
+    if len(header) > MOST_COLUMNS:
+        header, *rows = map(list, zip(header, *rows, strict=True))
+    table = Table(box=box.SIMPLE_HEAD)
+    for number, name in enumerate(header):
+        table.add_column(Text(name), justify="right" if number else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table

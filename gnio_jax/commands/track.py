@@ -13,6 +13,7 @@ from rich.table import Table
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
 from gnio_jax.config.schema import UNNAMED
+from gnio_jax.errors import InputError
 from gnio_jax.files import file_stem
 
 ERRORS = ("ate", "ate_2d", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio")
@@ -50,6 +51,8 @@ def track(request: TrackOptions, call: options.Call) -> None:
       {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
           accel_z=az
     """
+    if not request.file.exists():
+        raise InputError(request.file, "no such file or folder")
     console.compile_quickly()
     import jax  # late, so that mistakes do not wait for it
 
@@ -66,15 +69,15 @@ def track(request: TrackOptions, call: options.Call) -> None:
         details = {"command": str(call), "rerun_file": request.rerun}
         result = tracking.track(recording, trained, out, request.format, **details)
     summary = result.summary
-    no_walk = summary.warnings[:1] if math.isnan(summary.expected_error) else ()
-    for warning in no_walk:  # before every figure
+    first = summary.warnings[:1] if math.isnan(summary.expected_error) else ()
+    for warning in first:  # it says why there is no expected error, before every figure
         console.say(f"warning: {warning}")
     for note in summary.notes:
         console.say(f"  {note}")
     console.say(_table(summary))
-    for warning in summary.warnings[len(no_walk) :]:
+    for warning in summary.warnings[len(first) :]:
         console.say(f"warning: {warning}")
-    if not no_walk:  # what was measured are walks
+    if not first:  # what was measured are whole walks
         measured = summary.measured or "its error was not measured (gnio evaluate)"
         console.say(f"network {summary.network}: {measured}")
     console.say(f"results: {result.folder} (open report.html, or look at track.png)")

@@ -6,10 +6,11 @@ import dataclasses
 import sys
 import warnings
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
+from gnio_jax.commands.names import NETWORKS, check_names
 from gnio_jax.config import ConsideredStd, TrainConfig
 from gnio_jax.config.schema import Count, Seed, Words
 from gnio_jax.cores import usable_cores
@@ -17,6 +18,15 @@ from gnio_jax.cores import usable_cores
 
 @dataclass(frozen=True)
 class TrainOptions(TrainConfig):
+    MAIN: ClassVar = {
+        *("data.rate", "data.train_split", "data.val_split", "model.name", "model.width"),
+        *("model.uncertainty", "optim.epochs", "optim.batch_size", "optim.learning_rate"),
+        *("augment.low_pass_share", "through_filter.learn"),
+    }
+    """Options of sections that `--help` explains."""
+    WORDS_OF_HELP: ClassVar = {
+        "networks": "\n".join(f"  {name:<13} {text}" for name, text in NETWORKS.items())
+    }
     config: Annotated[str | None, Words("FILE")] = None
     """YAML file of settings, or the name of one that comes with the package."""
     set: Annotated[tuple[str, ...], Words("SECTION.FIELD=VALUE", repeated=True)] = ()
@@ -47,6 +57,10 @@ def train(request: TrainOptions, call: options.Call) -> None:
 
     These come with the package, for --config: {configs}.
 
+    These are the networks, for --model.name:
+
+    {networks}
+
     examples:
       {prog} --config quickstart --workdir runs/demo
       {prog} --dataset tlio --data-root ~/tlio --workdir runs/tlio
@@ -56,6 +70,7 @@ def train(request: TrainOptions, call: options.Call) -> None:
       {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
     """
     config = experiment(request, call)
+    check_names([config.model.name], config.datasets)
     from gnio_jax import data, filtering, parallel  # late: mistakes do not wait for JAX
     from gnio_jax.training import loop
 
@@ -82,7 +97,7 @@ def train(request: TrainOptions, call: options.Call) -> None:
         print(f"stopped and saved; continue with: {remedy}", file=sys.stderr)
     else:
         for outcome in outcomes:
-            following = f"{call.prog.replace('train', 'evaluate')} --network {outcome.workdir}"
+            following = f"{call.sibling('evaluate')} --network {outcome.workdir}"
             if outcome.best_loss is None:
                 problem = "no epoch had a finite figure on validation"
                 print(f"{outcome.workdir}: {problem}", file=sys.stderr)

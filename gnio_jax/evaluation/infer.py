@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.config import DataConfig
+from gnio_jax.evaluation.infer_memory import remembered_displacements
 from gnio_jax.evaluation.prepare import PreparedRecording
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
@@ -19,7 +20,7 @@ from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import align_recording, cut_windows, window_starts, without_any
 
 WINDOWS_PER_CALL = 512
-DIAGNOSTICS = ("gate", "scale")
+DIAGNOSTICS = ("gate", "scale", "body_velocity", "body_velocity_log_std")
 """Diagnostics of the network that are stored for every window. Attention is too large."""
 
 
@@ -71,6 +72,14 @@ def infer(
         least_std: Smallest standard deviation that the estimator uses, m
             (`FilterConfig.log_std_min` is its logarithm).
     """
+    if network.has_memory:
+        select = functools.partial(keep, names=diagnostics)
+        results = []
+        for number, recording in enumerate(recordings):
+            arguments = network, recording, windows, select, least_std
+            results.append(Displacements(*remembered_displacements(*arguments)))
+            progress((number + 1) / len(recordings))
+        return results
     parts, starts, turns = [], [], []
     for recording in recordings:
         assert recording.attitude is not None
@@ -113,7 +122,7 @@ def infer(
 @functools.partial(jax.jit, static_argnames=("apply", "length", "diagnostics"))
 def _predict(
     variables: Any,
-    samples: Float[Array, "t 6"],
+    samples: Float[Array, "t c"],
     start: Array,
     turn: Float[Array, "b 3 3"],
     *,

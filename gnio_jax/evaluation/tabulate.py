@@ -46,6 +46,8 @@ COLUMNS = {
     "rte_60s": Column("RTE 60 s", "m"),
     "rpe_1s": Column("RPE 1 s", "m", 3),
     "yaw_rmse": Column("yaw", "°", 1),
+    "t_rel": Column("t_rel", "%"),
+    "r_rel": Column("r_rel", "°/m", 5),
     "path_length_ratio": Column("path ratio", best=1.0),
     "stationary_drift": Column("standing", "m/min", 1),
     "nees": Column("NEES/3", best=1.0),
@@ -261,8 +263,9 @@ def describe(settings: Mapping[str, Any]) -> dict[str, str]:
     if settings.get("reference") == "waypoints":
         choices["alignment"] = TO_WAYPOINTS
     if settings.get("model"):
-        network = f"{settings['model']}, checkpoint {settings['checkpoint']}"
-        choices["network"] = f"{network}, step {settings['step']}"
+        latest = ", latest checkpoint" if settings["checkpoint"] == "latest" else ""
+        name = settings.get("network") or settings["model"]
+        choices["network"] = f"{name} ({settings['model']}, step {settings['step']}{latest})"
         choices["windows"] = windows(settings)
     return {name: str(value) for name, value in choices.items() if value}
 

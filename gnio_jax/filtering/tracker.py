@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from gnio_jax import numerics
 from gnio_jax.filtering.checks import (
     check_filter,
     check_number,
@@ -50,6 +51,7 @@ from gnio_jax.filtering.network import (
 from gnio_jax.filtering.propagation import integrate
 from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid
 from gnio_jax.filtering.scan import Measure, clone_step
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import (
     BIASES,
@@ -60,6 +62,7 @@ from gnio_jax.filtering.state import (
     invariant_errors,
     unroll_clones,
 )
+from gnio_jax.filtering.zero_velocity import quiet_samples
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array, Memory
 
 
@@ -85,6 +88,8 @@ class Pose(NamedTuple):
     speed above `FilterConfig.speed_limit`. All poses from there on are invalid."""
     failure: str = ""
     """What made the first pose that is not healthy impossible; empty before it."""
+    quiet: bool = False
+    """Whether the last clone interval was quiet (`zero_velocity.quiet_samples`) and complete."""
 
 
 class DevicePose(NamedTuple):
@@ -92,8 +97,8 @@ class DevicePose(NamedTuple):
 
     mean: Mean
     covariance: Float[Array, "15 15"]
-    flags: Float[Array, "3"]
-    """accepted, nis and healthy."""
+    flags: Float[Array, "4"]
+    """accepted, nis, healthy and quiet."""
 
 
 class Core(NamedTuple):
@@ -127,8 +132,10 @@ class Tracker:
         state: The start, at the time of the first sample (`initial_state`, `level_state`, or the
             final state of a run). None: it is made of the first `rest_seconds`, in which the device
             must be still (`level_state`). Until then there is no pose; afterwards these samples are
-            filtered too. A sample that is missing, or without any acceleration, begins the rest
-            anew.
+            filtered too. Missing samples are interpolated, because the filter bridges such holes as
+            well. A hole of more than `FilterConfig.bridge_seconds`, a sample without any
+            acceleration, and a rest of which more than half is missing begin the rest anew
+            (`hindrance` says which).
         rest_seconds: Length of that rest, s.
         hole: Samples further apart than this leave the grid samples between them missing, s; None:
             1.5 dt. A slower IMU needs a larger value.
@@ -155,6 +162,8 @@ class Tracker:
         dt = ekf.config.dt
         check_number("rest_seconds", rest_seconds, 1.5 * dt, "s")
         self._rest, self._failure = round(rest_seconds / dt), ""
+        self.hindrance = ""
+        """Why the samples before the start were no rest; empty if they were."""
         self._stream = Stream(create_grid(dt, hole, imu_rate))
         dtype = jax.dtypes.canonicalize_dtype(np.float64) if state is None else state.offset.dtype
         self._ekf = converted_filter(ekf, dtype)
@@ -232,16 +241,19 @@ class Tracker:
         return self._stream.grid.delay
 
     def _start_from_rest(self) -> None:
-        """Start as soon as the next samples make a whole rest; they are filtered afterwards."""
+        """Start as soon as the next samples make a rest; they are filtered afterwards."""
         while self._core is None and self._stream.ready >= self._rest:
             rows = self._stream.rows(self._rest)
-            unusable = np.flatnonzero((rows[:, VALID] == 0) | ~rows[:, ACCEL].any(axis=1))
-            if len(unusable):
-                self._stream.take(int(unusable[-1]) + 1)
+            self.hindrance, unusable = rest_problem(rows, self._ekf.config)
+            if unusable:
+                self._stream.take(unusable)
                 continue
+            number, measured = np.arange(float(self._rest)), rows[:, VALID] > 0
+            rows = numerics.interpolate(number, number[measured], rows[measured])
             try:
                 state = level_state(self._ekf, rows[:, GYRO], rows[:, ACCEL])
             except ValueError:  # It shows no gravity, but the next samples may.
+                self.hindrance = "its accelerations show no gravity"
                 self._stream.take(self._rest)
                 raise
             self._start(state)
@@ -259,7 +271,7 @@ class Tracker:
         # Copies, because the compiled step takes the memory of its argument, which no other array,
         # nor two of its fields, may share.
         core = _copy(Core(state, window, jnp.int32(0), tangents, memory))
-        flags = jnp.stack([jnp.nan, jnp.nan, state.healthy]).astype(window.dtype)
+        flags = jnp.stack([jnp.nan, jnp.nan, state.healthy, 0.0]).astype(window.dtype)
         self._core: Core | None = core
         estimate = device_pose(self._ekf, state, flags, tangents)
         self._ahead: tuple[int, DevicePose, ImuMemory] = 0, estimate, core.filter.imu
@@ -270,12 +282,36 @@ class Tracker:
         """The newest estimate on the host, at the end of the interval of its last sample."""
         ahead, estimate, _ = self._ahead
         mean, covariance, numbers = jax.tree.map(np.array, estimate)
-        accepted, nis, healthy = numbers.tolist()
+        accepted, nis, healthy, quiet = numbers.tolist()
         if not healthy and not self._failure:
             self._failure = describe_failure(mean, np.diag(covariance), self._ekf.config)
         time = self._stream.origin + (self._stream.taken + ahead) * self._ekf.config.dt
-        flags = {"accepted": accepted, "nis": nis, "healthy": healthy > 0}
+        flags = {"accepted": accepted, "nis": nis, "healthy": healthy > 0, "quiet": quiet > 0}
         return Pose(time, *mean, covariance=covariance, **flags, failure=self._failure)
+
+
+def rest_problem(rows: Float[np.ndarray, "n 7"], config: FilterConfig) -> tuple[str, int]:
+    """Why grid samples (gyro, accel, valid) are no rest, and how many of them cannot be in one;
+    ("", 0) if they are one.
+
+    A rest begins with a sample that the filter can hold, has no longer hole than it holds a sample,
+    and has at least half of its samples, as `rest_at_start` asks.
+    """
+    valid = rows[:, VALID] > 0
+    dead = np.flatnonzero(valid & ~rows[:, ACCEL].any(axis=1))
+    if len(dead):
+        return "the accelerometer reads zero", int(dead[-1]) + 1
+    ends = np.concatenate([[-1], np.flatnonzero(valid), [len(rows)]])
+    holes, longest = np.diff(ends) - 1, max(round(config.bridge_seconds / config.dt), 1)
+    broken = np.flatnonzero(holes > longest)
+    if len(broken):
+        hole = holes[broken[-1]] * config.dt
+        return f"samples are missing for {hole:.2g} s", int(ends[broken[-1] + 1])
+    if holes[0]:
+        return "its first sample is missing", int(holes[0])
+    if 2 * valid.sum() < len(rows):
+        return f"only {valid.sum()} of its {len(rows)} samples have come", int(ends[2])
+    return "", 0
 
 
 def compile_programs(
@@ -329,7 +365,10 @@ def advance(
     else:
         state, history, tangents = step_with_tangents(step, core.filter, core.tangents, measure)
     state = state._replace(imu=imu_memory._replace(quiet=state.imu.quiet))
-    flags = jnp.stack([history.accepted[0], history.nis[0], history.healthy[0]])
+    rate, force = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
+    quiet = jnp.all(valid) & jnp.all(quiet_samples(rate, force, config))
+    flags = [history.accepted[0], history.nis[0], history.healthy[0]]
+    flags = jnp.stack([*flags, quiet.astype(flags[0].dtype)])
     estimate = device_pose(ekf, state, flags, tangents)
     return Core(state, window, core.intervals + 1, tangents, memory), estimate
 
@@ -370,7 +409,7 @@ def look_ahead(
 
 
 def device_pose(
-    ekf: Filter, state: FilterState, flags: Float[Array, "3"], tangents: Tangents | None
+    ekf: Filter, state: FilterState, flags: Float[Array, "4"], tangents: Tangents | None
 ) -> DevicePose:
     """The state's estimate; the consider covariance is added to its own."""
     covariance = core_covariance(state, ekf.config)

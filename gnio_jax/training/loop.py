@@ -17,18 +17,19 @@ import jax
 import jax.numpy as jnp
 
 from gnio_jax import config as configuration
-from gnio_jax import parallel
+from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.models.memory import NetworkWithMemory
 from gnio_jax.networks import TrainedNetwork
 from gnio_jax.reporting import Lines, Reporter, Silence
-from gnio_jax.training import checkpoint, optimizer, run_folder
+from gnio_jax.training import checkpoint, optimizer, run_folder, support_vectors
 from gnio_jax.training.checkpoint import RunPosition
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.initial import load_initial_network
 from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.segment_task import SegmentTask, refuse_without_memory
+from gnio_jax.training.segment_task import SegmentTask
 from gnio_jax.training.task import DispatchSums, Row, Task
 from gnio_jax.training.window_task import WindowTask
 
@@ -102,6 +103,12 @@ def train_all(
         run_folder.refuse_other_run(configuration.validate(config), resume)
         for config, resume in zip(configs, resumes, strict=True)
     ]
+    if configs[0].model.name == "ridi":  # without steps
+        losses = [
+            support_vectors.train(config, workdir, reporter, workers)
+            for config, workdir in zip(configs, workdirs, strict=True)
+        ]
+        return [TrainingResult(*run, None) for run in zip(workdirs, losses, strict=True)]
     through_filter = bool(configs[0].through_filter.learn)
     if through_filter and devices is not None:
         raise InputError("--devices", "is for training on windows", "leave it out")
@@ -115,10 +122,7 @@ def train_all(
     with jax.enable_x64(through_filter), sharing, _record_signals() as signals:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
         start = None if resumed else load_initial_network(configs[0])
-        task_type = FilterTask if through_filter else WindowTask
-        if configs[0].segments.seconds and not through_filter:
-            task_type = SegmentTask
-            refuse_without_memory(configs[0].model)
+        task_type = choose_task(configs[0])
         task, data = set_up(task_type, configs[0], reporter, workers)
         for config, resume in zip(configs, resumes, strict=True):
             results.append(_train(task, data, config, start, resume, signals, reporter))
@@ -127,6 +131,23 @@ def train_all(
                 results[-1] = results[-1]._replace(stopped_by=signum)  # others are missing
                 break
     return results
+
+
+def choose_task(config: TrainConfig) -> type[Task]:
+    """The task of an experiment. Raises `InputError` for segments without a network with memory,
+    and for strides that do not fit such a network."""
+    model = models.from_config(config.model)
+    remembers = isinstance(model, NetworkWithMemory)
+    if config.segments.seconds and not remembers:
+        problem = f"is for a network with memory, and '{config.model.name}' has none"
+        raise InputError("segments.seconds", problem, "set it to 0")
+    if isinstance(model, NetworkWithMemory) and config.data.stride % model.multiple:
+        problem = f"is {config.data.stride} samples; '{config.model.name}' takes {model.multiple}"
+        remedy = f"make it a multiple of {model.multiple / config.data.rate:g} s"
+        raise InputError("data.stride_seconds", problem, remedy)
+    if config.through_filter.learn:
+        return FilterTask
+    return SegmentTask if config.segments.seconds else WindowTask
 
 
 def _train(

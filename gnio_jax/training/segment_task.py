@@ -17,11 +17,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from gnio_jax import models, parallel
-from gnio_jax.config import ModelConfig, TrainConfig
-from gnio_jax.errors import InputError
+from gnio_jax import parallel
+from gnio_jax.config import TrainConfig
 from gnio_jax.models.memory import NetworkWithMemory
-from gnio_jax.training.losses import Stage, loss_stage, losses, switches
+from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
 from gnio_jax.training.task import BatchLosses, Row, Task, TrainState
 from gnio_jax.training.walk_segments import (
     WalkSegments,
@@ -34,6 +33,7 @@ from gnio_jax.training.walk_segments import (
 )
 from gnio_jax.training.walkway import unchanged
 from gnio_jax.training.window_task import (
+    Validation,
     calibrate_uncertainty,
     has_statistics,
     predicted_axes,
@@ -163,7 +163,9 @@ class SegmentTask(Task):
         plain = [validate(state, source, key, stage, task=self)[0] for source in held_out.values()]
         mean = jax.tree.map(lambda *figures: sum(figures) / len(figures), *plain)
         # The frame has any heading, so both horizontal axes have the same errors.
-        return calibrate_uncertainty(state, mean, isotropic=True)
+        axes = mean.axis_mse, mean.axis_normalised
+        figures = Validation(Losses(mean.loss, mean.mse, mean.nll), *axes)
+        return calibrate_uncertainty(state, figures, isotropic=True)
 
     def figures_of(self, state: TrainState, held_out: WalkSource, key: PRNGKeyArray) -> Row:
         """`val_mse` is the mean of the squared errors of the walks as they are and of those that a
@@ -295,19 +297,12 @@ def measure(
         length = jnp.sqrt(jnp.sum(segment.displacement[..., :2] ** 2, axis=-1) + 1e-12)
         along = jnp.sum(prediction.displacement * segment.displacement, axis=-1) / length
         return SegmentValidation(
-            *(figures[name] for name in ("loss", "mse", "nll", "horizon")),
-            jnp.mean(error**2, axis=(0, 1)),
-            jnp.mean(error**2 * jnp.exp(-2 * prediction.log_std), axis=(0, 1)),
-            jnp.mean(along),
-            jnp.mean(length),
+            **figures,
+            axis_mse=jnp.mean(error**2, axis=(0, 1)),
+            axis_normalised=jnp.mean(error**2 * jnp.exp(-2 * prediction.log_std), axis=(0, 1)),
+            predicted=jnp.mean(along),
+            walked=jnp.mean(length),
         )
 
     figures = jax.vmap(one)(prediction, segments)
     return jax.tree.map(lambda leaf: jnp.tensordot(weight, leaf, 1), figures)
-
-
-def refuse_without_memory(config: ModelConfig) -> None:
-    """Raise `InputError` for a network that cannot be trained on segments."""
-    if not isinstance(models.from_config(config), NetworkWithMemory):
-        problem = f"is for a network with memory, and '{config.name}' has none"
-        raise InputError("segments.seconds", problem, "set it to 0")

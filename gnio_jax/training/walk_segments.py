@@ -108,7 +108,7 @@ def _source_of(sequence: Sequence, samples: int, rate: float) -> WalkSource:
     )
 
 
-class Grid(NamedTuple):
+class SegmentGrid(NamedTuple):
     """How a segment is divided."""
 
     stride: int
@@ -125,18 +125,18 @@ class Grid(NamedTuple):
         return self.stride * self.intervals
 
 
-def grid_of(config: TrainConfig) -> Grid:
+def grid_of(config: TrainConfig) -> SegmentGrid:
     """The grid of an experiment."""
     data = config.data
     intervals = round(config.segments.seconds / data.stride_seconds)
-    return Grid(data.stride, intervals, data.window // data.stride, data.rate)
+    return SegmentGrid(data.stride, intervals, data.window // data.stride, data.rate)
 
 
 def cut_walks(
     source: WalkSource,
     rows: Int[jax.Array, "b"],
     pace: Pace,
-    grid: Grid,
+    grid: SegmentGrid,
     config: AugmentConfig | None = None,
     key: PRNGKeyArray | None = None,
 ) -> WalkSegments:
@@ -147,9 +147,9 @@ def cut_walks(
     samples = grid.samples
     # Sample j of a segment and its margins is the recording at row + τ j, between two samples.
     count = samples + 2 * margin + 1
-    place = pace.stretch[:, None] * jnp.arange(count, dtype=jnp.float32)[None, :]
-    before = jnp.floor(place).astype(jnp.int32)
-    share = (place - before)[:, :, None]
+    row_offset = pace.stretch[:, None] * jnp.arange(count, dtype=jnp.float32)[None, :]
+    before = jnp.floor(row_offset).astype(jnp.int32)
+    share = (row_offset - before)[:, :, None]
     index = jnp.clip(rows[:, None] + before, 0, len(source.imu) - 2)
 
     def interpolate(signal: Array) -> jax.Array:
@@ -264,7 +264,7 @@ def draw_walks(
     key: PRNGKeyArray,
     source: WalkSource,
     rows: Int[jax.Array, "b"],
-    grid: Grid,
+    grid: SegmentGrid,
     config: AugmentConfig,
 ) -> WalkSegments:
     """The segments that begin at these rows, with all random changes that `config` switches on."""

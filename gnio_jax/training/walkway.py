@@ -53,7 +53,7 @@ def slow_motion(
     the acceleration in the interval after j is (q_{j+2} − q_{j+1} − q_j + q_{j−1}) / 2 Δt², which
     is exact for the filter's integration: v' = v + a Δt, p' = p + ½ (v + v') Δt.
     """
-    slow, accel = np.zeros((2, *position.shape))
+    slow, accel = np.zeros_like(position), np.zeros_like(position)
     filter_sections = butter(2, SLOW_HERTZ, fs=rate, output="sos")
     for start, stop in spans(usable):
         part = position[start:stop]

@@ -281,8 +281,7 @@ def test_import_of_a_phones_file_returns_the_walk(place, capsys):
     run("data", "import", "ios.csv", "--out", "own/walk.h5", *given)
     out = capsys.readouterr().out
     assert "accel negated (iOS's sign)" in out and "20.0 s at 100 Hz" in out
-    following = "next: gnio evaluate --dataset csv --data-root own --split test --init static"
-    assert out.splitlines()[-1] == following
+    assert out.splitlines()[-1] == "next: gnio track own/walk.h5"  # it has no reference
     (sequence,) = data.load("csv", place / "own", "test")
     assert sequence.name == "walk" and not sequence.valid.any()
     for found, wanted in ((sequence.gyro, walk.rate(time)), (sequence.accel, walk.force(time))):

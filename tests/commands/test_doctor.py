@@ -11,7 +11,7 @@ from tests.support.command_lines import run
 
 @pytest.fixture
 def home(tmp_path, monkeypatch):
-    """A folder with datasets of two names, and a package that is missing."""
+    """A folder with datasets of two names, and two packages that are missing."""
     for name in ("oxiod", "tlio_layout", "thesis"):
         (tmp_path / "recordings" / name).mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
@@ -21,7 +21,7 @@ def home(tmp_path, monkeypatch):
     version = metadata.version
 
     def without_optax(name):
-        if name == "optax":
+        if name in ("optax", "rerun-sdk"):
             raise metadata.PackageNotFoundError(name)
         return version(name)
 
@@ -34,8 +34,9 @@ def test_what_is_found_fits_a_screen_and_says_what_is_wrong(home, capsys, monkey
     found = json.loads(capsys.readouterr().out)
     assert f"jax {jax.__version__}, " in found["packages"]
     assert "optax is not installed" in found["packages"]
-    kind = jax.devices()[0].device_kind
-    assert found["devices"] == f"{len(jax.devices())} × cpu {kind}" and found["float64"] == "works"
+    assert found["devices"] == f"{len(jax.devices())} × cpu" and found["float64"] == "works"
+    assert found["extra bags"].startswith("rosbags ") and ", mcap " in found["extra bags"]
+    assert found["extra rerun"] == "lacks rerun-sdk: pip install 'gnio-jax[rerun]'"
     places = {name: place for name, place in found.items() if name.startswith("dataset")}
     computed = {"dataset synthetic": "computed"}
     there = {"dataset oxiod": "oxiod", "dataset tlio": "tlio_layout"}

@@ -1,9 +1,14 @@
 """Options out of the words of a command line: what is taken, and each mistake in one line."""
 
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+
 import pytest
 
-from gnio_jax import config
-from gnio_jax.commands import train
+from gnio_jax import config, data, models
+from gnio_jax.commands import app, names, train
 from gnio_jax.commands.options import Call, read
 from gnio_jax.errors import InputError
 from tests.support.command_lines import run
@@ -36,10 +41,19 @@ def test_spellings_and_values_of_options():
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ([], "command: is missing; give one of track, live, train, evaluate, score"),
         (["trian"], "command: unknown 'trian'; did you mean 'train'?"),
         (["train", "--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean '--optim."),
-        (["train", "--model.head", "foo"], "must be one of gated, linear or null, found 'foo'"),
+        (["train", "--lr", "1e-3"], "--lr: unknown option; did you mean '--optim.learning-rate'?"),
+        (["train", "--bs", "8"], "--bs: unknown option; did you mean '--optim.batch-size'?"),
+        (["train", "--batch-size", "8"], "did you mean '--optim.batch-size'?"),
+        (["train", "--epochs", "3"], "did you mean '--optim.epochs'?"),
+        (["train", "--gpu", "1"], "did you mean '--devices'?"),
+        (["track", "walk.csv", "--output", "x"], "did you mean '--out'?"),
+        (["evaluate", "--weights", "x"], "did you mean '--network'?"),
+        (
+            ["train", "--model.head", "foo"],
+            "must be one of gated, linear, bins or null, found 'foo'",
+        ),
         (["train", "--optim.epochs"], "--optim.epochs: expected one argument"),
         (["train", "stray"], "'stray': is not an option; options are --name VALUE"),
         (["train", "--resume=yes"], "--resume: ignored explicit argument 'yes'"),
@@ -48,6 +62,50 @@ def test_spellings_and_values_of_options():
 )
 def test_a_mistake_is_one_line(words, expected):
     assert expected in mistake(*words)
+
+
+def test_without_a_command_the_help_is_shown(capsys):
+    run()
+    assert "usage: gnio COMMAND" in capsys.readouterr().out
+    app.main(["--version"])
+    assert capsys.readouterr().out == f"gnio-jax {version('gnio-jax')}\n"
+
+
+@pytest.mark.parametrize(
+    ("prog", "sibling"),
+    [
+        ("gnio train", "gnio evaluate"),
+        ("python train.py", "python evaluate.py"),
+        ("python training/deeper.py train", "python training/deeper.py evaluate"),
+    ],
+)
+def test_the_next_command_is_one_of_the_same_program(prog, sibling):
+    assert Call(prog, []).sibling("evaluate") == sibling
+
+
+def test_names_that_exist_are_those_of_the_registries():
+    assert sorted(names.NETWORKS) == sorted(models.registry._PUBLISHED)
+    assert sorted(names.DATASETS) == sorted(data.registry._PUBLISHED)
+
+
+def test_a_wrong_name_does_not_wait_for_jax():
+    for words, line in (
+        (["train", "--dataset", "tilo"], "dataset: unknown name 'tilo'; did you mean 'tlio'?"),
+        (["train", "--model.name", "gnoi"], "model: unknown name 'gnoi'; did you mean 'gnio'?"),
+        (["evaluate", "--dataset", "oxoid"], "dataset: unknown name 'oxoid'; did you mean 'oxiod'"),
+        (["data", "check", "oxoid"], "dataset: unknown name 'oxoid'; did you mean 'oxiod'?"),
+        (["track", "no_walk.csv"], "no_walk.csv: no such file or folder"),
+    ):
+        program = (
+            "import sys\nfrom gnio_jax.commands.app import main\ntry:\n    main(sys.argv[1:])\n"
+        )
+        program += "finally:\n    assert 'jax' not in sys.modules"
+        line_of_command = [sys.executable, "-c", program, *words]
+        environment = {name: text for name, text in os.environ.items() if name != "GNIO_PLUGINS"}
+        result = subprocess.run(
+            line_of_command, capture_output=True, text=True, timeout=60, env=environment
+        )
+        assert result.returncode == 2 and result.stderr.startswith(line), result.stderr
 
 
 def test_options_win_over_the_file_and_the_file_over_the_default(tmp_path):

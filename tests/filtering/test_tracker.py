@@ -335,8 +335,8 @@ def resting():
 
 @pytest.mark.parametrize("lost", ["missing", "without acceleration"])
 def test_from_rest(built, lost):
-    """The first 0.9 s without a hole make the state, and are filtered from their first sample on.
-    A sensor that does not run yet reads zero."""
+    """The first 0.9 s without a long hole make the state, and are filtered from their first sample
+    on. A sensor that does not run yet reads zero."""
     gyro, accel = resting()
     time = 7.0 + np.arange(len(gyro)) * DT
     # 45 samples: no whole number of intervals
@@ -344,7 +344,7 @@ def test_from_rest(built, lost):
     assert tracker.pose() is None and tracker.filter_state() is None
     first, given = 10, (gyro[:40].copy(), accel[:40].copy())
     if lost == "missing":
-        given[0][first - 1] = np.nan
+        given[0][first - 3 : first] = np.nan  # 60 ms, and the filter bridges 50
     else:
         given[1][:first] = 0.0
     assert feed(tracker, *given, time[:40]) == [] and tracker.pose() is None
@@ -361,6 +361,54 @@ def test_from_rest(built, lost):
     later = slice(45 // N - 1, len(wanted.position))
     np.testing.assert_allclose([p.position for p in found], wanted.position[later], atol=1e-9)
     np.testing.assert_allclose([p.nis for p in found], wanted.nis[later], rtol=1e-7)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_a_rest_with_holes_is_a_rest(built, share):
+    """Holes that the filter bridges: in the state they are interpolated, in the filter they are
+    missing. Single lost rows are holes, because two intervals are more than 1.5."""
+    gyro, accel = (signal[: N * INTERVALS] for signal in resting())
+    random, time = np.random.default_rng(1), 7.0 + np.arange(len(gyro)) * DT
+    lost = random.random(len(gyro)) < share
+    lost[[0, 2, -1]], lost[1] = False, True
+    for row in range(2, len(lost)):
+        lost[row] &= not lost[row - 2 : row].all()  # never three in a row
+    tracker = Tracker(predict, filter_of(), rest_seconds=0.9)
+    found = feed(tracker, gyro[~lost], accel[~lost], time[~lost])
+    number, came = np.arange(45), ~lost[:45]
+    rest = [
+        np.stack([np.interp(number, number[came], axis[:45][came]) for axis in signal.T], axis=1)
+        for signal in (gyro, accel)
+    ]
+    state = with_correlated_error(filtering.level_state(filtering.Filter(CONFIG), *rest))
+    _, wanted = scan(state, gyro, accel, ~lost)
+    steps = [round((pose.time - 7.0) / (N * DT)) - 1 for pose in found]
+    assert 10 <= steps[0] <= 12 and len(steps) > 50 and tracker.hindrance == ""
+    positions = wanted.position[np.array(steps)]
+    np.testing.assert_allclose([p.position for p in found], positions, atol=1e-9)
+    assert any(pose.quiet for pose in found) and not all(pose.quiet for pose in found)
+
+
+@pytest.mark.parametrize(
+    ("missing", "hindrance", "start"),
+    [
+        ([*range(20, 24)], "samples are missing for 0.08 s", 24),
+        ([0, 1], "its first sample is missing", 2),
+        ([*range(1, 46, 3), *range(2, 46, 3)], "only 15 of its 45 samples have come", 12),
+    ],
+)
+def test_what_is_no_rest_is_said(built, missing, hindrance, start):
+    gyro, accel = (signal[:80] for signal in resting())
+    time = np.arange(80) * DT
+    broken = np.where(np.isin(np.arange(80), missing)[:, None], np.nan, gyro)
+    tracker, said = Tracker(predict, filter_of(), rest_seconds=0.9), set()
+    for row in zip(time, broken, accel, strict=True):
+        pose = tracker.push(*row)
+        said.add(tracker.hindrance)
+        if pose is not None:
+            break
+    assert hindrance in said and tracker.hindrance == ""
+    assert tracker.pose().time == pytest.approx((start + 45) * DT, abs=N * DT)
 
 
 def test_a_rest_without_gravity_is_told_once_and_another_starts(built):

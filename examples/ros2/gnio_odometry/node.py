@@ -12,7 +12,7 @@ from sensor_msgs.msg import Imu
 from tf2_ros import TransformBroadcaster
 
 from gnio_jax import networks
-from gnio_jax.apps import live
+from gnio_jax.apps.live.tracking import create_tracker
 from gnio_odometry.bridge import Bridge
 
 SENSOR_DATA = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -34,7 +34,7 @@ class GnioOdometry(Node):
         self._imu = self.declare_parameter("imu_frame", "imu_link").value
         publish_tf = self.declare_parameter("publish_tf", True).value
         run = networks.load(network)
-        self._bridge = Bridge(live.create_tracker(run, rate or None, rest_seconds))
+        self._bridge = Bridge(create_tracker(run, rate or None, rest_seconds))
         self._publisher = self.create_publisher(Odometry, "odometry", 10)
         self._transforms = TransformBroadcaster(self) if publish_tf else None
         self.create_subscription(Imu, "imu", self._take, SENSOR_DATA)

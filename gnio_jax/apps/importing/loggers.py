@@ -53,7 +53,7 @@ from gnio_jax.numerics import interpolate
 
 _AXIS = re.compile(r"\b([xyz])\b", re.IGNORECASE)
 _TURNS = ("rad/s", "deg/s")
-_SENSORS = {
+SENSORS = {
     "Gyroscope": ("gyro", "rad/s"),
     "GyroscopeUncalibrated": ("gyro", "rad/s"),
     "TotalAcceleration": ("accel", "m/s2"),
@@ -62,8 +62,8 @@ _SENSORS = {
     "AccelerometerUncalibrated": ("raw", None),
 }
 """Sensor Logger's files: the kind and the unit of each."""
-_REMEDY = "record the gyroscope and the accelerometer with gravity"
-_REMEDY += " (Sensor Logger: switch on Accelerometer and Gravity)"
+REMEDY = "record the gyroscope and the accelerometer with gravity"
+REMEDY += " (Sensor Logger: switch on Accelerometer and Gravity)"
 
 
 class _Set(NamedTuple):
@@ -100,8 +100,8 @@ def read_logger(path: Path, files: list[LogFile]) -> RawRecording | None:
 
 
 def _sensor_logger(path: Path, files: list[LogFile]) -> RawRecording:
-    parts = [file for file in files if file.location.stem in (*_SENSORS, "Metadata")]
-    sensors = [part for part in parts if part.location.stem in _SENSORS]
+    parts = [file for file in files if file.location.stem in (*SENSORS, "Metadata")]
+    sensors = [part for part in parts if part.location.stem in SENSORS]
     folders = sorted({str(part.location.parent) for part in sensors})
     if len(folders) > 1:
         raise InputError(path, f"holds {len(folders)} recordings: {', '.join(folders)}", "give one")
@@ -112,9 +112,9 @@ def _sensor_logger(path: Path, files: list[LogFile]) -> RawRecording:
     if "Gyroscope" in tables:
         tables.pop("GyroscopeUncalibrated", None)
     sets = []
-    for name in [name for name in _SENSORS if name in tables]:
+    for name in [name for name in SENSORS if name in tables]:
         clock = "time" if "time" in tables[name].layout.labels else "seconds_elapsed"
-        kind, unit = _SENSORS[name]
+        kind, unit = SENSORS[name]
         sets.append(_Set(kind, unit, tables[name], clock, ("x", "y", "z")))
     row = {"platform": "android"} if "TotalAcceleration" in tables else {}
     if "Metadata" in tables:
@@ -193,7 +193,7 @@ def _recording(
     kinds = {one.kind for one in sets}
     for sensor, needed in (("gyro", {"gyro"}), ("accelerometer", {"accel", "linear", "raw"})):
         if not kinds & needed:
-            raise InputError(path, f"has no {sensor} (found: {listed(files)})", _REMEDY)
+            raise InputError(path, f"has no {sensor} (found: {listed(files)})", REMEDY)
     gyro = _only("gyro", sets, path)
     if "accel" in kinds:
         parts = [_only("accel", sets, path)]
@@ -203,7 +203,7 @@ def _recording(
         parts = [_only("raw", sets, path)]
     else:
         name = next(one.file.name for one in sets if one.kind == "linear")
-        raise InputError(path, f"holds acceleration without gravity ({name})", _REMEDY)
+        raise InputError(path, f"holds acceleration without gravity ({name})", REMEDY)
     accel = parts[0].sensor("accel")
     if len(parts) > 1:
         accel = _added(accel, parts[1].sensor("accel"))

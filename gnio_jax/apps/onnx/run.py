@@ -42,7 +42,8 @@ CONVENTIONS = (
     "world. gyro and accel are raw, in the body frame, at `rate`, without holes; accel includes "
     "gravity. A displacement is expressed in the gravity frame of its window's first sample after "
     "the context, whose yaw is zero. covariance of a measurement: diag(exp(2 max(log_std, "
-    "log_std_min))), m²; a displacement of NaN is no measurement. Errors of rotations are in the "
+    "log_std_min))), m², turned about z by the angle whose cosine and sine are the output axes, if "
+    "there is one; a displacement of NaN is no measurement. Errors of rotations are in the "
     "world frame, left-multiplied."
 )
 
@@ -85,6 +86,9 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     require_packages("gnio export", "onnx", *PACKAGES)
     run = load(which)
     network = Network.of(run.model, run.variables)
+    if network.has_memory:
+        problem = f"'{run.config.model.name}' has a memory, which the exported filter cannot carry"
+        raise InputError(which, problem, "export a network on windows")
     ekf = make_filter(run.config.data, run.config.filter)
     with replacing_folder(out) as folder, ExitStack() as at_end:
         at_end.callback(logging.disable, logging.root.manager.disable)

@@ -1,5 +1,6 @@
 """ONNX models, driven as a program without JAX drives them."""
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -18,8 +19,10 @@ from gnio_jax.apps.onnx import driver
 from gnio_jax.apps.onnx.programs import start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check
 from gnio_jax.commands import app, console
+from gnio_jax.config import ModelConfig
 from gnio_jax.networks import read_network
 from tests.apps.onnx.conftest import BIAS, CONFIG, SECONDS
+from tests.support import drawn_run
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "onnx"
 REST = round(CONFIG.data.rate)
@@ -128,6 +131,22 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert not (tmp_path / "exports").exists()
+
+
+def test_a_network_with_memory_is_refused(tmp_path, monkeypatch, capsys):
+    for name in PACKAGES:
+        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
+    model = ModelConfig(name="ronin_tcn", width=2)
+    run = drawn_run.save(
+        tmp_path / "tcn",
+        dataclasses.replace(CONFIG, model=model),
+        lambda random, _, shape: random.normal(0, 0.1, shape),
+    )
+    with pytest.raises(SystemExit, match="2"):
+        console.run(lambda: app.main(["export", str(run), "--out", str(tmp_path / "out")]))
+    error = capsys.readouterr().err
+    assert "'ronin_tcn' has a memory" in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def library(folder):

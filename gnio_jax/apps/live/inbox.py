@@ -1,0 +1,135 @@
+"""Messages that wait for the filter, and the readers of standard input and of datagrams.
+
+Threads receive messages from the beginning, so that nothing is lost while the filter is compiled.
+What waits is bounded in number and in bytes. What is lost is counted and told.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
+
+from gnio_jax.apps.live.samples import LONGEST_LINE, NO_SAMPLE, Arrival, Sample, Units, parse_lines
+
+TICK = 0.25
+"""Time after which a source says that nothing has come, s."""
+MOST_MESSAGES, MOST_BYTES = 100_000, 32_000_000
+"""Messages that wait for the filter, at most, and their size, bytes."""
+CHUNK = 65536
+"""Bytes that are read at once, and largest datagram."""
+
+
+class Inbox:
+    """A queue of messages of a source `name`; `kind` is what messages are called."""
+
+    def __init__(self, name: str, kind: str = "messages"):
+        self.name, self._kind = name, kind
+        self._waiting: deque[tuple[float, Any, int]] = deque()
+        self._change = threading.Condition()
+        self._bytes, self._lost, self._told = 0, 0, 0
+        self._notices: deque[str] = deque(maxlen=10)
+
+    def put(self, message: Any, size: int) -> bool:
+        """Add a message of `size` bytes. False if it is lost, because too much waits already."""
+        with self._change:
+            full = len(self._waiting) >= MOST_MESSAGES or self._bytes + size > MOST_BYTES
+            if full:
+                self._lost += 1
+            else:
+                self._waiting.append((time.monotonic(), message, size))
+                self._bytes += size
+                self._change.notify()
+        return not full
+
+    def tell(self, notice: str) -> None:
+        """Add a message for the user."""
+        with self._change:
+            self._notices.append(notice)
+            self._change.notify()
+
+    def arrivals(
+        self, decode: Callable[[Any], Iterable[Sample | str]], silence: float | None = None
+    ) -> Iterator[Arrival]:
+        """What `decode` makes of the messages, until nothing comes for `silence` s after the first
+        one (None: without end)."""
+        latest = time.monotonic()
+        begun = False
+        while True:
+            with self._change:
+                if not self._waiting and not self._notices:
+                    self._change.wait(TICK if silence is None else min(TICK, silence))
+                notices = [self._notices.popleft() for _ in range(len(self._notices))]
+                clock, message, size = (
+                    self._waiting.popleft() if self._waiting else (time.monotonic(), None, 0)
+                )
+                self._bytes -= size
+                lost, self._told = self._lost - self._told, self._lost
+            if lost:
+                notices.append(f"{lost} {self._kind} are lost: they came faster than they are used")
+            yield from (Arrival(clock, notice=notice) for notice in notices)
+            if message is not None:
+                begun, latest = True, clock
+                yield from _arrivals(clock, decode(message))
+                continue
+            quiet = clock - latest
+            if begun and silence is not None and quiet >= silence:
+                return
+            yield Arrival(
+                clock, waiting=f"samples: nothing has come on {self.name} for {quiet:.0f} s"
+            )
+
+
+def receive_datagrams(receiver: socket.socket, inbox: Inbox) -> None:
+    """Put the datagrams of a UDP socket into the inbox, in a thread."""
+
+    def receive() -> None:
+        while True:
+            try:
+                message = receiver.recv(CHUNK)
+            except OSError:
+                return  # the socket is closed
+            inbox.put(message, len(message))
+
+    threading.Thread(target=receive, daemon=True).start()
+
+
+def read_stream(stream: Any, name: str, stated: Units) -> Iterator[Arrival]:
+    """The lines of a binary stream, until it ends. Of a line without end the beginning is kept."""
+    try:
+        number = stream.fileno()
+    except OSError:  # it is no file of the system
+        number, read = None, partial(stream.read, CHUNK)
+    else:
+        read = partial(os.read, number, CHUNK)
+    heard, tail = time.monotonic(), b""
+    while True:
+        if number is not None and not select.select([number], [], [], TICK)[0]:
+            clock = time.monotonic()
+            yield Arrival(
+                clock, waiting=f"samples: nothing has come on {name} for {clock - heard:.0f} s"
+            )
+            continue
+        piece, heard = read(), time.monotonic()
+        lines, mark, end = (tail + piece).rpartition(b"\n")
+        tail = end[: LONGEST_LINE + 1]
+        yield from _arrivals(heard, parse_lines(lines + mark, stated))
+        if len(tail) > LONGEST_LINE:
+            yield Arrival(heard, refusal=NO_SAMPLE)
+        if not piece:
+            yield from _arrivals(heard, parse_lines(tail, stated))
+            return
+
+
+def _arrivals(clock: float, parsed: Iterable[Sample | str]) -> Iterator[Arrival]:
+    for sample in parsed:
+        if isinstance(sample, str):
+            yield Arrival(clock, refusal=sample)
+        else:
+            yield Arrival(clock, sample)

@@ -1,0 +1,107 @@
+"""What waits for the filter, and the lines of streams and datagrams."""
+
+import io
+import os
+import socket
+import time
+
+import pytest
+
+from gnio_jax.apps.live import inbox as inboxes
+from gnio_jax.apps.live.inbox import Inbox, read_stream
+from gnio_jax.apps.live.samples import NO_SAMPLE, SI, parse_lines
+from gnio_jax.apps.live.sources import Stated, open_source
+from tests.support.live_streams import STILL, samples_of, texts_of
+
+
+def test_messages_keep_their_order_and_end_with_the_silence():
+    """What comes before the source is read is kept, and silence counts from the first message."""
+    inbox = Inbox("udp:5")
+    for first in (0, 3):
+        message = "\n".join(f"{first + k},{STILL}" for k in range(3)).encode()
+        assert inbox.put(message, len(message))
+    inbox.put(b"\xff\xfe", 2)
+    begin = time.monotonic()
+    found = list(inbox.arrivals(parse_lines, 0.3))
+    assert 0.25 < time.monotonic() - begin < 5
+    assert [sample.time for sample in samples_of(found)] == [0, 1, 2, 3, 4, 5]
+    assert texts_of(found, "refusal") == [NO_SAMPLE]
+
+
+def test_without_messages_time_passes_and_nothing_ends():
+    stage = Inbox("udp:5").arrivals(parse_lines, 0.01)
+    waiting = [next(stage).waiting for _ in range(5)]
+    assert waiting[-1] == "samples: nothing has come on udp:5 for 0 s"
+
+
+@pytest.mark.parametrize("bound", ["MOST_MESSAGES", "MOST_BYTES"])
+def test_what_waits_is_bounded_and_what_is_lost_is_said(monkeypatch, bound):
+    monkeypatch.setattr(inboxes, bound, 5 if bound == "MOST_MESSAGES" else 100)
+    inbox, line = Inbox("udp:5", "datagrams"), f"1,{STILL}".encode()
+    kept = sum(inbox.put(line, 20) for _ in range(12))
+    stage = inbox.arrivals(parse_lines, 0.05)
+    assert kept == 5
+    assert next(stage).notice.startswith("7 datagrams are lost: they came faster than")
+    assert len(samples_of(stage)) == 5
+    assert inbox.put(line, 20)  # what was read makes place
+
+
+def test_datagrams_of_the_largest_size_do_not_fill_the_memory():
+    """100,000 of them would be 6 GB."""
+    inbox, message = Inbox("udp:5", "datagrams"), bytes(60_000)
+    assert sum(inbox.put(message, len(message)) for _ in range(2000)) == 533
+
+
+@pytest.fixture
+def port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_datagrams_are_received_before_they_are_read(port):
+    source = open_source(f"udp:{port}", Stated(silence=0.3))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for k in range(50):
+            sender.sendto(f"{k},{STILL}\n".encode(), ("127.0.0.1", port))
+    time.sleep(0.2)
+    read = time.monotonic()
+    found = list(source.arrivals)
+    source.close()
+    assert [sample.time for sample in samples_of(found)] == list(range(50))
+    assert all(arrival.clock < read for arrival in found if arrival.sample)
+
+
+def lines_of(content):
+    return list(read_stream(io.BytesIO(content), "standard input", SI))
+
+
+def test_a_stream_is_read_line_by_line():
+    """Its last line needs no end, empty ones do not count, and chunks cut nothing."""
+    content = "".join(f"{k / 100},{STILL}\r\n\n" for k in range(20_000)).encode()
+    found = lines_of(content + f"200,{STILL}".encode())
+    assert [sample.time for sample in samples_of(found)] == [k / 100 for k in range(20_001)]
+    assert texts_of(found, "refusal") == []
+
+
+def test_a_line_without_an_end_is_refused_again_and_again():
+    """And its memory is bounded; the line after it is read."""
+    number = 40
+    content = bytes(number * inboxes.CHUNK) + f"\n1,{STILL}\n".encode()
+    found = lines_of(content)
+    assert number <= len(texts_of(found, "refusal")) <= number + 2
+    assert [sample.time for sample in samples_of(found)] == [1.0]
+
+
+def test_a_stream_that_is_silent_says_so(monkeypatch):
+    monkeypatch.setattr(inboxes, "TICK", 0.01)
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb") as stream:
+        stage = read_stream(stream, "standard input", SI)
+        assert next(stage).waiting == "samples: nothing has come on standard input for 0 s"
+        os.write(writing, f"1,{STILL}\n2,0".encode())
+        assert next(arrival for arrival in stage if arrival.sample).sample.time == 1.0
+        os.write(writing, b",0,0,0,0,9.81\n")
+        assert next(arrival for arrival in stage if arrival.sample).sample.time == 2.0
+        os.close(writing)
+        assert samples_of(stage) == []

@@ -1,0 +1,78 @@
+"""A network with memory along whole recordings, against the same network step by step."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import models
+from gnio_jax.config import DataConfig
+from gnio_jax.evaluation import estimate, infer
+from gnio_jax.evaluation.estimate import integrate
+from gnio_jax.filtering import make_filter
+from gnio_jax.models import Network
+from tests.support.compiling import quick
+from tests.support.estimators import OPTIONS, RATE, ready, rotations
+from tests.support.networks import SMALL, drawn
+
+CONFIG = DataConfig(rate=RATE)
+N, W = CONFIG.stride, CONFIG.window // CONFIG.stride
+MODEL = models.create("ronin_tcn", bank_size=3, head="gated", **SMALL["ronin_tcn"])
+NETWORK = Network.of(MODEL, drawn({"batch_stats": {}, **models.variable_shapes(MODEL, N)}))
+
+
+def stepwise(recording, strides):
+    """Displacements in the yaw frame of each window's start, with the attitude of the
+    recording."""
+    predict = NETWORK.predict()
+    step, memory, rows = quick(predict.step), predict.begin(), []
+    for k in strides:
+        samples = slice(k * N, k * N + N)
+        signals = np.concatenate([recording.accel[samples], recording.gyro[samples]], axis=1)
+        poses = recording.attitude[k * N : k * N + N + 1].transpose(1, 2, 0)
+        memory, prediction = step(memory, jnp.asarray(signals), jnp.asarray(poses))
+        start = recording.attitude[max(k * N + N - CONFIG.window, 0)]
+        turn = np.arctan2(*memory.heading[::-1]) - np.arctan2(start[1, 0], start[0, 0])
+        prediction = jax.device_get(prediction)
+        matrix = Rotation.from_euler("z", float(turn)).as_matrix()
+        covariance = matrix @ np.diag(np.exp(2 * prediction.log_std)) @ matrix.T
+        rows.append((matrix @ prediction.displacement, covariance, prediction.diagnostics["gate"]))
+    return rows
+
+
+def test_each_stretch_is_one_run_with_a_memory_of_its_own(walks):
+    """Behind a sample that was not measured the memory is empty."""
+    measured = np.ones(len(walks[0].time), bool)
+    measured[203] = False
+    sequence = walks[0]._replace(imu_valid=measured)
+    (recording,) = ready([sequence], CONFIG, orientation="reference")
+    (found,) = infer(NETWORK, [recording], CONFIG)
+    turns = rotations(walks[0].orientation).as_matrix()
+    np.testing.assert_allclose(recording.attitude[:50], turns[:50], atol=1e-9)
+    hole, last = 203 // N, recording.strides
+    for strides in (range(hole), range(hole + 1, last)):
+        for k, (value, covariance, gate) in zip(strides, stepwise(recording, strides), strict=True):
+            if k - strides.start < W - 1:
+                assert np.isnan(found.value[k]).all() and np.isnan(found.covariance[k]).all()
+                continue
+            np.testing.assert_allclose(found.value[k], value, atol=2e-3)
+            np.testing.assert_allclose(found.covariance[k], covariance, atol=2e-3, rtol=2e-3)
+            np.testing.assert_allclose(found.diagnostics["gate"][k], gate, atol=2e-3)
+    assert np.isnan(found.value[hole]).all() and set(found.diagnostics) == {"gate", "scale"}
+    assert np.isfinite(integrate(recording, found, CONFIG).trajectory.position).all()
+
+
+def test_the_filter_runs_with_it_over_several_recordings(walks):
+    recordings = ready(walks[:2], CONFIG)
+    ekf = make_filter(CONFIG, OPTIONS)
+    together = estimate(recordings, NETWORK, CONFIG, ekf)
+    for one, recording in zip(together, recordings, strict=True):
+        (alone,) = estimate([recording], NETWORK, CONFIG, ekf)
+        np.testing.assert_allclose(
+            one.trajectory.position, alone.trajectory.position, rtol=1e-3, atol=1e-3
+        )
+        measured = np.isfinite(one.displacements.value).all(1)
+        np.testing.assert_array_equal(np.flatnonzero(measured)[0], W + 1)
+        diagnostics = one.displacements.diagnostics
+        assert measured[W + 1 :].all() and set(diagnostics) == {"gate", "scale"}
+        np.testing.assert_array_equal(np.isfinite(diagnostics["gate"]).all(1), measured)
