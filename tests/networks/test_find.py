@@ -60,6 +60,20 @@ def test_names_are_those_of_folders_and_zips(networks, run, monkeypatch, tmp_pat
     refused("walk", "$GNIO_WEIGHTS", "nowhere")
 
 
+def test_of_two_networks_of_one_name_the_first_is_found(tmp_path, monkeypatch):
+    """The name of a network of gnio-jax stands for no other."""
+    folders = [tmp_path / name for name in ("shipped", "first", "second")]
+    for place, names in zip(folders, ("a", "ab", "abc"), strict=True):
+        for name in names:
+            (place / name).mkdir(parents=True)
+            for file in (folder.CONFIG, folder.WEIGHTS):
+                (place / name / file).touch()
+    monkeypatch.setattr(find, "SHIPPED", folders[0])
+    monkeypatch.setenv("GNIO_WEIGHTS", os.pathsep.join(map(str, folders[1:])))
+    expected = {name: place / name for name, place in zip("abc", folders, strict=True)}
+    assert find.list_networks() == expected
+
+
 def test_the_default_is_shipped_or_the_newest_run(networks, run, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GNIO_WEIGHTS", raising=False)

@@ -41,6 +41,10 @@ def test_what_is_compressed_is_unpacked_up_to_a_bound(tmp_path, name):
         bags._unpacked(content, "xz", tmp_path)
 
 
+def test_the_bounds_fit_into_the_memory_of_a_phone():
+    assert bags.SMALL_CHUNK < bags.LARGEST_CHUNK <= 1 << 29 and bags.LARGEST_RATIO <= 1000
+
+
 def compressed_writer(monkeypatch, kind):
     """The writers of rosbags compress as `kind` says."""
     module, _, mode = kind.partition(" ")
