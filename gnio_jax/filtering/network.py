@@ -197,11 +197,12 @@ def _check(prediction: Any) -> None:
     if not isinstance(prediction, Prediction):
         kind = type(prediction).__name__
         raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")
+    axes = prediction.axes
+    if axes is not None and axes.shape != (1, 2):
+        raise ValueError(f"predict: axes must be (1, 2) for one window, found {axes.shape}")
     for name, value in {**prediction._asdict(), **prediction.diagnostics}.items():
         if name in ("displacement", "log_std") and value.shape != (1, 3):
             raise ValueError(f"predict: {name} must be (1, 3) for one window, found {value.shape}")
-        if name == "axes" and value is not None and value.shape != (1, 2):
-            raise ValueError(f"predict: axes must be (1, 2) for one window, found {value.shape}")
         if name in prediction.diagnostics and value.shape[:1] != (1,):
             problem = f"must have a leading axis of one window, found {value.shape}"
             raise ValueError(f"predict: diagnostics['{name}'] {problem}")
