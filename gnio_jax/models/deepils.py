@@ -60,7 +60,7 @@ class ChannelAttention(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
         channels = x.shape[-1]
-        pooled = jnp.stack([x.mean(axis=1), _maximum(x, 1)], axis=1)
+        pooled = jnp.stack([x.mean(axis=1), maximum(x, 1)], axis=1)
         squeeze = linear(max(channels // REDUCTION, 1), "squeeze", use_bias=False)
         excite = linear(channels, "excite", use_bias=False)
         return x * nn.sigmoid(excite(nn.relu(squeeze(pooled))).sum(axis=1, keepdims=True))
@@ -71,11 +71,11 @@ class TimeAttention(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b n c"], train: bool) -> Float[Array, "b n c"]:
-        pooled = jnp.stack([x.mean(axis=-1), _maximum(x, 2)], axis=-1)
+        pooled = jnp.stack([x.mean(axis=-1), maximum(x, 2)], axis=-1)
         return x * nn.sigmoid(conv(1, 7, 1, train, "conv")(pooled))
 
 
-def _maximum(x: Float[Array, "b n c"], axis: int) -> Float[Array, "b k"]:
+def maximum(x: Float[Array, "b n c"], axis: int) -> Float[Array, "b k"]:
     """The maximum, whose gradient goes to the first place that has this value, as in PyTorch.
 
     The gradient of `jnp.max` is divided among all values that equal the maximum. Compilers may

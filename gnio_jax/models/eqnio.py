@@ -36,7 +36,7 @@ from gnio_jax.types import Prediction
 
 SPAN = 32
 """Samples of the convolutions in time."""
-REFLECTED = np.float32([1, -1, 1, -1, 1, -1])
+REFLECTED = np.array([1, -1, 1, -1, 1, -1], np.float32)
 """Signs of [accel, gyro] under the reflection of y."""
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from gnio_jax.config.schema import Count
 from gnio_jax.models.airio import norm
 from gnio_jax.models.convolution import convolve, convolve_depthwise, convolve_forward
+from gnio_jax.models.deepils import maximum
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
 from gnio_jax.models.layers import FLOAT32, checked_windows, linear
 from gnio_jax.types import Prediction
@@ -39,6 +40,11 @@ class IONext(nn.Module):
 
     width: Count = 96
     output_dim: Literal[2, 3] = 3
+
+    def __post_init__(self) -> None:
+        if self.width % 2:
+            raise ValueError(f"width must be even, found {self.width}")
+        super().__post_init__()
 
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 6"], train: bool = False) -> Prediction:
@@ -74,7 +80,7 @@ class DynamicBlock(nn.Module):
             halves.append(jnp.sum(shares * jnp.stack(branches, axis=2), axis=2))
         x = x + linear(channels, "mixer")(jnp.concatenate(halves, axis=-1))
         y = norm("gate_norm", train)(x)
-        pooled = jnp.concatenate([y.mean(axis=1), y.max(axis=1)], axis=-1)
+        pooled = jnp.concatenate([y.mean(axis=1), maximum(y, 1)], axis=-1)
         gate = nn.sigmoid(linear(channels, "gate")(pooled))
         return x + gate[:, None] * _depthwise(channels, GATE_SIZE, "gated")(y)
 

@@ -64,7 +64,7 @@ def test_the_gradient_of_a_maximum_goes_to_one_place():
 
         @quick
         def with_slope(x, axis=axis):
-            largest, pull_back = jax.vjp(functools.partial(deepils._maximum, axis=axis), x)
+            largest, pull_back = jax.vjp(functools.partial(deepils.maximum, axis=axis), x)
             return largest, pull_back(jnp.ones_like(largest))[0]
 
         largest, slope = with_slope(x)
