@@ -58,10 +58,7 @@ class NonHolonomic(NamedTuple):
         dtype = state.offset.dtype
         across = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)[1:]
         lever = jnp.stack([jnp.asarray(x, dtype) for x in self[-3:]])
-        rate = step.imu.gyro[-1] - state.gyro_bias
-        if step.imu.gap is not None:
-            rate = jnp.where(step.imu.gap.gyro_variance[-1] == 0, rate, jnp.nan)
-        velocity = matmul(state.rotation.T, state.velocity[:, None])[:, 0] + jnp.cross(rate, lever)
+        velocity = velocity_of_point(state, step, lever)
         of_velocity = matmul(across, state.rotation.T)
         linear = linearise(
             state,
@@ -72,6 +69,16 @@ class NonHolonomic(NamedTuple):
             gyro_bias=matmul(across, hat(lever)),
         )
         return measure(state, linear, step, THRESHOLD)
+
+
+def velocity_of_point(
+    state: FilterState, step: Step, lever: Float[Array, "3"]
+) -> Float[Array, "3"]:
+    """Rᵀ v + (ω − b_g) × l with the last sample of the interval; NaN if it is missing."""
+    rate = step.imu.gyro[-1] - state.gyro_bias
+    if step.imu.gap is not None:
+        rate = jnp.where(step.imu.gap.gyro_variance[-1] == 0, rate, jnp.nan)
+    return matmul(state.rotation.T, state.velocity[:, None])[:, 0] + jnp.cross(rate, lever)
 
 
 def car_axes(yaw: Number, pitch: Number, roll: Number) -> Float[Array, "3 3"]:
