@@ -126,21 +126,23 @@ class Prediction(NamedTuple):
     model has them."""
     axes: Float[Array, "*b 2"] | None = None
     """Cosine and sine of the angle about z by which the axes of `log_std` are turned; None: they
-    are those of `displacement`. So the covariance is full in the plane."""
+    are those of `displacement`. With turned axes the covariance is full in the plane."""
 
     def covariance(self, least: float, dtype: Any) -> Float[jax.Array, "*b 3 3"]:
         """Covariance of `displacement`, m²: A diag(exp 2u) Aᵀ with the axes A, u raised to
         `least`."""
         variance = jnp.exp(2 * jnp.maximum(jnp.asarray(self.log_std, dtype), least))
-        diagonal = jnp.vectorize(jnp.diag, signature="(d)->(d,d)")(variance)
         if self.axes is None:
-            return diagonal
+            return jnp.vectorize(jnp.diag, signature="(d)->(d,d)")(variance)
         cosine, sine = jnp.moveaxis(jnp.asarray(self.axes, dtype), -1, 0)
         x, y = variance[..., 0], variance[..., 1]
-        cross = cosine * sine * (x - y)
-        plane = [[cosine**2 * x + sine**2 * y, cross], [cross, sine**2 * x + cosine**2 * y]]
-        block = jnp.stack([jnp.stack(row, axis=-1) for row in plane], axis=-2)
-        return diagonal.at[..., :2, :2].set(block)
+        zero, cross = jnp.zeros_like(x), cosine * sine * (x - y)
+        rows = (
+            (cosine**2 * x + sine**2 * y, cross, zero),
+            (cross, sine**2 * x + cosine**2 * y, zero),
+            (zero, zero, variance[..., 2]),
+        )
+        return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
     def along_axes(self, error: Float[jax.Array, "*b d"]) -> Float[jax.Array, "*b d"]:
         """Errors of the first d axes (2 or 3), expressed in the axes of `log_std`."""

@@ -1,7 +1,8 @@
 """Stochastic-cloning extended Kalman filter: inertial propagation, displacement measurements,
 network in the loop.
 
-The network is any function from windows to a `Prediction`.
+The network is any function from windows to a `Prediction`, or a network that carries a memory from
+one clone interval to the next (`network`). `Filter` is the filter as one value, and `scan` runs it.
 """
 
 from gnio_jax.config import ConsideredStd, CorrelatedError, FilterSettings, InitialStd, NoiseModel

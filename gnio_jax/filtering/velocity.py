@@ -16,25 +16,20 @@ class BodyVelocity(NamedTuple):
     """Measures the last velocity of the network's window, in the place of its displacement.
 
     The network says it in the diagnostics `body_velocity` and `body_velocity_log_std` (m, 3), in
-    metres per window. Raises `ValueError` for a network without them.
+    metres per window. A run with given displacements, without a network, has no such measurement.
     """
 
     scale: Annotated[Number, ABOVE_ZERO] = 0.1
     """Factor of the predicted variance (AirIO: 0.1)."""
     name = "body_velocity"
-    replaces_displacement = True
+    needs = ("body_velocity", "body_velocity_log_std")
+    """The diagnostics of the network that are measured in the place of its displacement."""
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
-        if not {"body_velocity", "body_velocity_log_std"} <= step.diagnostics.keys():
-            raise ValueError(
-                "filter.measurements: 'body_velocity' needs a network that predicts a velocity "
-                "in the body, such as airio"
-            )
         dtype, config = state.velocity.dtype, step.config
-        seconds = config.window * config.dt
+        seconds, nothing = config.window * config.dt, jnp.full((1, 3), jnp.nan)
         velocity, log_std = (
-            step.diagnostics[name][-1].astype(dtype)
-            for name in ("body_velocity", "body_velocity_log_std")
+            step.diagnostics.get(name, nothing)[-1].astype(dtype) for name in self.needs
         )
         present = jnp.isfinite(velocity) & jnp.isfinite(log_std)
         variance = self.scale * jnp.exp(2 * jnp.where(present, log_std, 0.0)) / seconds**2

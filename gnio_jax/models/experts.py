@@ -1,4 +1,5 @@
-"""Experts for low and high speed behind a router that sees the spectrum of the window (ours)."""
+"""Experts for low and high speed, weighted by a router that sees the spectrum of the window
+(ours)."""
 
 from __future__ import annotations
 
@@ -27,9 +28,9 @@ class Experts(nn.Module):
 
     The router sees the logarithms of the power of |accel| and |gyro| at the lowest frequencies of
     the window, which do not change if the phone or the world is turned. Displacement and variance
-    are those of the mixture: d̂ = Σ p d, σ² = Σ p (σ_k² + (d_k − d̂)²). The loss holds the shares
-    together by `loss.balance_weight` (`training.network_losses.balance`), because otherwise one
-    expert may take every window. Which expert has which speed is learnt.
+    are those of the mixture: d̂ = Σ p d, σ² = Σ p (σ_k² + (d_k − d̂)²). `loss.balance_weight` keeps
+    the shares of the experts near each other (`training.network_losses.balance`), because otherwise
+    one expert may take every window. The networks learn which expert has which speed.
 
     `width`: channels of the first group of every expert.
     """
@@ -49,9 +50,9 @@ class Experts(nn.Module):
             h = encoder(windows, train).mean(axis=1)
             displacements.append(LinearHead(name=f"expert{number + 1}_displacement")(h)[0])
             log_stds.append(UncertaintyHead(name=f"expert{number + 1}_log_std")(h, train))
-        displacement, u = jnp.stack(displacements, axis=1), jnp.stack(log_stds, axis=1)
-        mean = jnp.einsum("bk,bki->bi", shares, displacement)
-        spread = jnp.log((displacement - mean[:, None]) ** 2 + 1e-12)
+        of_experts, u = jnp.stack(displacements, axis=1), jnp.stack(log_stds, axis=1)
+        mean = jnp.einsum("bk,bki->bi", shares, of_experts)
+        spread = jnp.log((of_experts - mean[:, None]) ** 2 + 1e-12)
         logs = jnp.logaddexp(2 * u, spread) + jnp.log(shares + 1e-12)[..., None]
         return Prediction(mean, 0.5 * jax.nn.logsumexp(logs, axis=1), {"router": shares})
 

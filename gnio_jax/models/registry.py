@@ -35,6 +35,7 @@ from gnio_jax.models.imot import IMoT, IMoTText
 from gnio_jax.models.ionet import IONet
 from gnio_jax.models.ionext import IONext
 from gnio_jax.models.memory import NetworkWithMemory
+from gnio_jax.models.ridi import RIDI
 from gnio_jax.models.ronin import RoNINResNet
 from gnio_jax.models.ronin_temporal import RoNINLSTM, RoNINTCN
 from gnio_jax.models.state_space import StateSpaceNetwork
@@ -52,6 +53,7 @@ _MODELS: dict[str, type[nn.Module]] = {
     "imot_text": IMoTText,
     "ionet": IONet,
     "ionext": IONext,
+    "ridi": RIDI,
     "ronin_lstm": RoNINLSTM,
     "ronin_resnet": RoNINResNet,
     "ronin_tcn": RoNINTCN,

@@ -78,7 +78,7 @@ def ensemble_variance(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _descend(
-    model: nn.Module, variables: Any, windows: Float[Array, "b n 6"], learning_rate: float
+    model: nn.Module, variables: Any, windows: Float[Array, "b n 6"], learning_rate: Any
 ) -> Any:
     """The variables after `STEPS` steps on −cos, the mean over the windows and `ANGLES`."""
     trained = jax.tree_util.tree_map_with_path(

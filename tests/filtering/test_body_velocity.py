@@ -45,5 +45,15 @@ def test_the_velocity_is_measured_in_the_body_and_the_displacement_is_not():
 
 def test_a_network_without_a_velocity_is_refused():
     plain = lambda windows: Prediction(jnp.zeros((1, 3)), jnp.zeros((1, 3)))  # noqa: E731
-    with pytest.raises(ValueError, match="'body_velocity' needs a network that predicts"):
+    with pytest.raises(ValueError, match="'body_velocity' needs the diagnostics 'body_velocity'"):
         run(plain)
+
+
+def test_a_run_with_given_displacements_has_no_velocity():
+    ekf = filtering.Filter(CONFIG, measurements=(BodyVelocity(),))
+    state = filtering.initial_state(ekf, TURN, np.zeros(3), np.zeros(3))
+    accel = np.tile([0.0, 0.0, 9.81], (10, 1))
+    given = np.zeros((5, 3)), np.tile(0.01 * np.eye(3), (5, 1, 1))
+    _, history = filtering.run_filter(ekf, state, np.zeros((10, 3)), accel, *given)
+    assert not np.any(history.outcomes["body_velocity"].present)
+    np.testing.assert_array_equal(history.accepted[3:], 1.0)

@@ -77,7 +77,7 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
     if name != "gnio":  # whose bank is as wide as four groups make it
         monkeypatch.setattr(resnet, "GROUP_STRIDES", (1, 2))
     # A width of their own: JAX keeps the shapes of a network.
-    fewer = {"ctin": {"decoder_layers": 1}, "imot": {"encoder_layers": 1}}
+    fewer = {"ctin": {"decoder_layers": 1}, "imot": {"encoder_layers": 1}, "ridi": {}}
     model = models.create(name, **SMALL[name] | fewer.get(name, {"width": 5}))
     samples = {"gru": 60, "state_space": 60, "ronin_lstm": 20, "ionet": 9, "airio": 40}.get(
         name, 12 if name in fewer else 64
@@ -115,8 +115,8 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
         elif names[-2:] not in SOFTMAX and (names[-2] not in SHIFTS or names[-1] != "bias"):
             assert trained > 1e-6, path
     dropped = np.abs(one.displacement - other.displacement).max() > 1e-3
-    without = ("experts", "gnio", "gru", "ionext", "ronin_lstm", "state_space", "trunk")
-    assert dropped == (name not in without)
+    without = ("experts", "gnio", "gru", "ionext", "ridi", "ronin_lstm", "state_space")
+    assert dropped == (name not in (*without, "trunk"))
     assert jax.tree.structure(changed) == jax.tree.structure(statistics)
     before = jax.tree.leaves_with_path(statistics)
     for (path, old), new in zip(before, jax.tree.leaves(changed), strict=True):

@@ -24,6 +24,7 @@ SMALL = {
     "gru": {"width": 4},
     "ionet": {"width": 4},
     "ionext": {"width": 4},
+    "ridi": {"supports": 3},
     "ronin_lstm": {"width": 5},
     "ronin_resnet": {"width": 4},
     "ronin_tcn": {"width": 4},
