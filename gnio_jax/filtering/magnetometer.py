@@ -78,8 +78,8 @@ class Magnetometer(NamedTuple):
         present = present & usual & (level > LEAST_LEVEL) & (std > 0)
         # A safe branch for the derivative of atan2 where the field is vertical.
         x, y = (jnp.where(present, part, safe) for part, safe in ((x, 1.0), (y, 0.0)))
-        apart = direction - jnp.arctan2(y, x)
-        residual = jnp.arctan2(jnp.sin(apart), jnp.cos(apart))
+        difference = direction - jnp.arctan2(y, x)
+        residual = jnp.arctan2(jnp.sin(difference), jnp.cos(difference))
         squared = jnp.where(present, level**2, 1.0)
         turn = jnp.stack([-x * z / squared, -y * z / squared, jnp.ones_like(z)])
         linear = linearise(

@@ -204,12 +204,14 @@ def _check(prediction: Any) -> None:
     if not isinstance(prediction, Prediction):
         kind = type(prediction).__name__
         raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")
-    for name, value in {**prediction._asdict(), **prediction.diagnostics}.items():
-        if name in ("displacement", "log_std") and value.shape != (1, 3):
-            raise ValueError(f"predict: {name} must be (1, 3) for one window, found {value.shape}")
-        if name == "axes" and value is not None and value.shape != (1, 2):
-            raise ValueError(f"predict: axes must be (1, 2) for one window, found {value.shape}")
-        if name in prediction.diagnostics and value.shape[:1] != (1,):
+    axes = () if prediction.axes is None else (("axes", prediction.axes, 2),)
+    vectors = ("displacement", prediction.displacement, 3), ("log_std", prediction.log_std, 3)
+    for name, value, size in (*vectors, *axes):
+        if value.shape != (1, size):
+            shapes = f"must be (1, {size}) for one window, found {value.shape}"
+            raise ValueError(f"predict: {name} {shapes}")
+    for name, value in prediction.diagnostics.items():
+        if value.shape[:1] != (1,):
             problem = f"must have a leading axis of one window, found {value.shape}"
             raise ValueError(f"predict: diagnostics['{name}'] {problem}")
 

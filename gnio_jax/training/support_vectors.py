@@ -65,7 +65,7 @@ def train(config: TrainConfig, workdir: Path, reporter: Reporter, workers: int =
         )
         parts.append(labelled_windows(sequences, config))
         reporter.line(f"  {split}: {len(parts[-1].placement):,} windows")
-    network = fit(*parts, config)
+    network = fit(parts[0], parts[1], config)
     workdir.mkdir(parents=True, exist_ok=True)
     write_network(workdir, network)
     log_std = np.asarray(network.variables["batch_stats"]["uncertainty"]["log_std"])

@@ -111,7 +111,7 @@ def read(minute: Path) -> list[Sequence]:
         velocity @ level.T,
         source=str(pose),
     )
-    gyro, accel = (Samples(stamps - start, values, file) for stamps, values, file in sensors)
+    gyro, accel = (Samples(stamps - start, *values) for stamps, *values in sensors)
     attributes = {
         "group": minute.parent.name,
         "device": minute.parent.name[:16],
