@@ -84,12 +84,12 @@ def read(drive: Path) -> list[Sequence]:
     time = functools.reduce(np.intersect1d, [of_pose for of_pose, _ in tables.values()])
     if len(time) < 2:
         raise damaged(drive, "has no stamps that position, velocity and attitude share")
-    place, velocity, angles = (
+    geodetic, velocity, angles = (
         values[np.searchsorted(of_pose, time)] for of_pose, values in tables.values()
     )
-    if not (np.abs(place[:, :2]) <= LARGEST_ANGLES).all():
+    if not (np.abs(geodetic[:, :2]) <= LARGEST_ANGLES).all():
         raise damaged(paths["position"], "field 'Latitude' or 'Longitude' is no angle in rad")
-    position = project(*np.degrees(place[:, :2].T), place[:, 2])
+    position = project(*np.degrees(geodetic[:, :2].T), geodetic[:, 2])
     to_world = TO_EAST_NORTH_UP @ Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()
     start = float(stamps[0])
     poses = Poses(
