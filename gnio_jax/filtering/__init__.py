@@ -25,6 +25,7 @@ from gnio_jax.filtering.state import FilterState, GateState
 from gnio_jax.filtering.tracker import Pose, Tracker
 from gnio_jax.filtering.update import Linearised, Outcome, Step, linearise, measure
 from gnio_jax.filtering.waypoints import WaypointPoses, waypoint_poses
+from gnio_jax.filtering.wheel_speed import WheelSpeed, speeds_on_intervals
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
 
 __all__ = [
@@ -50,6 +51,7 @@ __all__ = [
     "Step",
     "Tracker",
     "WaypointPoses",
+    "WheelSpeed",
     "ZeroVelocity",
     "barometer_on_intervals",
     "considered_covariance",
@@ -70,6 +72,7 @@ __all__ = [
     "run_odometry",
     "sensitivity",
     "smooth",
+    "speeds_on_intervals",
     "waypoint_poses",
     "with_considered",
 ]

@@ -97,7 +97,7 @@ def barometer_on_intervals(
     at_ends = readings_at(ends, time, pressure[:, None])[:, 0]
     present = np.flatnonzero(np.isfinite(at_ends))
     if not len(present):
-        problem = f"time: no two stamps are within the {ends[-1] - start:.0f} s of the IMU"
+        problem = f"time: no two stamps are within the {ends[-1] - start:.4g} s of the IMU"
         raise InputError("barometer", problem, "give it stamps on the clock of the IMU")
     middle = float(np.median(pressure))
     if not PRESSURES[0] <= middle <= PRESSURES[1]:

@@ -21,7 +21,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from gnio_jax.config.schema import ABOVE_ZERO, FINITE, Number
 from gnio_jax.filtering.state import FilterState
@@ -58,10 +58,7 @@ class NonHolonomic(NamedTuple):
         dtype = state.offset.dtype
         across = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)[1:]
         lever = jnp.stack([jnp.asarray(x, dtype) for x in self[-3:]])
-        rate, present = step.imu.gyro[-1] - state.gyro_bias, jnp.bool_(True)
-        if step.imu.gap is not None:
-            present = step.imu.gap.gyro_variance[-1] == 0
-        velocity = matmul(state.rotation.T, state.velocity[:, None])[:, 0] + jnp.cross(rate, lever)
+        velocity, present = velocity_of_point(state, step, lever)
         of_velocity = matmul(across, state.rotation.T)
         linear = linearise(
             state,
@@ -72,6 +69,17 @@ class NonHolonomic(NamedTuple):
             gyro_bias=matmul(across, hat(lever)),
         )
         return measure(state, linear, step, THRESHOLD)
+
+
+def velocity_of_point(
+    state: FilterState, step: Step, lever: Float[Array, "3"]
+) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
+    """Rᵀ v + (ω − b_g) × l with the last sample of the interval, and whether this was measured."""
+    rate, present = step.imu.gyro[-1] - state.gyro_bias, jnp.bool_(True)
+    if step.imu.gap is not None:
+        present = step.imu.gap.gyro_variance[-1] == 0
+    velocity = matmul(state.rotation.T, state.velocity[:, None])[:, 0] + jnp.cross(rate, lever)
+    return velocity, present
 
 
 def car_axes(yaw: Number, pitch: Number, roll: Number) -> Float[Array, "3 3"]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import config as configuration
 from gnio_jax import filtering
+from gnio_jax.errors import InputError
 from gnio_jax.filtering.gaps import Gap, Imu
 from gnio_jax.filtering.nonholonomic import THRESHOLD, NonHolonomic, car_axes
 from tests.support import manifold
@@ -34,22 +35,21 @@ def test_the_axes_of_the_car_are_those_of_its_mounting(angles):
 
 
 def predicted(poses, gyro):
-    """Velocity of the point to the left and up, in NumPy, for poses with axes in front."""
+    """Velocity of the point ahead, to the left and up, in NumPy, for poses with axes in front."""
     rotation, velocity, _, gyro_bias, _ = poses
     in_body = np.einsum("...ji,...j->...i", rotation, velocity)
     in_body = in_body + np.cross(gyro - gyro_bias, np.array(MOUNTED[-3:]))
-    return (in_body @ Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix())[..., 1:]
+    return in_body @ Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix()
 
 
-@quick
-def updated(state, gyro):
-    config = dataclasses.replace(CONFIG, clones_per_window=4, error="additive")
-    imu = Imu(gyro, jnp.zeros((N, 3)), None)
-    step = filtering.Step(imu, 0, 1, config, NOISE)
-    return MOUNTED.update(state, step)[:2]
+def wheels(speeds):
+    """Rows of a car with the same mounting, with one speed at every stamp."""
+    time = np.linspace(0.0, 1.0, 11)
+    return filtering.speeds_on_intervals(time, speeds * np.ones(11), 5, CONFIG, MOUNTED)
 
 
-def test_an_update_is_the_textbooks_with_the_derivatives_by_finite_differences():
+@pytest.mark.parametrize("sensor", ["constraint", "wheels"])
+def test_an_update_is_the_textbooks_with_the_derivatives_by_finite_differences(sensor):
     config = dataclasses.replace(CONFIG, clones_per_window=4, error="additive")
     start, *signals = random_walk(5, n=N, clones=4, intervals=12, dt=DT, nan_rows=range(12))
     std = filtering.InitialStd(0.1, 0.1, 3.0, 1.0, 0.01, 0.1)
@@ -57,14 +57,24 @@ def test_an_update_is_the_textbooks_with_the_derivatives_by_finite_differences()
     state, _ = filtering.run_filter(ekf, filtering.initial_state(ekf, *start), *signals)
     gyro = np.random.default_rng(0).normal(size=(N, 3))
     poses = [np.asarray(part) for part in state.mean]
+    axes = slice(1, 3) if sensor == "constraint" else slice(0, 1)
     jacobian = manifold.differences(
-        lambda errors: predicted(manifold.plus(poses, errors), gyro[-1]), 15
+        lambda errors: predicted(manifold.plus(poses, errors), gyro[-1])[..., axes], 15
     )
+    residual, stds, measurement = -predicted(poses, gyro[-1])[axes], MOUNTED[:2], MOUNTED
+    if sensor == "wheels":
+        stds, at_end = [0.3], wheels(predicted(poses, gyro[-1])[0] + 0.4)
+        residual, measurement = np.array([0.4]), jax.tree.map(lambda leaf: leaf[-1], at_end)
     before = np.asarray(covariance(state))
     rows = np.pad(jacobian, ((0, 0), (0, len(before) - 15)))
-    spread = rows @ before @ rows.T + np.diag(np.square(MOUNTED[:2]))
+    spread = rows @ before @ rows.T + np.diag(np.square(stds))
     gain = np.linalg.solve(spread, rows @ before).T
-    residual = -predicted(poses, gyro[-1])
+
+    @quick
+    def updated(state, gyro):
+        step = filtering.Step(Imu(gyro, jnp.zeros((N, 3)), None), 0, 1, config, NOISE)
+        return measurement.update(state, step)[:2]
+
     after, outcome = updated(state, gyro)
     assert bool(outcome.accepted)
     np.testing.assert_allclose(outcome.residual, residual, atol=1e-12)
@@ -77,14 +87,16 @@ def test_an_update_is_the_textbooks_with_the_derivatives_by_finite_differences()
 
 
 @optimised
-def run(rides, constraint):
-    def one(rotation, velocity, position, gyro, accel, displacement):
+def run(rides, constraint, speeds=None):
+    def one(rotation, velocity, position, gyro, accel, displacement, speeds):
         ekf = filtering.Filter(CONFIG, NOISE, STD, measurements=(constraint,))
         state = filtering.initial_state(ekf, rotation, velocity, position)
         spread = jnp.tile(jnp.eye(3)[None], (len(displacement), 1, 1))
-        return filtering.run_filter(ekf, state, gyro, accel, displacement, spread)[1]
+        rows = () if speeds is None else (speeds,)
+        signals = ekf, state, gyro, accel, displacement, spread
+        return filtering.run_filter(*signals, measurements=rows)[1]
 
-    return jax.vmap(one)(*rides[:6])
+    return jax.vmap(one)(*rides[:6], speeds)
 
 
 def test_squared_errors_of_rides_are_as_the_covariance_says():
@@ -128,6 +140,46 @@ def test_a_car_that_slides_is_not_believed_to_go_straight():
     assert abs(left @ (velocity + np.cross(rate, np.array(tight[-3:]))) - 4.0) < 0.3
     error = np.asarray(history.velocity[0]) - rides.velocity[0]
     assert np.abs(error[-1]).max() < 0.5
+
+
+def test_wheels_show_the_speed_ahead():
+    """Of 100 rides without the constraint; a speed of a kilometre a second is refused."""
+    rides = drive(2, RUNS, INTERVALS, N, DT, NOISE, STD, MOUNTED, 0.05, 0.1)
+    body = np.einsum("rkji,rkj->rki", rides.rotation, rides.velocity)
+    body = body + np.cross(rides.gyro[:, N - 1 :: N] - rides.gyro_bias, np.array(MOUNTED[-3:]))
+    ahead = Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix()[:, 0]
+    speed = body @ ahead + 0.3 * np.random.default_rng(0).normal(size=(RUNS, INTERVALS))
+    speed[:, 100] = 1000.0
+    speed[:, 110:120] = np.nan
+    shape = RUNS, INTERVALS
+    rows = jax.tree.map(lambda leaf: np.broadcast_to(leaf[0], shape + leaf.shape[1:]), wheels(0.0))
+    free = MOUNTED._replace(lateral_std=1e6, vertical_std=1e6)
+    history = run(rides, free, rows._replace(speed=speed))
+    error, spread = errors(rides, history), np.asarray(history.covariance)
+    forward = rides.rotation[:, -1] @ ahead
+    errors_ahead = np.einsum("ri,ri->r", error[:, -1, 3:6], forward)
+    outcome = history.outcomes["wheel_speed"]
+    assert not np.asarray(outcome.accepted)[:, 100:101].any()
+    assert not np.asarray(outcome.present)[:, 110:120].any()
+    assert np.asarray(outcome.accepted)[:, 150:].mean() > 0.97
+    v, p = error[:, -1, 3:6], spread[:, -1, 3:6, 3:6]
+    nees = np.einsum("ri,ri->r", v, np.linalg.solve(p, v[:, :, None])[:, :, 0]) / 3
+    assert nees.mean() < 1.5 and np.std(errors_ahead) < 1.0
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda time, speed: (time, 3.6 * speed), "108 m/s is beyond a car; divide km/h by 3.6"),
+        (lambda time, speed: (time + 1e9, speed), "no two stamps are within the 0.5 s of the IMU"),
+        (lambda time, speed: (time[::-1], speed), "time: does not increase"),
+        (lambda time, speed: (time, speed[1:]), r"must be \(f,\), found"),
+    ],
+)
+def test_a_speed_that_cannot_be_is_refused(change, words):
+    rows = change(np.linspace(0.0, 1.0, 11), np.full(11, 30.0))
+    with pytest.raises(InputError, match=rf"^wheel speed: .*{words}"):
+        filtering.speeds_on_intervals(*rows, 5, CONFIG, MOUNTED)
 
 
 def test_no_velocity_is_measured_where_the_rate_is_missing():

@@ -1,0 +1,60 @@
+"""onavdata: a known motion must come back from its increments and its angles, and damaged files are
+refused."""
+
+import zipfile
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import data
+from gnio_jax.data.readers import onavdata
+from gnio_jax.data.self_check import self_check
+from gnio_jax.errors import InputError
+from tests.support import known_walk
+from tests.support import onav_files as files
+
+
+def test_a_drive_comes_back(tmp_path):
+    files.write(tmp_path / "HGuide n380")
+    (sequence,) = data.load("onavdata", tmp_path, "test")
+    assert sequence.name == files.DRIVE and self_check(sequence, pedestrian=False).failures == ()
+    # The body is turned about its axis ahead, and otherwise it is the known one.
+    attitude = Rotation.from_quat(sequence.orientation, scalar_first=True)
+    level = sequence._replace(
+        gyro=sequence.gyro @ files.FLIP,
+        accel=sequence.accel @ files.FLIP,
+        orientation=(attitude * Rotation.from_matrix(files.FLIP)).as_quat(scalar_first=True),
+    )
+    origin = known_walk.position(np.zeros(1))
+    known_walk.compare(level, sequence.time, speed=2e-2, origin=origin)
+
+
+@pytest.mark.parametrize(
+    "name, change, words",
+    [
+        ("position", lambda text: text.replace("Latitude", "Lat"), "'Latitude' is missing"),
+        ("velocity", lambda text: text[: len(text) // 2] + "\nx,y\n", "cannot be read as a zip"),
+        ("attitude", lambda text: text.replace(",4.0", ",1.0"), "holds 0 rows with a stamp"),
+        ("position", lambda text: text.replace(",0.78", ",45.78"), "is no angle in rad"),
+    ],
+)
+def test_damaged_tables_are_refused(tmp_path, name, change, words):
+    path = files.write(tmp_path, 8.0) / f"n380-{name}.csv.zip"
+    with zipfile.ZipFile(path) as archive:
+        text = archive.read(f"n380-{name}.csv").decode()
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"n380-{name}.csv", change(text))
+    with pytest.raises(InputError, match=words):
+        onavdata.read(path.parent)
+    path.unlink()
+    with pytest.raises(InputError, match="no such file"):
+        onavdata.read(path.parent)
+
+
+def test_tables_that_share_no_stamp_are_refused(tmp_path):
+    folder, time = files.write(tmp_path, 8.0), np.arange(0, 8, 0.01) + 0.003
+    names = [f"VelocityNED[{axis}]" for axis in range(3)]
+    files.zipped(folder, "velocity", names, time, np.zeros((len(time), 3)))
+    with pytest.raises(InputError, match="has no stamps that position, velocity and attitude"):
+        onavdata.read(folder)
