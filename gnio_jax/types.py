@@ -104,8 +104,9 @@ class Sequence(NamedTuple):
 class Windows(NamedTuple):
     """A batch of training windows in the gravity-aligned frame whose first sample has zero yaw."""
 
-    imu: Float[Array, "b n 6"]
-    """[accel m/s², gyro rad/s], the paper's channel order (eq. 1)."""
+    imu: Float[Array, "b n c"]
+    """[accel m/s², gyro rad/s], the paper's channel order (eq. 1); with `window_rotation:
+    body_axes` the x and y axes of the body are channels 6 to 11."""
     displacement: Float[Array, "b 3"]
     """Displacement over the window in the same frame, m."""
     steps: Float[Array, "b n 3"]
@@ -123,17 +124,41 @@ class Prediction(NamedTuple):
     diagnostics: dict[str, Array] = {}
     """Internal values for inspection: `gate`, `scale` (b, 3), `attention` (b, heads, m), if the
     model has them."""
+    axes: Float[Array, "*b 2"] | None = None
+    """Cosine and sine of the angle about z by which the axes of `log_std` are turned; None: they
+    are those of `displacement`. With turned axes the covariance is full in the plane."""
 
     def covariance(self, least: float, dtype: Any) -> Float[jax.Array, "*b 3 3"]:
-        """Covariance of `displacement`, m²: diag(exp 2u), u raised to `least`."""
+        """Covariance of `displacement`, m²: A diag(exp 2u) Aᵀ with the axes A, u raised to
+        `least`."""
         variance = jnp.exp(2 * jnp.maximum(jnp.asarray(self.log_std, dtype), least))
-        return jnp.vectorize(jnp.diag, signature="(d)->(d,d)")(variance)
+        if self.axes is None:
+            return jnp.vectorize(jnp.diag, signature="(d)->(d,d)")(variance)
+        cosine, sine = jnp.moveaxis(jnp.asarray(self.axes, dtype), -1, 0)
+        x, y = variance[..., 0], variance[..., 1]
+        zero, cross = jnp.zeros_like(x), cosine * sine * (x - y)
+        rows = (
+            (cosine**2 * x + sine**2 * y, cross, zero),
+            (cross, sine**2 * x + cosine**2 * y, zero),
+            (zero, zero, variance[..., 2]),
+        )
+        return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+    def along_axes(self, error: Float[jax.Array, "*b d"]) -> Float[jax.Array, "*b d"]:
+        """Errors of the first d axes (2 or 3), expressed in the axes of `log_std`."""
+        if self.axes is None:
+            return error
+        cosine, sine = jnp.moveaxis(jnp.asarray(self.axes), -1, 0)
+        x, y = error[..., 0], error[..., 1]
+        plane = jnp.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
+        return jnp.concatenate([plane, error[..., 2:]], axis=-1)
 
     def normalised(
         self, error: Float[jax.Array, "*b d"], least: float | None
     ) -> tuple[Float[jax.Array, "*b d"], Float[jax.Array, "*b d"]]:
-        """(e/σ)² of errors of the first d axes, m, and log σ, with the same covariance. Without its
-        constant, −log N(e) is Σ ½ (e/σ)² + log σ."""
+        """(e/σ)² of errors of the first d axes, m, along the axes of `log_std`, and log σ, with the
+        same covariance. Without its constant, −log N(e) is Σ ½ (e/σ)² + log σ."""
+        error = self.along_axes(error)
         log_std = jnp.asarray(self.log_std)[..., : error.shape[-1]]
         log_std = log_std if least is None else jnp.maximum(log_std, least)
         return error**2 * jnp.exp(-2 * log_std), log_std

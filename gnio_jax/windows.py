@@ -42,8 +42,9 @@ Starts = Int[np.ndarray, "m"]
 class AlignedRecording(NamedTuple):
     """A recording from which each window needs one rotation. float32, host or device arrays."""
 
-    imu: Float[Array, "t 6"]
-    """[accel m/s², gyro rad/s]: in the world for `per_sample`, in the body for `single`."""
+    imu: Float[Array, "t c"]
+    """[accel m/s², gyro rad/s]: in the body for `single`, else in the world; for `body_axes` with
+    the x and y axes of the body after them (12 channels)."""
     rotation: Float[Array, "m 3 3"]
     """Rotation from the frame of `imu` to the gravity-aligned frame of each window."""
 
@@ -79,15 +80,18 @@ def align_recording(
         start: (m,) samples whose yaw the windows remove: their first ones after the context.
         window_rotation: With "per_sample" every sample is rotated to the world by its own attitude,
             and a window needs only its start's yaw removed. With "single" the samples stay in the
-            body, and a window is rotated by its start's attitude without yaw.
+            body, and a window is rotated by its start's attitude without yaw. "body_axes" is
+            "per_sample" with the x and y axes of the body as six more channels.
     """
     signals = np.stack([accel, gyro], axis=2)
     rotation = remove_yaw(attitude[start])
-    if window_rotation == "per_sample":
-        signals = attitude @ signals
-    else:
+    if window_rotation == "single":
         rotation = rotation @ attitude[start]
-    imu = signals.transpose(0, 2, 1).reshape(-1, 6)
+    else:
+        signals = attitude @ signals
+    if window_rotation == "body_axes":
+        signals = np.concatenate([signals, attitude[:, :, :2]], axis=2)
+    imu = signals.transpose(0, 2, 1).reshape(len(signals), -1)
     return AlignedRecording(imu.astype(np.float32), rotation.astype(np.float32))
 
 
@@ -97,11 +101,11 @@ def window_rows(start: Int[Array, "b"], length: int) -> Int[Array, "b n"]:
 
 
 def cut_windows(
-    imu: Float[Array, "t 6"],
+    imu: Float[Array, "t c"],
     start: Int[Array, "b"],
     rotation: Float[Array, "b 3 3"],
     length: int,
-) -> Float[jax.Array, "b n 6"]:
+) -> Float[jax.Array, "b n c"]:
     """The windows of `length` samples that start at rows `start` of an aligned recording. Jittable.
 
     imu and rotation as in `AlignedRecording`, one rotation per window.
@@ -110,12 +114,12 @@ def cut_windows(
 
 
 def rotate_channels(
-    rotation: Float[jax.Array, "b 3 3"], imu: Float[jax.Array, "b n 6"]
-) -> Float[jax.Array, "b n 6"]:
-    """Rotate accel and gyro of every sample of each window."""
-    windows, length, _ = imu.shape
-    vectors = imu.reshape(windows, length, 2, 3)
-    return rotate_vectors(rotation, vectors).reshape(windows, length, 6)
+    rotation: Float[jax.Array, "b 3 3"], imu: Float[jax.Array, "b n c"]
+) -> Float[jax.Array, "b n c"]:
+    """Rotate accel and gyro of every sample of each window, and the body's axes if it has them."""
+    windows, length, channels = imu.shape
+    vectors = imu.reshape(windows, length, channels // 3, 3)
+    return rotate_vectors(rotation, vectors).reshape(windows, length, channels)
 
 
 def rotate_vectors(
@@ -146,10 +150,13 @@ class WindowCut(NamedTuple):
     """Whether the network sees the samples without the filter's biases."""
     propagating: slice
     """Slice of the window's bias-corrected rates that propagate attitude between its samples."""
+    body_axes: bool = False
+    """Whether the window has the x and y axes of the body as six more channels."""
 
 
 WINDOW_CUTS = {
     "per_sample": WindowCut(0, True, slice(-1)),
+    "body_axes": WindowCut(0, True, slice(-1), body_axes=True),
     # No rate is integrated: all samples have the attitude of the first.
     "single": WindowCut(0, True, slice(0)),
     # In TLIO's tracker a sample with stamp t drives the filter from t − dt to t, and its own rate
@@ -168,7 +175,7 @@ def cut_window(
     cut: WindowCut,
     dt: float,
     context: int = 0,
-) -> Float[jax.Array, "n 6"]:
+) -> Float[jax.Array, "n c"]:
     """A window of n raw samples in the gravity-aligned frame of its start. Jittable and
     differentiable.
 
@@ -187,7 +194,7 @@ def cut_window(
         context: Number of samples before the window's start.
 
     Returns:
-        (n, 6): [accel m/s², gyro rad/s].
+        (n, 6): [accel m/s², gyro rad/s], or (n, 12) with the body's x and y axes.
     """
     rates = gyro - gyro_bias[None]
     if cut.subtract_biases:
@@ -204,7 +211,9 @@ def cut_window(
     # filter.
     attitudes = jnp.broadcast_to(attitudes, (3, 3, len(gyro)))
     signals = geometry.matmul(attitudes, jnp.stack([accel.T, gyro.T], axis=1))
-    return signals.transpose(2, 1, 0).reshape(-1, 6)
+    if cut.body_axes:
+        signals = jnp.concatenate([signals, attitudes[:, :2]], axis=1)
+    return signals.transpose(2, 1, 0).reshape(len(gyro), -1)
 
 
 # The reference's displacement

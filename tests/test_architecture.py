@@ -47,6 +47,7 @@ LIBRARIES = {
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
     "safetensors": {"networks.folder"},
+    "sklearn": {"training.support_vectors"},
     "tensorboardX": {"training.run_folder"},
 }
 """Libraries that only these rooms or modules import."""

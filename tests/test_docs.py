@@ -36,7 +36,7 @@ SMALLER = {
     "docs/notebooks/learn_noise.py": {"SECONDS = 30": "SECONDS = 2", "STEPS = 150": "STEPS = 2"},
 }
 """Fewer samples and steps than on the page: page -> what stands there -> what runs."""
-HELP = {"--help", "--completion", "COMMAND"}
+HELP = {"--help", "-H", "--completion", "--version", "COMMAND"}
 """Words that leave with a text; COMMAND stands for any command."""
 NEW_FILES = {"gnio_jax/data/readers/mine.py", "tests/support/mine_files.py"}
 """What CONTRIBUTING asks a reader to write."""
@@ -119,12 +119,20 @@ def test_a_measurement_of_ones_own(capsys):
     try:
         run("docs/measurements.md", code_of("docs/measurements.md"))
     finally:
-        measurements._MEASUREMENTS.pop("nonholonomic", None)
+        measurements._MEASUREMENTS.pop("keel", None)
     without, constrained, accepted, heights = capsys.readouterr().out.splitlines()
     assert abs(float(without.split()[1])) > 0.5 and without.endswith("taken []")
     assert abs(float(constrained.split()[1])) < 0.1
-    assert constrained.endswith("taken ['nonholonomic']")
+    assert constrained.endswith("taken ['keel']")
     assert int(accepted.split()[1]) > 390 and heights == "heights 200"
+
+
+def test_a_car_and_the_other_sensors_of_a_phone(capsys):
+    run("docs/vehicles.md", code_of("docs/vehicles.md"))
+    mounting, *errors = capsys.readouterr().out.splitlines()
+    assert mounting.startswith("yaw 0.50 rad, ±0.0")
+    without, magnetometer = (abs(float(line.split()[-1].strip("°"))) for line in errors)
+    assert without > 40 and magnetometer < 10
 
 
 def test_weights_that_are_loaded(tmp_path, monkeypatch):
@@ -189,7 +197,7 @@ def test_the_imports_of_the_reference():
 def test_every_block_that_runs_has_a_test():
     tested = {"README.md", "docs/differentiable_filter.md", "docs/networks.md", "docs/weights.md"}
     tested |= {"docs/measurements.md", "docs/many_sequences.md", "docs/networks_with_memory.md"}
-    tested |= {"docs/api/index.md", "CONTRIBUTING.md"}
+    tested |= {"docs/api/index.md", "docs/vehicles.md", "CONTRIBUTING.md"}
     assert {block.page for block in RUN} == tested
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import data
+from gnio_jax import data, models
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -26,3 +26,13 @@ def test_the_walk_of_the_gradients_example_has_its_true_start_and_displacements(
     yaw = Rotation.from_euler("z", rotation[0:201:10].as_euler("ZYX")[:, :1])
     error = displacement[9:] - yaw.inv().apply(steps)
     assert np.abs(error).max() < 5 * 0.05 and 0.03 < error.std() < 0.07
+
+
+def test_the_network_of_its_own_is_that_of_the_page():
+    path = EXAMPLES / "deeper.py"
+    example = runpy.run_path(str(path))
+    assert models.names().count("deeper") == 1
+    assert isinstance(models.create("deeper", width=4), example["Deeper"])
+    page = (EXAMPLES.parent / "docs" / "networks.md").read_text(encoding="utf-8")
+    classes = path.read_text(encoding="utf-8").partition("class TwoLayers")[2]
+    assert classes.partition("models.register")[0] in page

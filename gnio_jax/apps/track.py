@@ -52,7 +52,7 @@ class Tracked(NamedTuple):
 def track(
     recording: Imported,
     trained: TrainedNetwork,
-    out: Path,
+    out: str | Path,
     formats: tuple[str, ...] = (),
     progress: Progress = silent,
     command: str = "",
@@ -76,7 +76,7 @@ def track(
         InputError: The results could not be written, or the recording is too short or has a hole
             that is too long.
     """
-    sequence, config = recording.sequence, trained.config
+    out, sequence, config = Path(out), recording.sequence, trained.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
     result, ready, ekf = estimate_recording(sequence, trained, progress)
@@ -179,8 +179,11 @@ def _draw(
     view = make_view(result, alignment=None)
     length = f"{summary.path_length:.1f} m in {summary.seconds:.0f} s"
     error = summary.expected_error
-    expected = "no walk" if np.isnan(error) else f"expected error at the end {error:.1f} m"
-    title = f"{shown_name(summary.recording)}: {length}, {expected}"
+    title = f"{shown_name(summary.recording)}: {length}"
+    if np.isnan(error):
+        title += f", {summary.warnings[0].partition(':')[0]}"
+    else:
+        title += f", expected error at the end {error:.1f} m"
     drawing.save(folder / "track.png", plots.sequence(view, title))
     aligned = "start position and yaw" if result.waypoints is None else tabulate.TO_WAYPOINTS
     share = np.isfinite(result.reference.position).all(axis=1).mean()

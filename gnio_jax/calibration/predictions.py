@@ -1,5 +1,5 @@
-"""The data of a calibration: recordings, and the displacements that a network predicts for them
-which was not trained on them."""
+"""The data of a calibration: recordings, and the displacements that a network predicts for them.
+The network was not trained on them."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def average_over_headings(network: TrainedNetwork, source: str) -> TrainedNetwor
     """Average a network over four headings (`models.equivariance.FourHeadings`), which has the same
     weights. Raises `InputError` naming `source` for a network that was not trained on every
     heading, or is equivariant in another way."""
-    if network.config.model.equivariance == "canonical_frame":
+    if network.config.model.equivariance not in ("none", "four_headings"):
         raise InputError(source, "its network has a canonical frame: there is nothing to average")
     averaged = dataclasses.replace(network.config.model, equivariance="four_headings")
     config = dataclasses.replace(network.config, model=averaged)

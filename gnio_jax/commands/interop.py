@@ -29,23 +29,26 @@ class InteropOptions:
 
 
 def interop(request: InteropOptions, _call: options.Call) -> None:
-    """Make a run from weights that were trained with TLIO's code, for gnio evaluate.
+    """Make a run from weights that were trained with the code of TLIO, RoNIN or EqNIO, for gnio
+    evaluate.
 
-    CHECKPOINT is a checkpoint of TLIO's training, its model_torchscript.pt, or an .npz of its state
-    dict; files of PyTorch need pip install 'gnio-jax[torch]'. The run's filter cuts the network's
-    windows as TLIO's tracker does (filter.window_rotation).
+    CHECKPOINT is a checkpoint of their training, TLIO's model_torchscript.pt, or an .npz of a state
+    dict; files of PyTorch need pip install 'gnio-jax[torch]'. RoNIN's is its ResNet-18, EqNIO's one
+    of its frames around TLIO or RoNIN. For weights of TLIO's kind the run's filter cuts windows as
+    TLIO's tracker does (filter.window_rotation).
 
     examples:
       {prog} checkpoint_best.pt runs/tlio_public
       {prog} model_torchscript.pt runs/tlio_public --stride-seconds 0.1
+      {prog} ronin_resnet/checkpoint_gsn_latest.pt runs/ronin_public --dataset ronin
       gnio evaluate --network runs/tlio_public --dataset tlio --data-root ~/tlio
     """
-    from gnio_jax import interop as tlio  # late: mistakes do not wait for JAX
+    from gnio_jax import interop as weights  # late: mistakes do not wait for JAX
 
     data = DataConfig(
         rate=request.rate,
         window_seconds=request.window_seconds,
         stride_seconds=request.stride_seconds,
     )
-    tlio.write_run(request.checkpoint, request.workdir, data, request.dataset)
+    weights.write_run(request.checkpoint, request.workdir, data, request.dataset)
     print(f"run: {request.workdir}; next: gnio evaluate --network {request.workdir}")

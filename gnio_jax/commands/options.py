@@ -247,8 +247,8 @@ def _parser(
         )
 
     names = dict.fromkeys(dest.partition(".")[0] for dest in options if dest in hidden)
-    more = f"{prog} -H explains {len(hidden)} more options of {', '.join(names)}.\n\n"
-    more = more if hidden else ""
+    more = f"{prog} -H explains {len(hidden)} more options of {', '.join(names)}."
+    more = f"{paragraphs(more)}\n\n" if hidden else ""
     parser = argparse.ArgumentParser(
         prog=prog,
         usage=" ".join([prog, *usage, "[OPTIONS]"]),
@@ -349,7 +349,8 @@ def _overview(group: Group, prog: str) -> str:
     for name, command in group.commands.items():
         is_group = isinstance(command, Group)
         text = command.help if is_group else inspect.getdoc(function(command)) or ""
-        lines.append(f"  {name:<11}{text.partition(chr(10))[0]}")
+        indents = {"initial_indent": f"  {name:<11}", "subsequent_indent": " " * 13}
+        lines.append(textwrap.fill(text.partition("\n")[0], WIDTH, **indents))
     return "\n".join(
         [
             f"{description}\nusage: {prog} COMMAND [OPTIONS]\n",

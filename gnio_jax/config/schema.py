@@ -93,12 +93,13 @@ class Entries(Mapping[str, Any]):
 ABOVE_ZERO = Bound(lambda value: 0 < value < math.inf, "must be positive and finite")
 NOT_NEGATIVE = Bound(lambda value: 0 <= value < math.inf, "must be finite and not negative")
 FACTOR = Bound(lambda value: 1e-6 <= value <= 1e6, "must be from 1e-6 to 1e6")
+FINITE = Bound(math.isfinite, "must be finite")
 SHARE = Bound(lambda value: 0 <= value < 1, "must be at least 0 and below 1")
 PACE = Bound(lambda value: 0.1 <= value <= 10, "must be from 0.1 to 10")
 
 Positive = Annotated[float, ABOVE_ZERO]
 NonNegative = Annotated[float, NOT_NEGATIVE]
-Finite = Annotated[float, Bound(math.isfinite, "must be finite")]
+Finite = Annotated[float, FINITE]
 Probability = Annotated[float, SHARE]
 Width = Annotated[int, Bound(lambda value: 1 <= value <= 4096, "must be from 1 to 4096")]
 Share = Annotated[float, Bound(lambda value: 0 <= value <= 1, "must be from 0 to 1")]
@@ -134,9 +135,10 @@ class DataConfig:
     train_stride_seconds: Positive = 0.1
     """Distance between window starts in training, s (paper: 0.1 s). With a shorter distance the
     network sees the same steps at more phases."""
-    window_rotation: Literal["per_sample", "single"] = "per_sample"
+    window_rotation: Literal["per_sample", "single", "body_axes"] = "per_sample"
     """Rotate each sample with its own attitude, or the whole window with the attitude at its start
-    (eq. 1 read literally)."""
+    (eq. 1 read literally). body_axes is per_sample with the x and y axes of the body as six more
+    channels, for networks that see the body (airio, and a corrector)."""
     train_split: str = "train"
     """Split of the dataset for training. train-0of4 leaves out the first of four folds of it, in
     which people and sessions are whole: with a network for each fold, gnio calibrate has walks that
@@ -234,8 +236,8 @@ class AugmentConfig:
     walkway: Annotated[tuple[Factor, Factor], FILE_ONLY] = (0.45, 2.0)
     """Smallest and largest factor of the mean speed on a walkway."""
     alternating_gain: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
-    """Smallest and largest factor of what is not slow in position and acceleration, for segments
-    (ours)."""
+    """Smallest and largest factor of the fast part of position and acceleration, for segments: of
+    the gait without the mean motion (ours)."""
     time_stretch: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
     """Smallest and largest factor of the pace at which a segment is played (ours)."""
 
@@ -266,9 +268,14 @@ class ModelConfig:
     bank_std: Positive | None = None
     """Standard deviation of the prototypes before training (gnio: 1). Near 1/√d, for d features,
     all prototypes receive the same attention."""
-    head: Literal["gated", "linear"] | None = None
+    head: Literal["gated", "linear", "bins"] | None = None
     """Displacement as scale × gate, or a plain linear layer (gnio: gated, networks with memory:
-    linear)."""
+    linear), or a distribution over bins with its own uncertainty (gnio, trunk; VeloBins)."""
+    reach: Positive | None = None
+    """Largest displacement of the bins, m (3). Take 1.1 times the largest of the training
+    windows."""
+    block: Literal["star", "rep", "fourier", "wavelet"] | None = None
+    """Kind of block of the network trunk (star)."""
     gate: Literal["tanh", "sigmoid"] | None = None
     """Activation of the gate (gnio: tanh)."""
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] | None = None
@@ -279,11 +286,17 @@ class ModelConfig:
     (gnio: head)."""
     output_dim: Literal[2, 3] | None = None
     """Dimensions of the displacement: 3, or 2 without the vertical, as published (ronin_resnet,
-    deepils, ctin, imot)."""
-    equivariance: Literal["none", "four_headings", "canonical_frame"] = "none"
+    deepils, ctin, imot, ionext)."""
+    equivariance: Literal[
+        "none", "four_headings", "canonical_frame", "o2_frame", "so2_frame", "so2_frame_shallow"
+    ] = "none"
     """How a network is made equivariant, so that its displacement turns with a window that is
     turned about the vertical. four_headings is the mean over four headings of the window, at
-    inference; canonical_frame uses a frame that a small network finds in the window (EqNIO)."""
+    inference; canonical_frame uses a frame that a small network finds in the window. The others
+    are EqNIO's networks for the frame: with reflections (o2_frame), without them (so2_frame: around
+    TLIO, so2_frame_shallow: around RoNIN)."""
+    corrector: Literal["none", "airimu"] = "none"
+    """A network that corrects the samples before any other sees them (AirIMU)."""
     options: Annotated[Mapping[str, float | int | bool | str | None], FILE_ONLY] = field(
         default_factory=Entries
     )
@@ -299,10 +312,15 @@ class ModelConfig:
 class LossConfig:
     """The training loss (paper §III-F), and the extra terms of the other networks."""
 
-    name: Literal["weighted_sum", "velocity_and_covariance"] = "weighted_sum"
+    name: Literal["weighted_sum", "velocity_and_covariance", "polar", "body_velocity", "bins"] = (
+        "weighted_sum"
+    )
     """Weighted sum of squared error, absolute error and negative log-likelihood of the
     displacement, with the weights below; or CTIN's loss, which has errors of velocity and position
-    and the likelihood of each sample's velocity, weighted by two trainable parameters."""
+    and the likelihood of each sample's velocity, weighted by two trainable parameters; or IONet's
+    (polar), the squared errors of length and angle; or AirIO's (body_velocity), Huber's loss and
+    the likelihood of the velocities in the body; or VeloBins' (bins), Huber's loss of the mean and
+    the divergence of the distribution from one about the truth."""
     mse_weight: NonNegative = 1e2
     """λ_MSE."""
     mae_weight: NonNegative = 0.0
@@ -317,6 +335,16 @@ class LossConfig:
     alone (TLIO: 10)."""
     log_std_floor: Finite | None = None
     """Smallest log standard deviation in the likelihood (TLIO: log 1e-3); none by default."""
+    angle_weight: Annotated[NonNegative, FILE_ONLY] = 1.0
+    """Weight of the squared angle, m²/rad², in the loss polar (IONet's κ, which is not
+    published)."""
+    rotation_weight: Annotated[NonNegative, FILE_ONLY] = 0.0
+    """Weight of the rotation consistency (RIO: 1): the negative cosine between the prediction,
+    turned by a random angle, and the prediction for the window turned by it."""
+    balance_weight: Annotated[NonNegative, FILE_ONLY] = 0.01
+    """Weight of the balance between experts, for networks with a router (ours)."""
+    preintegration_weight: Annotated[NonNegative, FILE_ONLY] = 0.0
+    """Weight of the preintegration loss of a corrector (AirIMU: 1, and 0 for the other weights)."""
     outlier_sigmas: Annotated[Positive | None, FILE_ONLY] = None
     """Standard deviations beyond which the likelihood of an error grows only with its logarithm
     (ours, e.g. 10); none by default, as in the paper."""
@@ -465,7 +493,7 @@ class FilterOptions:
     rest_accel: NonNegative = 0.3
     """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
     rest_seconds: NonNegative = 0.5
-    """How long the IMU is quiet before it rests, s."""
+    """How long the IMU must be quiet before it counts as at rest, s."""
     bridge_seconds: NonNegative = 0.1
     """For this long, s, the last IMU sample stands in for missing ones; then the filter coasts with
     constant attitude and velocity, and windows are no measurements."""
@@ -500,7 +528,7 @@ class FilterSettings(FilterOptions):
     after the displacement of a clone interval, in this order. zero_velocity: {std: 0.02} measures a
     velocity of zero with a standard deviation of 0.02 m/s while the IMU rests. `null` takes one
     away. Others are those that a plugin registers (ours)."""
-    window_rotation: Literal["per_sample", "single", "tlio"] | None = None
+    window_rotation: Literal["per_sample", "single", "body_axes", "tlio"] | None = None
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
     for weights trained that way."""
@@ -516,7 +544,7 @@ class FilterSettings(FilterOptions):
 
 
 SHORTEST_HORIZON = 1.0
-"""Times of the relative errors in the losses through the filter, s."""
+"""Shortest time over which the losses through the filter compare displacements, s."""
 Part = Literal["noise", "measurement", "start", "uncertainty", "head", "encoder", "all"]
 """A part of network and filter that can be trained."""
 
@@ -621,9 +649,13 @@ class TrainConfig:
         if weights and len(weights) != len(names):
             problem = f"has {len(weights)} values for {len(names)} datasets"
             location.child("data.weights").refuse(problem, "give one for each, or none")
-        if self.data.context and self.model.name == "ctin":
+        if self.data.context and self.model.name in ("ctin", "airio"):
             remedy = "it predicts every sample it sees: set it to 0"
-            location.child("data.context_seconds").refuse("is not for ctin", remedy)
+            location.child("data.context_seconds").refuse(f"is not for {self.model.name}", remedy)
+        in_body = self.model.name == "airio" or self.model.corrector != "none"
+        if in_body and self.data.window_rotation != "body_axes":
+            problem = "must be body_axes for airio and for a corrector, which see the body"
+            location.child("data.window_rotation").refuse(problem)
         if self.model.equivariance == "four_headings" and not self.augment.yaw:
             problem = "is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"

@@ -47,8 +47,8 @@ QUIET_ACCEL, QUIET_GYRO = 0.15, 0.04
 the IMU is quieter than in a hand (ours): it lies, or rides smoothly."""
 NO_WALK = 0.15
 """A recording whose seconds within a walk are fewer than this share is none (ours). Cars and
-trolleys have 0, drones up to 8 %. Walks at 0.6 m/s or more have 80 to 100 %, for every way of
-carrying. Of Tyrex's, at 0.3 to 0.6 m/s in a small room, a few while texting are below it."""
+trolleys have 0, drones up to 8 %. Walks have 82 to 100 % in a hand, in pockets and swinging. Of 23
+slow ones while texting or at the ear, in Tyrex's small room, three are below it."""
 
 
 class Gait(NamedTuple):

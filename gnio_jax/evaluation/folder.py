@@ -110,13 +110,13 @@ def arrays(estimate: SequenceEstimate) -> dict[str, Float[np.ndarray, "n ..."]]:
 # --- read back
 
 
-def read(folder: Path) -> Report:
+def read(folder: str | Path) -> Report:
     """The figures of an evaluation from its metrics.json.
 
     Raises `InputError` if the folder has none, if they are damaged, or if they were written by a
     version whose figures mean something else.
     """
-    path = folder / "metrics.json"
+    path = Path(folder) / "metrics.json"
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["settings"].get("definitions") != DEFINITIONS:

@@ -20,7 +20,7 @@ from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import align_recording, cut_windows, window_starts, without_any
 
 WINDOWS_PER_CALL = 512
-DIAGNOSTICS = ("gate", "scale")
+DIAGNOSTICS = ("gate", "scale", "body_velocity", "body_velocity_log_std")
 """Diagnostics of the network that are stored for every window. Attention is too large."""
 
 
@@ -122,7 +122,7 @@ def infer(
 @functools.partial(jax.jit, static_argnames=("apply", "length", "diagnostics"))
 def _predict(
     variables: Any,
-    samples: Float[Array, "t 6"],
+    samples: Float[Array, "t c"],
     start: Array,
     turn: Float[Array, "b 3 3"],
     *,

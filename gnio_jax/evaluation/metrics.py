@@ -38,6 +38,8 @@ LEAST_PATH = 1.0
 """Length of the reference below which `drift` and `path_length_ratio` are undefined, m."""
 LEAST_LEG = 1.0
 """Length of a leg below which the ratio of lengths is not meaningful, m."""
+KITTI_LENGTHS = tuple(range(100, 900, 100))
+"""Lengths of the pieces of `t_rel` and `r_rel`, m."""
 LEAST_SECONDS = 10.0
 """Time below which `yaw_drift` is undefined, s."""
 
@@ -283,6 +285,59 @@ def _oriented(reference: Quaternions) -> Int[np.ndarray, "m"]:
     return rows
 
 
+# --- KITTI's errors of pieces of a path
+
+
+def t_rel(estimate: Trajectory, reference: Trajectory, step: float) -> float:
+    """Relative error of translation, % of the length: the mean over the pieces of 100, 200, … 800 m
+    of the reference that begin at its rows one second apart (KITTI's odometry benchmark, Geiger et
+    al. 2012). The whole attitude is aligned at the start of a piece (`piece_errors`)."""
+    return float(100 * np.mean(piece_errors(estimate, reference, step)[:, 0]))
+
+
+def r_rel(estimate: Trajectory, reference: Trajectory, step: float) -> float:
+    """Relative error of rotation over the pieces of `t_rel`, degrees per metre."""
+    return float(np.degrees(np.mean(piece_errors(estimate, reference, step)[:, 1])))
+
+
+def piece_errors(
+    estimate: Trajectory, reference: Trajectory, step: float
+) -> Float[np.ndarray, "m 2"]:
+    """Errors of translation (m) and rotation (rad) over pieces, divided by their length.
+
+    A piece of ℓ metres begins at row i and ends at the first row j by which the reference has moved
+    further than ℓ, summed from row to row within an unbroken stretch. Its error is the motion
+    (T_i⁻¹ T_j of the estimate)⁻¹ (T_i⁻¹ T_j of the reference). Raises `Undefined` where no unbroken
+    stretch is longer than 100 m.
+    """
+    i, j, length = pieces(reference, step)
+    if not len(i):
+        raise Undefined(f"no unbroken reference of {KITTI_LENGTHS[0]} m")
+    turns, moves = [], []
+    for path in (estimate, reference):
+        back = np.swapaxes(matrix_from_quaternion(path.orientation[i]), 1, 2)
+        turns.append(back @ matrix_from_quaternion(path.orientation[j]))
+        moves.append(np.einsum("nij,nj->ni", back, path.position[j] - path.position[i]))
+    cosine = 0.5 * (np.einsum("nij,nij->n", *turns) - 1)
+    turned = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return np.stack([np.linalg.norm(moves[1] - moves[0], axis=1), turned], axis=1) / length[:, None]
+
+
+def pieces(reference: Trajectory, step: float) -> Int[np.ndarray, "3 m"]:
+    """First row, last row and nominal length (m) of the pieces of `piece_errors`."""
+    every, parts = max(1, round(1.0 / step)), [np.zeros((3, 0), int)]
+    trusted = finite_rows(reference.position) & finite_rows(reference.orientation)
+    for start, stop in spans(trusted):
+        sides = np.linalg.norm(np.diff(reference.position[start:stop], axis=0), axis=1)
+        distance = np.concatenate([[0.0], np.cumsum(sides)])
+        begins = np.arange(0, stop - start, every)
+        for length in KITTI_LENGTHS:
+            end = np.searchsorted(distance, distance[begins] + length, side="right")
+            rows = np.stack([begins + start, end + start, np.full(len(end), length)])
+            parts.append(rows[:, end < stop - start])
+    return np.concatenate(parts, axis=1)
+
+
 # --- consistency of the filter
 
 
@@ -421,6 +476,11 @@ OTHERS: dict[str, Metric] = {
     "yaw_rmse": lambda c: yaw_rmse(c.aligned.orientation, c.reference.orientation),
     "yaw_drift": lambda c: yaw_drift(c.raw.orientation, c.reference.orientation, c.step),
 }
+OF_PIECES: dict[str, Metric] = {
+    "t_rel": lambda c: t_rel(c.raw, c.reference, c.step),
+    "r_rel": lambda c: r_rel(c.raw, c.reference, c.step),
+}
+"""Metrics of a reference with an unbroken stretch of more than 100 m."""
 OF_FILTER: dict[str, Metric] = {
     "nis": lambda c: mean_normalised(c.filter_results().nis, 3),
     "nis_coverage": lambda c: coverage(c.filter_results().nis, 3),
@@ -441,6 +501,7 @@ OF_WAYPOINTS: dict[str, Metric] = {
 NAMES = (
     *(name + tag for tag in ("", "_2d") for name in SPATIAL | NEES),
     *OTHERS,
+    *OF_PIECES,
     *OF_FILTER,
     *OF_WAYPOINTS,
 )
@@ -542,7 +603,9 @@ def _metrics(inputs: MetricInputs) -> Iterator[tuple[str, Metric, MetricInputs]]
     nees, filter_metrics = ({}, {}) if inputs.filtered is None else (NEES, OF_FILTER)
     if inputs.waypoints is None:
         spatial = SPATIAL | nees
-        groups = [(3, "", PATH | spatial), (2, "_2d", spatial), (3, "", OTHERS | filter_metrics)]
+        of_pieces = OF_PIECES if pieces(inputs.reference, inputs.step).size else {}
+        others = OTHERS | of_pieces | filter_metrics
+        groups = [(3, "", PATH | spatial), (2, "_2d", spatial), (3, "", others)]
     else:
         groups = [(3, "", LEGS | OF_WAYPOINTS | filter_metrics)]
     for dims, tag, metrics in groups:

@@ -46,6 +46,8 @@ COLUMNS = {
     "rte_60s": Column("RTE 60 s", "m"),
     "rpe_1s": Column("RPE 1 s", "m", 3),
     "yaw_rmse": Column("yaw", "°", 1),
+    "t_rel": Column("t_rel", "%"),
+    "r_rel": Column("r_rel", "°/m", 5),
     "path_length_ratio": Column("path ratio", best=1.0),
     "stationary_drift": Column("standing", "m/min", 1),
     "nees": Column("NEES/3", best=1.0),

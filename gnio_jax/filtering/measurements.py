@@ -1,8 +1,7 @@
 """The measurements by name: those that a file may list in `filter.measurements`.
 
 A measurement of your own is a NamedTuple of numbers with a `name` and a method `update` (see
-`update.Measurement`). `register` makes it known. docs/differentiable_filter.md has
-an example.
+`update.Measurement`). `register` makes it known. docs/measurements.md has an example.
 """
 
 from __future__ import annotations
@@ -16,10 +15,14 @@ from gnio_jax import plugins
 from gnio_jax.config.files import check_value
 from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError, did_you_mean
+from gnio_jax.filtering.nonholonomic import NonHolonomic
 from gnio_jax.filtering.update import Measurement
+from gnio_jax.filtering.velocity import BodyVelocity
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
 
-_MEASUREMENTS: dict[str, type] = {ZeroVelocity.name: ZeroVelocity}
+_MEASUREMENTS: dict[str, type] = {
+    kind.name: kind for kind in (ZeroVelocity, BodyVelocity, NonHolonomic)
+}
 _PUBLISHED = frozenset({*_MEASUREMENTS, "displacement"})
 """Names of the measurements of this package; a registered one must have another name."""
 

@@ -73,8 +73,7 @@ def has_memory(predict: Predict | PredictWithMemory) -> TypeGuard[PredictWithMem
 
 def first_memory(predict: PredictWithMemory, ekf: Filter, state: FilterState) -> Memory:
     """The memory at the start of a run: that of the state, or an empty one. Raises `ValueError` if
-    the state has the memory of another network, and for windows that a network with memory has
-    not."""
+    the state has the memory of another network, or if `window_rotation` is not "per_sample"."""
     if ekf.config.window_rotation != "per_sample":
         problem = "a network with memory rotates every sample with its own attitude"
         raise ValueError(f"ekf.config.window_rotation: {problem}: it must be 'per_sample'")
@@ -129,10 +128,14 @@ def recalled_displacement(
     dtype = state.offset.dtype
     to_world = geometry.heading_rotation(*recall.heading.astype(dtype))
     turn = geometry.matmul(geometry.yaw_rotation(state.clone_rotation[oldest]).T, to_world)
-    covariance = recall.prediction.covariance(ekf.config.log_std_min, dtype)
-    covariance = geometry.matmul(geometry.matmul(turn, covariance), turn.T)
     displacement = recall.prediction.displacement.astype(dtype)
-    turned = geometry.matmul(turn, displacement[:, None])[:, 0]
+    covariance = recall.prediction.covariance(ekf.config.log_std_min, dtype)
+    # No NaN may enter the products, because otherwise the derivatives would be NaN too.
+    finite = jnp.isfinite(displacement).all() & jnp.isfinite(covariance).all()
+    turned = geometry.matmul(turn, jnp.where(finite, displacement, 0.0)[:, None])[:, 0]
+    turned = jnp.where(finite, turned, jnp.nan)
+    covariance = jnp.where(finite, covariance, jnp.eye(3, dtype=dtype))
+    covariance = geometry.matmul(geometry.matmul(turn, covariance), turn.T)
     symmetric = 0.5 * (covariance + covariance.T)
     measured = scaled_displacement(turned, symmetric, ekf.noise, ekf.config.displacement_frame)
     return measured, recall.prediction.diagnostics
@@ -152,13 +155,19 @@ def network_measurement(
     """
 
     config = ekf.config
+    needs = {name: other for other in ekf.measurements for name in getattr(other, "needs", ())}
+    shape = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
 
-    def predict_one(window: Float[Array, "1 n 6"]) -> Prediction:
+    def predict_one(window: Float[Array, "1 n c"]) -> Prediction:
         prediction = predict(window)
         _check(prediction)
         return jax.tree.map(lambda leaf: _make_floating(leaf[0]), prediction)
 
-    shapes = jax.eval_shape(predict_one, jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32))
+    shapes = jax.eval_shape(predict_one, shape)
+    for name, other in needs.items():
+        if name not in shapes.diagnostics:
+            problem = f"needs the diagnostics '{name}', which this network does not give"
+            raise ValueError(f"filter.measurements: '{other.name}' {problem}")
 
     def predict_nothing() -> Prediction:
         return jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
@@ -173,8 +182,12 @@ def network_measurement(
             gyro, accel, gap = latest()
             prediction = predict_one(network_window(state, oldest, gyro, accel, config))
             whole = gap is None or jnp.all(gap.used > 0)
+            says = prediction.diagnostics
+            measured = {name: jnp.where(whole, says[name], jnp.nan) for name in needs}
+            if needs:  # they are measured in its place
+                whole = jnp.bool_(False)
             displacement = jnp.where(whole, prediction.displacement, jnp.nan)
-            return prediction._replace(displacement=displacement)
+            return prediction._replace(displacement=displacement, diagnostics=says | measured)
 
         prediction = jax.lax.cond(has_window, infer, predict_nothing)
         dtype, frame = state.offset.dtype, config.displacement_frame
@@ -191,10 +204,14 @@ def _check(prediction: Any) -> None:
     if not isinstance(prediction, Prediction):
         kind = type(prediction).__name__
         raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")
-    for name, value in {**prediction._asdict(), **prediction.diagnostics}.items():
-        if name in ("displacement", "log_std") and value.shape != (1, 3):
-            raise ValueError(f"predict: {name} must be (1, 3) for one window, found {value.shape}")
-        if name in prediction.diagnostics and value.shape[:1] != (1,):
+    axes = () if prediction.axes is None else (("axes", prediction.axes, 2),)
+    vectors = ("displacement", prediction.displacement, 3), ("log_std", prediction.log_std, 3)
+    for name, value, size in (*vectors, *axes):
+        if value.shape != (1, size):
+            shapes = f"must be (1, {size}) for one window, found {value.shape}"
+            raise ValueError(f"predict: {name} {shapes}")
+    for name, value in prediction.diagnostics.items():
+        if value.shape[:1] != (1,):
             problem = f"must have a leading axis of one window, found {value.shape}"
             raise ValueError(f"predict: diagnostics['{name}'] {problem}")
 
@@ -205,7 +222,7 @@ def network_window(
     gyro: Float[Array, "r 3"],
     accel: Float[Array, "r 3"],
     config: FilterConfig,
-) -> Float[Array, "1 n 6"]:
+) -> Float[Array, "1 n c"]:
     """The network's window from the clone in slot `oldest` to the present, float32.
 
     gyro and accel are the last `config.reach` raw samples.

@@ -61,10 +61,11 @@ class FilterConfig(FilterOptions):
     """IMU samples C before a measurement's window that the network sees too (ours)."""
     history: Literal["diagonal", "core"] = "diagonal"
     """Keep the diagonal of the core covariance at every interval, or the whole 15×15 block too."""
-    window_rotation: Literal["per_sample", "single", "tlio"] = "per_sample"
-    """Rotate each sample of the network's window with its own attitude, or all with that of the
-    start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
-    earlier, and without subtracting the biases."""
+    window_rotation: Literal["per_sample", "single", "body_axes", "tlio"] = "per_sample"
+    """How the network's window is rotated. per_sample: each sample with its own attitude. single:
+    all with that of the start (paper eq. 1 read literally). body_axes: as per_sample, with the x
+    and y axes of the body as six more channels. tlio: the window is cut and rotated as in TLIO's
+    tracker, one sample earlier and without subtracting the biases."""
     gate_softness: NonNegative = 0.0
     """0 accepts or rejects; above 0 the gate has a slope, for training: a measurement's information
     is weighted by the logistic function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
@@ -100,6 +101,11 @@ class FilterConfig(FilterOptions):
     def seen(self) -> int:
         """IMU samples C + N that the network sees: the context and the window."""
         return self.context_samples + self.window
+
+    @property
+    def channels(self) -> int:
+        """Channels of a window."""
+        return 12 if self.cut.body_axes else 6
 
     @property
     def first_measured(self) -> int:
@@ -142,7 +148,8 @@ class FilterConfig(FilterOptions):
         return self.error == "invariant" or (self.error is None and self.window_rotation != "tlio")
 
     def whole_samples(self, seconds: float) -> int:
-        """t·dt > seconds ⇔ t > this number, independently of the rounding of seconds / dt."""
+        """Largest number t of samples with t·dt ≤ seconds, independently of the rounding of
+        seconds / dt."""
         return int(np.floor(seconds / self.dt + 1e-6))
 
 

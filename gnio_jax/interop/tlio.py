@@ -1,4 +1,4 @@
-"""TLIO's weights for the model `tlio`, and a run made of them for `gnio evaluate`.
+"""TLIO's weights for the model `tlio`.
 
 PyTorch is needed for its own files alone (`pip install gnio-jax[torch]`); a mapping of arrays or an
 .npz needs nothing.
@@ -6,7 +6,6 @@ PyTorch is needed for its own files alone (`pip install gnio-jax[torch]`); a map
 
 from __future__ import annotations
 
-import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,19 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gnio_jax import config as configuration
 from gnio_jax import models
-from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.files import replacing_folder
-from gnio_jax.networks import TrainedNetwork, write_network
 
-_CHANNELS = np.array([3, 4, 5, 0, 1, 2])
+CHANNELS = np.array([3, 4, 5, 0, 1, 2])
 """Index of each of our channels, [accel, gyro], among TLIO's, [gyro, accel]."""
 _STEM = "input_block.0.weight"
 _FLATTENED = "output_block1.fc1.weight"
 _PREP_CHANNELS = 128
-_PARTS = {
+PARTS = {
     "encoder": "",
     "displacement": "output_block1.",
     "log_std": "output_block2.",
@@ -60,17 +55,10 @@ def load_tlio_state_dict(mapping_or_path: Mapping[str, Any] | str | Path) -> Any
     [accel, gyro]. Raises `InputError` naming the file and the key that is missing, unexpected, of
     another shape or not finite.
     """
-    where, weights = _open(mapping_or_path)
-    weights = weights.get("model_state_dict", weights)
-    if not isinstance(weights, Mapping):
-        raise InputError(where, "its model_state_dict is not a mapping of arrays", _REMEDY)
-    weights = {str(key).removeprefix("module."): value for key, value in weights.items()}
-    weights = {
-        key: value for key, value in weights.items() if not key.endswith("num_batches_tracked")
-    }
+    where, weights = open_weights(mapping_or_path)
     template = _template(where, weights)
     expected = {
-        "".join(_PARTS.get(step.key, f"{step.key}.") for step in path[1:]): leaf
+        "".join(PARTS.get(step.key, f"{step.key}.") for step in path[1:]): leaf
         for path, leaf in jax.tree_util.tree_leaves_with_path(template)
     }
     odd = {
@@ -82,9 +70,9 @@ def load_tlio_state_dict(mapping_or_path: Mapping[str, Any] | str | Path) -> Any
             more = f" (and {len(keys) - 1} more)" if len(keys) > 1 else ""
             raise InputError(where, f"'{min(keys)}' is {problem}{more}", _REMEDY)
     arrays = {
-        key: _transpose(where, key, weights[key], leaf.shape) for key, leaf in expected.items()
+        key: checked_array(where, key, weights[key], leaf.shape) for key, leaf in expected.items()
     }
-    arrays[_STEM] = arrays[_STEM][:, _CHANNELS]
+    arrays[_STEM] = arrays[_STEM][:, CHANNELS]
     leaves = [jnp.asarray(arrays[key], jnp.float32) for key in expected]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
@@ -102,7 +90,7 @@ def _template(where: str, weights: Mapping[str, Any]) -> Any:
     return models.variable_shapes(models.create("tlio"), 32 * (shape[1] // _PREP_CHANNELS))
 
 
-def _transpose(where: str, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def checked_array(where: str, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """The array with PyTorch's (out, in, size) turned to our `shape`, (size, in, out)."""
     array = np.asarray(value.detach().cpu().float() if hasattr(value, "detach") else value)
     if array.shape != (torch_shape := shape[::-1]):
@@ -113,6 +101,16 @@ def _transpose(where: str, key: str, value: Any, shape: tuple[int, ...]) -> np.n
         problem = f"'{key}' holds values that are not finite numbers"
         raise InputError(where, problem, "the weights are damaged")
     return array.T
+
+
+def open_weights(source: Mapping[str, Any] | str | Path) -> tuple[str, dict[str, Any]]:
+    """The name of the weights in messages, and the state dict, without counts of batches."""
+    where, weights = _open(source)
+    weights = weights.get("model_state_dict", weights)
+    if not isinstance(weights, Mapping):
+        raise InputError(where, "its model_state_dict is not a mapping of arrays", _REMEDY)
+    weights = {str(key).removeprefix("module."): value for key, value in weights.items()}
+    return where, {k: v for k, v in weights.items() if not k.endswith("num_batches_tracked")}
 
 
 def _open(source: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, Any]]:
@@ -149,26 +147,3 @@ def _torch(path: Path) -> Any:
         if script:
             return torch.jit.load(path, map_location="cpu").state_dict()
     return torch.load(path, map_location="cpu", weights_only=True)
-
-
-def write_run(weights: Path, workdir: Path, data: DataConfig, dataset: str = "tlio") -> None:
-    """Make a run of TLIO's weights that all commands read: config.yaml and weights.safetensors.
-    The folder appears whole or not at all.
-
-    `data` gives rate, window and stride that the network was trained with. Raises `InputError` for
-    weights that do not fit them, or a folder that is there already.
-    """
-    model, settings = ModelConfig(name="tlio"), FilterSettings(window_rotation="tlio")
-    config = TrainConfig(dataset=dataset, data=data, model=model, filter=settings)
-    configuration.validate(config, "gnio interop")
-    if workdir.exists():
-        raise InputError(workdir, "is there already", "name another folder")
-    variables = load_tlio_state_dict(weights)
-    features = variables["params"]["displacement"]["fc1"]["kernel"].shape[0] // _PREP_CHANNELS
-    if features != math.ceil(data.window / 32):  # all that weights show of their window's length
-        samples = f"{32 * features - 31} to {32 * features} samples"
-        remedy = "give the --rate and --window-seconds that it was trained with"
-        raise InputError(weights, f"is for windows of {samples}, not {data.window}", remedy)
-    network = TrainedNetwork(config, models.create("tlio"), variables, epoch=0, step=0)
-    with replacing_folder(workdir) as new:
-        write_network(new, network)

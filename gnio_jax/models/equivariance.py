@@ -16,7 +16,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from gnio_jax.geometry import direction
-from gnio_jax.models.heads import root_mean_square
+from gnio_jax.models.heads import root_mean_square, to_axes
 from gnio_jax.models.layers import checked_windows, conv_norm, linear
 from gnio_jax.types import GRAVITY, Prediction
 
@@ -74,7 +74,7 @@ class FourHeadings(Equivariant):
             diagnostics["velocity_log_std"] = jax.vmap(root_mean_square)(log_stds)
         return Prediction(
             by_heading(turned_back.displacement).mean(axis=-2),
-            root_mean_square(by_heading(turned_back.log_std)),
+            root_mean_square(by_heading(turn_log_std(prediction.log_std, opposite(heading)))),
             diagnostics,
         )
 
@@ -84,8 +84,8 @@ class CanonicalFrame(Equivariant):
     back (EqNIO: Jayanth et al., "EqNIO: Subequivariant Neural Inertial Odometry", 2024; its SO(2)
     part, details ours). Exact for every angle.
 
-    The network's variances are along the axes of the frame. Turned back they are a covariance, of
-    which the diagonal is returned. Diagnostics are expressed in the frame, except CTIN's
+    The network's variances are along the axes of the frame (`Prediction.axes`), so the covariance
+    is full in the plane. Diagnostics are expressed in the frame, except CTIN's
     velocities, which its loss needs: they are turned back.
     """
 
@@ -139,7 +139,7 @@ def invariants(windows: Float[Array, "b n 6"]) -> Float[Array, "b n 6"]:
     return jnp.stack(values, axis=-1)
 
 
-def length(vectors: Float[Array, "*k 2"]) -> Float[Array, "*k"]:
+def length(vectors: Float[Array, "*k d"]) -> Float[Array, "*k"]:
     """Lengths, with zero derivative at 0."""
     squared = jnp.sum(vectors**2, axis=-1)
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
@@ -151,8 +151,8 @@ def quarter_turn(vectors: Float[Array, "*k 2"]) -> Float[Array, "*k 2"]:
 
 
 def opposite(heading: Float[Array, "b 2"]) -> Float[Array, "b 2"]:
-    """The headings of the opposite angles."""
-    return heading * jnp.float32([[1, -1]])
+    """The headings of the same angles with the opposite sign."""
+    return heading * jnp.array([[1, -1]], heading.dtype)
 
 
 def turn(vectors: Float[Array, "b *n 3"], heading: Float[Array, "b 2"]) -> Float[Array, "b *n 3"]:
@@ -163,11 +163,11 @@ def turn(vectors: Float[Array, "b *n 3"], heading: Float[Array, "b 2"]) -> Float
 
 
 def turn_windows(
-    windows: Float[Array, "b n 6"], heading: Float[Array, "b 2"]
-) -> Float[Array, "b n 6"]:
-    """Windows turned about z: acceleration and angular rate are both vectors."""
-    batch, samples, _ = windows.shape
-    return turn(windows.reshape(batch, samples, 2, 3), heading).reshape(windows.shape)
+    windows: Float[Array, "b n c"], heading: Float[Array, "b 2"]
+) -> Float[Array, "b n c"]:
+    """Windows turned about z: acceleration, angular rate and axes of the body are all vectors."""
+    batch, samples, channels = windows.shape
+    return turn(windows.reshape(batch, samples, channels // 3, 3), heading).reshape(windows.shape)
 
 
 def turn_log_std(
@@ -190,21 +190,33 @@ def turn_log_std(
 
 
 def turn_prediction(prediction: Prediction, heading: Float[Array, "b 2"]) -> Prediction:
-    """The prediction turned about z, with the velocities among its diagnostics."""
+    """The prediction turned about z: the displacement, the axes of its uncertainty, and the
+    velocities among its diagnostics, of which the diagonal of the covariance is kept."""
     diagnostics = dict(prediction.diagnostics)
     for name, turned in (("velocity", turn), ("velocity_log_std", turn_log_std)):
         if name in diagnostics:
             diagnostics[name] = turned(diagnostics[name], heading)
-    return Prediction(
-        turn(prediction.displacement, heading),
-        turn_log_std(prediction.log_std, heading),
-        diagnostics,
-    )
+    axes = heading
+    if prediction.axes is not None:
+        axes = turn(to_axes(prediction.axes), heading)[:, :2]
+    displacement = turn(prediction.displacement, heading)
+    return Prediction(displacement, prediction.log_std, diagnostics, axes)
+
+
+def reflect_prediction(prediction: Prediction, sign: Float[Array, "b"]) -> Prediction:
+    """The prediction with y reflected where the sign is negative. A diagonal covariance does not
+    change."""
+    signs = jnp.stack([jnp.ones_like(sign), sign, jnp.ones_like(sign)], axis=-1)
+    diagnostics = dict(prediction.diagnostics)
+    if "velocity" in diagnostics:
+        diagnostics["velocity"] = diagnostics["velocity"] * signs[:, None]
+    displacement = prediction.displacement * signs
+    return prediction._replace(displacement=displacement, diagnostics=diagnostics)
 
 
 def _components(
     heading: Float[Array, "b 2"], axes: int
 ) -> tuple[Float[Array, "b *n"], Float[Array, "b *n"]]:
-    """Both columns, with `axes` axes of length 1 after the batch."""
+    """Cosine and sine of every row, with `axes` axes of length 1 after the batch."""
     columns = heading.reshape(-1, *[1] * axes, 2)
     return columns[..., 0], columns[..., 1]

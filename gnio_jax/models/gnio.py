@@ -10,6 +10,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from gnio_jax.config.schema import Count, NonNegativeCount, Positive
+from gnio_jax.models.bins import BinHead
 from gnio_jax.models.heads import (
     CalibratedUncertainty,
     ConstantUncertainty,
@@ -31,7 +32,9 @@ class GNIO(nn.Module):
     leaves the bank out (h = f). Widths other than 64 scale every layer, for machines without an
     accelerator. Two choices of `uncertainty` are ours: "calibrated" multiplies the head's standard
     deviation by one factor per axis, "constant" uses one standard deviation per axis in its place.
-    Both are fitted to the errors on the validation split.
+    Both are fitted to the errors on the validation split. The head "bins" (VeloBins') has the
+    uncertainty of its distribution over bins from −`reach` to `reach` m, in the place of
+    `uncertainty`.
 
     A network with a head of its own overrides `displacement_head` or `uncertainty_head`.
     """
@@ -39,10 +42,11 @@ class GNIO(nn.Module):
     width: Count = 64
     bank_size: NonNegativeCount = 64
     bank_std: Positive = 1.0
-    head: Literal["gated", "linear"] = "gated"
+    head: Literal["gated", "linear", "bins"] = "gated"
     gate: Literal["tanh", "sigmoid"] = "tanh"
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
     uncertainty: Literal["head", "calibrated", "constant"] = "head"
+    reach: Positive = 3.0
     winograd: bool = False
 
     @nn.compact
@@ -55,15 +59,18 @@ class GNIO(nn.Module):
             context, diagnostics["attention"] = self._bank(name="bank")(h, memory)
             h = h + context
         displacement, head_diagnostics = self.displacement_head()(h)
-        log_std = self.uncertainty_head()(h, train)
+        if "log_std" in head_diagnostics:
+            log_std = head_diagnostics.pop("log_std")
+        else:
+            log_std = self.uncertainty_head()(h, train)
         return Prediction(displacement, log_std, diagnostics | head_diagnostics)
 
     @nn.nowrap
     def displacement_head(self) -> nn.Module:
         """A module named "head" that maps h (b, 8·width) to the displacement (b, 3), m, and a dict
         of diagnostics, each with b rows."""
-        gated = partial(GatedHead, self.gate, self.scale)
-        return {"gated": gated, "linear": LinearHead}[self.head](name="head")
+        gated, bins = partial(GatedHead, self.gate, self.scale), partial(BinHead, reach=self.reach)
+        return {"gated": gated, "linear": LinearHead, "bins": bins}[self.head](name="head")
 
     @nn.nowrap
     def uncertainty_head(self) -> nn.Module:

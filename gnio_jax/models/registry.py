@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Literal, get_origin, get_type_hints
 
 import jax
@@ -21,37 +21,54 @@ from gnio_jax.config import ModelConfig
 from gnio_jax.config.files import check_value
 from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError, did_you_mean
+from gnio_jax.models.airimu import Corrected
+from gnio_jax.models.airio import AirIO
 from gnio_jax.models.convolution import winograd_pays
 from gnio_jax.models.ctin import CTIN
 from gnio_jax.models.deepils import DeepILS
+from gnio_jax.models.eqnio import EqNIO
 from gnio_jax.models.equivariance import CanonicalFrame, FourHeadings
+from gnio_jax.models.experts import Experts
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.gru import GRUNetwork
 from gnio_jax.models.imot import IMoT, IMoTText
+from gnio_jax.models.ionet import IONet
+from gnio_jax.models.ionext import IONext
 from gnio_jax.models.memory import NetworkWithMemory
+from gnio_jax.models.ridi import RIDI
 from gnio_jax.models.ronin import RoNINResNet
 from gnio_jax.models.ronin_temporal import RoNINLSTM, RoNINTCN
 from gnio_jax.models.state_space import StateSpaceNetwork
 from gnio_jax.models.tlio import TLIO
+from gnio_jax.models.trunk import Trunk
 
 _MODELS: dict[str, type[nn.Module]] = {
+    "airio": AirIO,
     "ctin": CTIN,
     "deepils": DeepILS,
+    "experts": Experts,
     "gnio": GNIO,
     "gru": GRUNetwork,
     "imot": IMoT,
     "imot_text": IMoTText,
+    "ionet": IONet,
+    "ionext": IONext,
+    "ridi": RIDI,
     "ronin_lstm": RoNINLSTM,
     "ronin_resnet": RoNINResNet,
     "ronin_tcn": RoNINTCN,
     "state_space": StateSpaceNetwork,
     "tlio": TLIO,
+    "trunk": Trunk,
 }
 _PUBLISHED = frozenset(_MODELS)
 
-_EQUIVARIANT: dict[str, type[nn.Module]] = {
+_EQUIVARIANT: dict[str, Callable[[nn.Module], nn.Module]] = {
     "four_headings": FourHeadings,
     "canonical_frame": CanonicalFrame,
+    "o2_frame": EqNIO,
+    "so2_frame": functools.partial(EqNIO, reflections=False),
+    "so2_frame_shallow": functools.partial(EqNIO, reflections=False, depth=1),
 }
 
 
@@ -83,6 +100,7 @@ def options(name: str) -> dict[str, Any]:
     types = get_type_hints(network, include_extras=True)
     kinds = {field.name: types[field.name] for field in dataclasses.fields(network)}
     kinds |= {"equivariance": Literal["none", *_EQUIVARIANT]}
+    kinds |= {"corrector": Literal["none", "airimu"]}
     return {option: kind for option, kind in kinds.items() if option not in ("parent", "name")}
 
 
@@ -98,8 +116,9 @@ def create(name: str, **values: Any) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a
     `Prediction`.
 
-    `equivariance` is an option of all: "none", "four_headings" or "canonical_frame"
-    (`models.equivariance`). `winograd`, the way of computing convolutions in training, is chosen
+    `equivariance` is an option of all: "none", "four_headings", "canonical_frame"
+    (`models.equivariance`), or a frame of EqNIO (`models.eqnio`); so is `corrector`: "none" or
+    "airimu" (`models.airimu`). `winograd`, the way of computing convolutions in training, is chosen
     for this machine unless it is given (`models.convolution`). Raises `InputError` for an unknown
     name or option, naming the known ones, a value that is not one of an option's choices or beyond
     its bounds, or options that do not fit together.
@@ -111,17 +130,29 @@ def create(name: str, **values: Any) -> nn.Module:
             values[option] = check_value(kind, value, Location(subject, option))
     if "winograd" in kinds:
         values.setdefault("winograd", winograd_pays())
-    equivariance = values.pop("equivariance", "none")
+    equivariance, corrector = values.pop("equivariance", "none"), values.pop("corrector", "none")
     try:
         network = _MODELS[name](**values)
     except ValueError as error:
         raise InputError(subject, str(error)) from None
-    if equivariance == "none":
-        return network
-    if isinstance(network, NetworkWithMemory):
-        remedy = "leave model.equivariance out"
-        raise InputError(subject, "turns with the world by its memory's frame", remedy)
-    return _EQUIVARIANT[equivariance](network)
+    memory, body = isinstance(network, NetworkWithMemory), channels(network) != 6
+    if equivariance != "none":
+        if memory or body:
+            problem = "turns with the world already, by its memory's frame"
+            problem = problem if memory else "sees the body, whose axes a frame would not turn"
+            raise InputError(subject, problem, "leave model.equivariance out")
+        network = _EQUIVARIANT[equivariance](network)
+    if corrector != "none":
+        if memory:
+            problem = "sees single samples, and a corrector needs windows"
+            raise InputError(subject, problem, "leave model.corrector out")
+        network = Corrected(network)
+    return network
+
+
+def channels(model: nn.Module) -> int:
+    """Channels of the windows of a network: 6, or 12 with the body's axes."""
+    return getattr(model, "channels", 6)
 
 
 def _check_word(
@@ -141,12 +172,12 @@ def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
     `model.init` gives the same to rounding, but compiling it takes many times as long. Here the
     network is never run, and one small program draws all parameters of one shape.
     """
-    return model.lazy_init(key, _windows(window))
+    return model.lazy_init(key, _windows(model, window))
 
 
 def variable_shapes(model: nn.Module, window: int = 200) -> Any:
     """The shapes and types of what `initialise` gives; nothing is computed."""
-    return _init.eval_shape(model, jax.random.key(0), _windows(window))
+    return _init.eval_shape(model, jax.random.key(0), _windows(model, window))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -155,5 +186,5 @@ def _init(model: nn.Module, key: PRNGKeyArray, windows: Any) -> Any:
     return model.init(key, windows)
 
 
-def _windows(window: int) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct((1, window, 6), jnp.float32)
+def _windows(model: nn.Module, window: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((1, window, channels(model)), jnp.float32)

@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -287,8 +287,23 @@ def make_standing(
 
 # --- complexity
 
+BLOCKS = ("rep", "fourier", "wavelet")
 NETWORKS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "imot_text", "gnio")
 NETWORKS += ("ronin_lstm", "ronin_tcn", "gru", "state_space")
+NETWORKS += ("ionet", "airio", "ionext", "experts", "trunk", "ridi")
+VARIANTS: dict[str, dict[str, Any]] = {
+    "tlio behind airimu": {"name": "tlio", "corrector": "airimu"},
+    "tlio in o2_frame": {"name": "tlio", "equivariance": "o2_frame"},
+    "tlio in so2_frame": {"name": "tlio", "equivariance": "so2_frame"},
+    "ronin_resnet in o2_frame": {"name": "ronin_resnet", "equivariance": "o2_frame"},
+    "ronin_resnet in so2_frame_shallow": {
+        "name": "ronin_resnet",
+        "equivariance": "so2_frame_shallow",
+    },
+    "gnio with bins": {"name": "gnio", "head": "bins"},
+    **{f"trunk of {block}": {"name": "trunk", "block": block} for block in BLOCKS},
+}
+"""Networks with options, by the names of their rows."""
 PAPERS_COST = {
     "tlio": (5.42, 0.08),
     "deepils": (2.29, 0.03),
@@ -315,15 +330,16 @@ class Complexity(NamedTuple):
 def make_complexity(out: Path, reporter: Reporter) -> str:
     """Parameters, operations and latency of every network, beside the paper's columns."""
     table = []
-    for network in NETWORKS:
+    for network in (*NETWORKS, *VARIANTS):
         reporter.line(f"timing {network}")
         cost = measure(network)
         millions, gflops = PAPERS_COST.get(network, (None, None))
-        measured = [f"{cost.parameters:,}", tabulate.number(cost.gflops, 3)]
+        measured = [f"{cost.parameters:,}", tabulate.number(500 * cost.gflops, 1)]
+        measured += [tabulate.number(cost.gflops, 3)]
         measured += [tabulate.number(milliseconds, 2) for milliseconds in cost.latency]
         printed = "–" if millions is None else f"{millions:.2f} M"
         table.append([network, *measured, printed, tabulate.number(gflops, 2)])
-    header = ["", "parameters", "GFLOP / window"]
+    header = ["", "parameters", "10⁶ multiply-adds / window", "GFLOP / window"]
     header += [f"ms / window, batch {batch}" for batch in BATCHES]
     text = (
         f"## Complexity\n\nOne window of {SAMPLES} samples, float32, on {hardware()}. The paper's "
@@ -343,12 +359,12 @@ def measure(
 ) -> Complexity:
     """Cost of a network's inference, batch norms folded, on this machine; each latency is timed for
     about `seconds`."""
-    model = models.create(network)
+    model = models.create(**VARIANTS.get(network, {"name": network}))
     variables = models.initialise(model, jax.random.key(0), SAMPLES)
     frozen, inference = models.inference_variables(model, variables), models.Inference(model)
     latency, operations = [], math.nan
     for batch in batches:
-        samples = np.random.default_rng(0).standard_normal((batch, SAMPLES, 6))
+        samples = np.random.default_rng(0).standard_normal((batch, SAMPLES, models.channels(model)))
         windows = jnp.asarray(samples, jnp.float32)
         compiled = jax.jit(inference).lower(frozen, windows).compile()
         if batch == batches[0]:

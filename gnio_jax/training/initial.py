@@ -41,12 +41,15 @@ def _describe_network(config: TrainConfig) -> dict[str, Any]:
     """What two experiments share if they have the same network: its name and options, and its
     windows."""
     model: Any = models.from_config(config.model)
-    model = getattr(model, "network", model)  # the network inside an equivariant construction
+    while hasattr(model, "network"):  # inside an equivariant construction or behind a corrector
+        model = model.network
     fields = (field.name for field in dataclasses.fields(model))
     options = {name: getattr(model, name) for name in fields if name not in ("parent", "name")}
     # Any network can be averaged over headings, which adds no parameters.
-    framed = config.model.equivariance == "canonical_frame"
-    options = {"name": config.model.name, "canonical_frame": framed, **options}
+    frame = config.model.equivariance
+    frame = "none" if frame == "four_headings" else frame
+    parts = {"name": config.model.name, "frame": frame, "corrector": config.model.corrector}
+    options = {**parts, **options}
     of_windows = ("rate", "window_seconds", "context_seconds", "window_rotation")
     windows = {f"data.{name}": getattr(config.data, name) for name in of_windows}
     return {f"model.{name}": value for name, value in options.items()} | windows

@@ -23,7 +23,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.models.memory import NetworkWithMemory
 from gnio_jax.networks import TrainedNetwork
 from gnio_jax.reporting import Lines, Reporter, Silence
-from gnio_jax.training import checkpoint, optimizer, run_folder
+from gnio_jax.training import checkpoint, optimizer, run_folder, support_vectors
 from gnio_jax.training.checkpoint import RunPosition
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.initial import load_initial_network
@@ -103,6 +103,12 @@ def train_all(
         run_folder.refuse_other_run(configuration.validate(config), resume)
         for config, resume in zip(configs, resumes, strict=True)
     ]
+    if configs[0].model.name == "ridi":  # without steps
+        losses = [
+            support_vectors.train(config, workdir, reporter, workers)
+            for config, workdir in zip(configs, workdirs, strict=True)
+        ]
+        return [TrainingResult(*run, None) for run in zip(workdirs, losses, strict=True)]
     through_filter = bool(configs[0].through_filter.learn)
     if through_filter and devices is not None:
         raise InputError("--devices", "is for training on windows", "leave it out")

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from gnio_jax.config import LossConfig
+from gnio_jax.models.airimu import preintegration_loss
+from gnio_jax.training import network_losses
 from gnio_jax.types import Prediction, Windows
 
 TASK_LOG_STD_FLOOR = -math.log(2.0)
@@ -64,7 +66,12 @@ def loss_stage(config: LossConfig, step: Int[jax.Array, ""] | int, steps_per_epo
 
 
 def losses(
-    prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage, axes: int = 3
+    prediction: Prediction,
+    windows: Windows,
+    config: LossConfig,
+    stage: Stage,
+    axes: int = 3,
+    dt: float = 0.005,
 ) -> Losses:
     """The losses of a batch.
 
@@ -74,9 +81,11 @@ def losses(
         config: The loss and its weights.
         stage: The parts of the loss that take effect at this step (`loss_stage`).
         axes: Number of axes, 3, or 2 for a network without the vertical.
+        dt: Time between the samples of a window, s, which the preintegration loss needs.
 
     Raises:
-        ValueError: The loss needs more than the network predicts (a velocity for every sample).
+        ValueError: The loss needs more than the network predicts (e.g. a velocity for every
+            sample).
     """
     vectors = (prediction.displacement, prediction.log_std, windows.displacement)
     chex.assert_equal_shape(vectors)
@@ -85,12 +94,25 @@ def losses(
     held = prediction._replace(log_std=_hold_log_std(prediction.log_std, stage))
     mse = jnp.mean(jnp.sum(error**2, axis=-1))
     nll = gaussian_nll(held, error, config)
-    if config.name == "velocity_and_covariance":
-        total = _velocity_and_covariance(prediction, windows, config, stage, axes)
-        return Losses(total, mse, nll)
-    total = config.mse_weight * mse + stage.nll_weight * nll
-    if config.mae_weight:
-        total = total + config.mae_weight * jnp.mean(jnp.sum(jnp.abs(error), axis=-1))
+    match config.name:
+        case "velocity_and_covariance":
+            total = _velocity_and_covariance(prediction, windows, config, stage, axes)
+        case "polar":
+            total = network_losses.polar(prediction, windows, config)
+        case "body_velocity":
+            total = network_losses.body_velocity(prediction, windows)
+        case "bins":
+            total = network_losses.bins(prediction, windows, axes)
+        case _:
+            total = config.mse_weight * mse + stage.nll_weight * nll
+            if config.mae_weight:
+                total = total + config.mae_weight * jnp.mean(jnp.sum(jnp.abs(error), axis=-1))
+    if "router" in prediction.diagnostics:
+        balance = network_losses.balance(prediction.diagnostics["router"])
+        total = total + config.balance_weight * balance
+    if config.preintegration_weight:
+        corrected = preintegration_loss(prediction, windows.imu, windows.steps, dt)
+        total = total + config.preintegration_weight * corrected
     return Losses(total, mse, nll)
 
 

@@ -147,9 +147,9 @@ def cut_walks(
     samples = grid.samples
     # Sample j of a segment and its margins is the recording at row + τ j, between two samples.
     count = samples + 2 * margin + 1
-    place = pace.stretch[:, None] * jnp.arange(count, dtype=jnp.float32)[None, :]
-    before = jnp.floor(place).astype(jnp.int32)
-    share = (place - before)[:, :, None]
+    row_offset = pace.stretch[:, None] * jnp.arange(count, dtype=jnp.float32)[None, :]
+    before = jnp.floor(row_offset).astype(jnp.int32)
+    share = (row_offset - before)[:, :, None]
     index = jnp.clip(rows[:, None] + before, 0, len(source.imu) - 2)
 
     def interpolate(signal: Array) -> jax.Array:

@@ -23,6 +23,7 @@ from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.models.layers import MOMENTUM
 from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
+from gnio_jax.training.network_losses import rotation_consistency
 from gnio_jax.training.task import BatchLosses, Row, Task, TrainState
 from gnio_jax.training.windows import (
     WindowSource,
@@ -101,11 +102,18 @@ class WindowTask(Task):
     def losses(
         self, variables: Any, batch: tuple[Windows, PRNGKeyArray], step: Int[jax.Array, ""]
     ) -> BatchLosses:
-        windows, _ = batch
+        windows, key = batch
         stage = loss_stage(self.config.loss, step, self.steps_per_epoch)
         prediction, changed = apply_training(self.model, variables, batch)
-        values = losses(prediction, windows, self.config.loss, stage, predicted_axes(self.model))
-        figures = {"loss": values.total, "mse": values.mse, "nll": values.nll}
+        data, loss = self.config.data, self.config.loss
+        axes = predicted_axes(self.model)
+        values = losses(prediction, windows, loss, stage, axes, 1 / data.rate)
+        total = values.total
+        if loss.rotation_weight:
+            keys = (jax.random.fold_in(key, 1), jax.random.fold_in(key, 2))
+            arguments = self.model, variables, windows, prediction, keys, data.window_seconds
+            total = total + loss.rotation_weight * rotation_consistency(*arguments)
+        figures = {"loss": total, "mse": values.mse, "nll": values.nll}
         return BatchLosses(figures, changed.get("batch_stats", {}), jnp.bool_(True))
 
     def with_statistics(
@@ -124,7 +132,7 @@ class WindowTask(Task):
         stage = self.last_stage(state)
         validations = [validate(state, source, stage, task=self) for source in held_out.values()]
         mean = jax.tree.map(lambda *figures: sum(figures) / len(figures), *validations)
-        isotropic = self.config.model.equivariance != "none"
+        isotropic = self.config.model.equivariance == "four_headings"
         return calibrate_uncertainty(state, mean, isotropic)
 
     def figures_of(self, state: TrainState, held_out: WindowSource, key: PRNGKeyArray) -> Row:
@@ -161,8 +169,9 @@ def apply_training(
 
 def predicted_axes(model: nn.Module) -> int:
     """How many axes of the displacement a network predicts: 2 where the vertical is always 0."""
-    network = getattr(model, "network", model)  # the network inside an equivariant construction
-    return getattr(network, "output_dim", 3)
+    while hasattr(model, "network"):  # inside an equivariant construction or behind a corrector
+        model = model.network
+    return getattr(model, "output_dim", 3)
 
 
 # The statistics of batch normalisation
@@ -240,7 +249,7 @@ class Validation(NamedTuple):
 
     losses: Losses
     axis_mse: Float[jax.Array, "3"]
-    """Squared error of each axis, m²."""
+    """Squared error of each axis of the uncertainty, m²."""
     axis_normalised: Float[jax.Array, "3"]
     """(e/σ)² of each axis: 1 if the standard deviations are those of the errors."""
 
@@ -251,7 +260,7 @@ def validate(
 ) -> Validation:
     """Mean losses and errors over every window of `source`, without augmentation and in inference
     mode."""
-    config, model = task.config, task.model
+    config, model, axes = task.config, task.model, predicted_axes(task.model)
     count = source.visited.shape[0]
     # Batches are whole, so that each device has the same share: the last one is filled up with
     # windows of weight zero.
@@ -266,9 +275,9 @@ def validate(
         prediction, windows = jax.tree.map(lambda x: x[None], (prediction, windows))
         error = windows.displacement - prediction.displacement
         return Validation(
-            losses(prediction, windows, config.loss, stage, predicted_axes(model)),
-            error[0] ** 2,
-            error[0] ** 2 * jnp.exp(-2 * prediction.log_std[0]),
+            losses(prediction, windows, config.loss, stage, axes, 1 / config.data.rate),
+            prediction.along_axes(error)[0] ** 2,
+            prediction.normalised(error, None)[0][0],
         )
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
@@ -287,7 +296,7 @@ def calibrate_uncertainty(
     """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that
     validation found with it.
 
-    `isotropic`: both horizontal axes get their mean, because constants of an equivariant network
+    `isotropic`: both horizontal axes get their mean, because constants of a mean over headings
     cannot distinguish them. Errors below 0.1 mm count as 0.1 mm, and a σ changes at most by a
     factor of 1000 at once, so that nothing becomes infinite.
     """

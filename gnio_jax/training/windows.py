@@ -9,7 +9,7 @@ Overlapping windows are never copied: a second of IMU belongs to ten windows and
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import jax
@@ -36,8 +36,9 @@ from gnio_jax.windows import (
 class WindowSource(NamedTuple):
     """All recordings of a split, end to end, and where windows may start in them. float32."""
 
-    imu: Float[Array, "t 6"]
-    """[accel m/s², gyro rad/s], as in `gnio_jax.windows.AlignedRecording`."""
+    imu: Float[Array, "t c"]
+    """[accel m/s², gyro rad/s] and perhaps the body's axes, as in
+    `gnio_jax.windows.AlignedRecording`."""
     start: Int[Array, "m"]
     """Row of `imu` at which each window begins, with its context."""
     rotation: Float[Array, "m 3 3"]
@@ -186,8 +187,8 @@ def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: f
 
 
 def random_low_pass(
-    key: PRNGKeyArray, imu: Float[jax.Array, "b n 6"], config: AugmentConfig, rate: float
-) -> Float[jax.Array, "b n 6"]:
+    key: PRNGKeyArray, imu: Float[jax.Array, "b n c"], config: AugmentConfig, rate: float
+) -> Float[jax.Array, "b n c"]:
     """Signals of which a random share is low-passed (ours).
 
     The network must not recognise a dataset by the spectrum that a phone's filter leaves.
@@ -206,9 +207,10 @@ def random_low_pass(
     cutoff = jnp.exp(_uniform(cutoff_key, (count,), low, high))
     frequency = np.fft.rfftfreq(length, 1 / rate).astype(np.float32)
     power = (frequency[None] / cutoff[:, None]) ** (2 * order[:, None])
-    spectrum = jnp.fft.rfft(imu, axis=1) / (1 + power)[:, :, None]
+    spectrum = jnp.fft.rfft(imu[..., :6], axis=1) / (1 + power)[:, :, None]
     smooth = jnp.fft.irfft(spectrum, length, axis=1)
-    return jnp.where(chosen[:, None, None], smooth, imu)
+    smooth = jnp.where(chosen[:, None, None], smooth, imu[..., :6])
+    return jnp.concatenate([smooth, imu[..., 6:]], axis=-1)
 
 
 def low_pass_margin(config: AugmentConfig, rate: float) -> int:
@@ -235,10 +237,13 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
     imu, count = windows.imu, len(windows.imu)
     if any(config.scale):
         error = _uniform(jax.random.fold_in(key, 4), (count, 1, 2), -1.0, 1.0)
-        imu = imu * (1 + jnp.repeat(error, 3, axis=2) * _channels(*config.scale))
+        imu = _on_samples(
+            imu, lambda x: x * (1 + error.repeat(3, axis=2) * _channels(*config.scale))
+        )
     if config.gyro_bias or config.accel_bias:
         offset = _uniform(bias_key, (count, 1, 6), -1.0, 1.0)
-        imu = imu + offset * _channels(config.gyro_bias, config.accel_bias)
+        offset = offset * _channels(config.gyro_bias, config.accel_bias)
+        imu = _on_samples(imu, lambda x: x + offset)
     if config.tilt_degrees:
         heading_key, angle_key = jax.random.split(tilt_key)
         heading = _uniform(heading_key, (count,), 0.0, 2 * math.pi)
@@ -254,8 +259,9 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
             rotate_vectors(turn, windows.steps[:, :, None])[:, :, 0],
         )
     if any(config.noise):
-        noise = jax.random.normal(noise_key, imu.shape, jnp.float32)
-        windows = windows._replace(imu=windows.imu + noise * _channels(*config.noise))
+        noise = jax.random.normal(noise_key, (*imu.shape[:2], 6), jnp.float32)
+        noise = noise * _channels(*config.noise)
+        windows = windows._replace(imu=_on_samples(windows.imu, lambda x: x + noise))
     return windows
 
 
@@ -265,10 +271,17 @@ def _at_rest(key: PRNGKeyArray, windows: Windows, share: float) -> Windows:
     lies = jax.random.bernoulli(key, jnp.float32(share), (len(windows.imu), 1, 1))
     still = jnp.array([[[0, 0, GRAVITY, 0, 0, 0]]], jnp.float32)
     return Windows(
-        jnp.where(lies, still, windows.imu),
+        _on_samples(windows.imu, lambda x: jnp.where(lies, still, x)),
         jnp.where(lies[:, 0], 0, windows.displacement),
         jnp.where(lies, 0, windows.steps),
     )
+
+
+def _on_samples(
+    imu: Float[jax.Array, "b n c"], change: Callable[[jax.Array], jax.Array]
+) -> Float[jax.Array, "b n c"]:
+    """The windows with [accel, gyro] changed, and the body's axes as they are."""
+    return jnp.concatenate([change(imu[..., :6]), imu[..., 6:]], axis=-1)
 
 
 def _channels(gyro: float, accel: float) -> Float[jax.Array, "1 1 6"]:

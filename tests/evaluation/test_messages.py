@@ -41,6 +41,7 @@ UNDEFINED = [
     (lambda: metrics.rte_distance(LINE, LINE, 100.0), "no unbroken reference of 100 m"),
     (lambda: metrics.stationary_drift(LINE, LINE, STEP), "never stands still for 2 s"),
     (lambda: metrics.yaw_drift(*[WALK.orientation[:50]] * 2, STEP), "less than 10 s"),
+    (lambda: metrics.t_rel(WALK, WALK, STEP), "no unbroken reference of 100 m"),
     (lambda: align(WALK, BEFORE_AND_AFTER), "fewer than two waypoints are within the estimate"),
     *(
         (

@@ -185,6 +185,54 @@ def test_yaw_errors_of_a_tilted_phone(pitch):
         assert values[name] == pytest.approx(0, abs=1e-6)
 
 
+def test_errors_of_pieces_are_those_of_kittis_benchmark():
+    """Against a plain loop with homogeneous matrices, with a hole in the reference."""
+    rng, rows = np.random.default_rng(6), 1500
+    time = STEP * np.arange(rows)
+    yaw = np.cumsum(0.02 * np.sin(0.05 * time) * STEP)
+    attitude = Rotation.from_euler("ZYX", np.stack([yaw, 0.02 * np.sin(time), 0 * yaw], 1))
+    position = np.cumsum(attitude.apply([9.0 * STEP, 0.0, 0.0]), axis=0)
+    truth = Trajectory(time, position, quaternions(attitude))
+    turn = Rotation.from_rotvec(np.cumsum(rng.normal(size=(rows, 3)), axis=0) * 1e-3)
+    drift = np.cumsum(rng.normal(size=(rows, 3)), axis=0) * 0.05
+    # A rigid motion of the whole estimate is no error.
+    estimate = moved_by(
+        Trajectory(time, position + drift, quaternions(turn * attitude)), TURNED, [5.0, 3.0, 1.0]
+    )
+    truth.position[700:720] = np.nan
+
+    def poses(path):
+        matrices = np.tile(np.eye(4), (rows, 1, 1))
+        matrices[:, :3, :3] = Rotation.from_quat(np.roll(path.orientation, -1, 1)).as_matrix()
+        matrices[:, :3, 3] = path.position
+        return matrices
+
+    ours, true = poses(estimate), poses(truth)
+    pieces = []
+    for start, stop in ((0, 700), (720, rows)):
+        for i in range(start, stop, 10):  # a second
+            for length in range(100, 801, 100):
+                walked, j = 0.0, i
+                while j + 1 < stop and walked <= length:
+                    j += 1
+                    walked += np.linalg.norm(truth.position[j] - truth.position[j - 1])
+                if walked > length:
+                    motions = [np.linalg.solve(path[i], path[j]) for path in (ours, true)]
+                    error = np.linalg.solve(*motions)
+                    cosine = np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)
+                    pieces.append(np.array([np.linalg.norm(error[:3, 3]), np.arccos(cosine)]))
+                    pieces[-1] /= length
+    expected = np.mean(pieces, axis=0)
+    assert len(pieces) > 30
+    assert metrics.t_rel(estimate, truth, STEP) == pytest.approx(100 * expected[0], rel=1e-9)
+    assert metrics.r_rel(estimate, truth, STEP) == pytest.approx(np.degrees(expected[1]), rel=1e-6)
+    assert metrics.t_rel(truth, truth, STEP) == pytest.approx(0, abs=1e-9)
+    assert metrics.measure(estimate, truth).values["r_rel"] == pytest.approx(
+        np.degrees(expected[1]), rel=1e-6
+    )
+    assert not metrics.OF_PIECES.keys() & metrics.measure(walk(), walk()).values.keys()
+
+
 def test_the_nees_of_a_consistent_filter_is_one():
     random = np.random.default_rng(0)
     root = random.normal(size=(20000, 3, 3))
@@ -275,7 +323,7 @@ def test_metrics_have_names_and_reasons():
     results.nis[0], results.accepted[:2] = np.nan, [np.nan, 0.0]
     measures = metrics.measure(perturbed(truth), truth, filtered=results)
     assert not measures.reasons
-    with_poses = set(metrics.NAMES) - metrics.OF_WAYPOINTS.keys()
+    with_poses = set(metrics.NAMES) - metrics.OF_WAYPOINTS.keys() - metrics.OF_PIECES.keys()
     assert with_poses == measures.values.keys() - {"duration", "path_length"}
     expected = {"nis": 1.0, "duration": 89.9, "accepted": 100 * 898 / 899}
     assert {name: measures.values[name] for name in expected} == pytest.approx(expected)

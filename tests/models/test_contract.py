@@ -31,6 +31,20 @@ def test_networks_have_as_many_parameters_as_published():
         ("ctin", {"output_dim": 2}, 555_364 + 2),  # the publication's 557,100 to 1 %
         ("imot", {"output_dim": 2}, 14_492_810),
         ("imot_text", {"output_dim": 2}, 7_137_482),
+        ("ionet", {}, 302_978),
+        ("airio", {}, 354_278),
+        ("tlio", {"corrector": "airimu"}, 5_424_646 + 520_044),
+        ("tlio", {"equivariance": "o2_frame"}, 6_020_230),
+        ("ronin_resnet", {"equivariance": "o2_frame", "output_dim": 2}, 5_230_466),
+        ("tlio", {"equivariance": "so2_frame"}, 8_884_870),
+        ("ronin_resnet", {"equivariance": "so2_frame_shallow", "output_dim": 2}, 6_456_194),
+        ("ionext", {"output_dim": 2}, 10_641_506),
+        # Of our own sizes.
+        ("trunk", {"block": "star"}, 1_193_434),
+        ("trunk", {"block": "rep"}, 819_718),
+        ("trunk", {"block": "fourier"}, 646_802),
+        ("trunk", {"block": "wavelet"}, 646_303),
+        ("experts", {}, 1_933_422),
     ):
         assert count(shapes(name, 200, **options)["params"]) == wanted, (name, options)
 
@@ -40,6 +54,10 @@ SOFTMAX = {("key", "bias"), ("key_content", "bias"), ("key_position", "bias")}
 FIRST = {("value", "bias"), ("output", "bias"), ("output", "kernel")}
 """What iMoT's first attention of particles learns: all contents are zero there, so whom a particle
 attends to makes no difference."""
+
+
+SHIFTS = ("filter1", "filter2", "projection", "stem", "down1", "down2", "down3", "mixer")
+"""Layers of AirIO and IONext before a batch normalisation, which takes their bias off again."""
 
 
 SLOW = {"ctin", "deepils", "imot"}
@@ -59,12 +77,13 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
     if name != "gnio":  # whose bank is as wide as four groups make it
         monkeypatch.setattr(resnet, "GROUP_STRIDES", (1, 2))
     # A width of their own: JAX keeps the shapes of a network.
-    fewer = {"ctin": {"decoder_layers": 1}, "imot": {"encoder_layers": 1}}
+    fewer = {"ctin": {"decoder_layers": 1}, "imot": {"encoder_layers": 1}, "ridi": {}}
     model = models.create(name, **SMALL[name] | fewer.get(name, {"width": 5}))
-    samples = {"gru": 60, "state_space": 60, "ronin_lstm": 20}.get(
+    samples = {"gru": 60, "state_space": 60, "ronin_lstm": 20, "ionet": 9, "airio": 40}.get(
         name, 12 if name in fewer else 64
     )
-    windows = jnp.asarray(np.random.default_rng(1).standard_normal((4, samples, 6)))
+    shape = (4, samples, models.channels(model))
+    windows = jnp.asarray(np.random.default_rng(1).standard_normal(shape))
     variables = drawn({"batch_stats": {}, **models.variable_shapes(model, samples)})
     statistics = variables["batch_stats"]
 
@@ -93,10 +112,11 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
         assert np.isfinite(leaf).all(), path
         if names[:2] == ("decoder_1", "self") and name != "ctin" and names[2:] not in FIRST:
             assert trained < 1e-5, path
-        elif names[-2:] not in SOFTMAX:
+        elif names[-2:] not in SOFTMAX and (names[-2] not in SHIFTS or names[-1] != "bias"):
             assert trained > 1e-6, path
     dropped = np.abs(one.displacement - other.displacement).max() > 1e-3
-    assert dropped == (name not in ("gnio", "gru", "ronin_lstm", "state_space"))  # without dropout
+    without = ("experts", "gnio", "gru", "ionext", "ridi", "ronin_lstm", "state_space")
+    assert dropped == (name not in (*without, "trunk"))
     assert jax.tree.structure(changed) == jax.tree.structure(statistics)
     before = jax.tree.leaves_with_path(statistics)
     for (path, old), new in zip(before, jax.tree.leaves(changed), strict=True):
@@ -108,9 +128,13 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
 
 def test_options_that_cannot_be_are_refused():
     for name, options, problem in (
-        ("gnoi", {}, r"unknown; did you mean 'gnio'\? known models: ctin, deepils, gnio"),
+        ("gnoi", {}, r"unknown; did you mean 'gnio'\? known models: airio, ctin, deepils"),
         ("gnio", {"bank_sise": 3}, r"unknown option 'bank_sise'; did you mean 'bank_size'\?"),
-        ("gnio", {"head": "gatd"}, "'head' must be one of gated, linear, found 'gatd'; did you me"),
+        (
+            "gnio",
+            {"head": "gatd"},
+            "'head' must be one of gated, linear, bins, found 'gatd'; did",
+        ),
         ("tlio", {"equivariance": "so3"}, "'equivariance' must be one of none, four_headings"),
         ("gnio", {"width": 0}, "'width' must be at least 1.*, found 0"),
         ("gnio", {"width": "8"}, "'width' must be a whole number, found '8'"),

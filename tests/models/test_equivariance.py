@@ -143,8 +143,9 @@ def test_the_network_sees_the_window_in_its_frame():
     said = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), predictions("canonical_frame"))
     wanted = np.einsum("bij,bj->bi", frame, inner.displacement)
     np.testing.assert_allclose(said.displacement, wanted, atol=1e-4 * np.abs(wanted).max())
-    variance = turned_variance(np.float64(inner.log_std), frame)
-    np.testing.assert_allclose(np.exp(2 * said.log_std), variance, rtol=1e-3)
+    squares = np.exp(2 * np.float64(inner.log_std))[..., None] * np.eye(3)
+    covariance = frame @ squares @ frame.swapaxes(1, 2)  # full in the plane
+    np.testing.assert_allclose(said.covariance(-30.0, float), covariance, rtol=1e-3, atol=1e-4)
     # The loss of CTIN learns from the velocities.
     mean = said.diagnostics["velocity"].mean(axis=1)
     np.testing.assert_allclose(mean, said.displacement, atol=1e-5)

@@ -1,6 +1,8 @@
 """Layers in plain NumPy, for one window at a time: direct sums, no matrix tricks. `q` are the
 parameters of a layer, `s` its statistics."""
 
+import math
+
 import jax
 import numpy as np
 
@@ -73,3 +75,33 @@ def attention(query, key, value, q, causal=False):
             weights = softmax(b[:seen] @ a[i] / np.sqrt(a.shape[1]))
             out[i] += weights @ c[:seen] @ q["out"]["kernel"][h]
     return out
+
+
+def gelu(x):
+    return np.array([0.5 * v * (1 + math.erf(v / math.sqrt(2))) for v in x.flat]).reshape(x.shape)
+
+
+def recurrence(x, q, cell, reverse=False):
+    """An LSTM or GRU step by step: the outputs, and the one that came last."""
+    units = len(q["recurrent_kernel"])
+    h, c, outputs = np.zeros(units), np.zeros(units), [None] * len(x)
+    for t in reversed(range(len(x))) if reverse else range(len(x)):
+        a = x[t] @ q["input"]["kernel"] + q["input"]["bias"]
+        b = h @ q["recurrent_kernel"] + q["recurrent_bias"]
+        gate = [(a[k : k + units], b[k : k + units]) for k in range(0, len(a), units)]
+        if cell == "lstm":
+            i, f, g, o = (u + v for u, v in gate)
+            c = sigmoid(f) * c + sigmoid(i) * np.tanh(g)
+            h = sigmoid(o) * np.tanh(c)
+        else:
+            r, z = (sigmoid(u + v) for u, v in gate[:2])
+            h = (1 - z) * np.tanh(gate[2][0] + r * gate[2][1]) + z * h
+        outputs[t] = h
+    return np.array(outputs), h
+
+
+def both_ways(x, q, cell):
+    forward, backward = (
+        recurrence(x, q[name], cell, name == "backward") for name in ("forward", "backward")
+    )
+    return tuple(np.concatenate(pair, axis=-1) for pair in zip(forward, backward, strict=True))

@@ -36,6 +36,9 @@ def test_cost_of_a_network_by_hand(monkeypatch):
 def test_the_table_names_every_network(tmp_path, monkeypatch):
     monkeypatch.setattr(make, "measure", lambda name: make.Complexity(5, float("nan"), [2.0, 0.5]))
     text = make.make_complexity(tmp_path, Lines())
-    assert "| gnio | 5 | – | 2.00 | 0.50 | 4.90 M | 0.08 |" in text
+    assert "| gnio | 5 | – | – | 2.00 | 0.50 | 4.90 M | 0.08 |" in text
     assert set(make.NETWORKS) == set(models.names())
+    assert "| tlio in o2_frame | 5 |" in text
+    for options in make.VARIANTS.values():
+        models.create(**options)
     assert (tmp_path / "complexity.md").read_text(encoding="utf-8") in text

@@ -4,6 +4,7 @@ and whether its gyro and its accelerometer belong together."""
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -19,10 +20,10 @@ from gnio_jax.data.parsing.stamps import RATES, is_rate
 from gnio_jax.errors import InputError
 
 FIRST_SECONDS = 1.0
-"""Time of a stream over which its rate is measured, s …"""
+"""The rate of a stream is measured over this time, s."""
 FIRST_SAMPLES = 21
-"""… and smallest number of samples for it, from which the units of accelerometer and stamps are
-recognised (ours)."""
+"""Smallest number of samples from which the rate is measured, and the units of accelerometer and
+stamps are recognised (ours)."""
 MOST_HELD = 20_000
 """Number of samples after which the first second must be over, at any rate of an IMU."""
 SECONDS_WITHOUT_A_SENSOR = 10.0
@@ -50,12 +51,13 @@ class Nature(NamedTuple):
 def measured(
     arrivals: Iterator[Arrival], nature: Nature, begin: Callable[[float], None]
 ) -> Iterator[Arrival]:
-    """The same arrivals, with Android's sign. The samples of the first second are held until their
-    rate, Hz, is given to `begin`.
+    """Hold back the samples of the first second, measure their rate, Hz, and call `begin` with it;
+    then pass all samples on, with Android's sign.
 
     Raises `InputError` while it runs, if the stamps are not in seconds, if the stated rate is
     wrong, if the accelerometer of a device at rest does not read gravity, or if after eight
-    seconds, or later, gravity does not turn as the gyro does. What is in doubt is a notice.
+    seconds, or later, gravity does not turn as the gyro does. Where there is only a doubt, it
+    yields a notice.
     """
     held: list[Arrival] = []
     samples: list[Sample] = []
@@ -137,6 +139,13 @@ def _sign_of(accel: Float[np.ndarray, "n 3"], nature: Nature, notices: list[str]
     return -1.0 if (signed * accel).sum() < 0 else 1.0
 
 
+def _for_streams(remedy: str) -> str:
+    """The remedy for a recording without the options of an import, which a stream does not have."""
+    remedy = re.sub(r",? (or|as by) --columns.*", "", remedy)
+    remedy = re.sub(r"give --time-unit.*", "stamps must be in seconds", remedy)
+    return re.sub(r" as by --gyro-unit (?!deg/s$).*", " or send it in rad/s", remedy)
+
+
 class _Turning:
     """Compares the rotation of gravity with the gyro, until it is certain or a minute is over."""
 
@@ -154,8 +163,14 @@ class _Turning:
         self._due.pop(0)
         rows = np.array(self._rows)
         imu = physics.ImuSamples(rows[:, 0] - rows[0, 0], rows[:, 1:4], rows[:, 4:7])
-        warnings = physics.check_turning(imu, self._name)
-        yield from (Arrival(arrival.clock, notice=f"warning: {text}") for text in warnings)
+        try:
+            warnings = physics.check_turning(imu, self._name)
+        except InputError as error:
+            _, problem, remedy = error.parts
+            raise InputError(self._name, problem, _for_streams(remedy)) from None
+        yield from (
+            Arrival(arrival.clock, notice=f"warning: {_for_streams(text)}") for text in warnings
+        )
         if warnings or physics.is_supported(*physics.agreement(imu)):
             self._due.clear()
         if not self._due:

@@ -98,6 +98,8 @@ class Clock:
     def late(self, arrival: Arrival) -> str:
         """Why a sample whose stamp does not continue this clock is refused."""
         assert arrival.sample is not None
+        if not self.is_running:
+            return f"time: must increase, found {arrival.sample.time!r}, far from the next stamps"
         ahead = arrival.sample.time + self._offset - self.newest
         words = f"{ahead:.3g} s ahead of" if ahead > 0 else f"{-ahead:.3g} s behind"
         return f"time: must increase, found {arrival.sample.time!r}, {words} the newest sample"
@@ -133,5 +135,5 @@ def _check_unit(stamps: list[float], name: str) -> None:
         interval = float(np.median(np.abs(np.diff(stamps))))
         problem = f"its samples come {interval:g} s apart by their stamps"
         if interval > LONGEST_INTERVAL:
-            raise InputError(name, problem, "stamps must be in seconds, not in ms")
+            raise InputError(name, problem, "they must be in seconds, not in ms, and of one sender")
         del stamps[:AGREEING]

@@ -148,8 +148,8 @@ class Phyphox:
         """The rows since the last question. Their stamps do not stand still in a pause."""
         words = []
         for kind, names in self._buffers.items():
-            since = f"{self._newest[kind]!r}|{names[0]}"
-            words += [f"{quote(name)}={quote(since)}" for name in names]
+            condition = f"{self._newest[kind]!r}|{names[0]}"
+            words += [f"{quote(name)}={quote(condition)}" for name in names]
         answer, now = self.ask("/get?" + "&".join(words)), time.monotonic()
         rows: Rows = {}
         for kind, names in self._buffers.items():

@@ -29,6 +29,8 @@ STRETCH = 1.0
 """Time between the points by which a walk is measured, s, as in `metrics.path_length`."""
 STEP = 0.2
 """Distance between points of the path that are drawn, m (ours)."""
+MOST_NOTICES = 20
+"""Newest messages that are kept for the page."""
 QUIET_SECONDS = 5.0
 """Time without a sample after which a message says so, s."""
 OFTEN = 10
@@ -63,7 +65,7 @@ class Followed:
     waiting: str = ""
     """What is needed before there can be a pose, or why nothing comes."""
     notices: list[str] = field(default_factory=list)
-    """Messages so far."""
+    """The newest messages."""
     samples: int = 0
     first: float = math.nan
     """Stamp of the first sample, s."""
@@ -180,15 +182,24 @@ def follow(
     """Feed the samples to a tracker, until the source ends or its samples are no longer accepted
     (`Followed.lost`).
 
-    `result` is updated with each sample, and `on_pose` is called after each clone step. `say` gets
-    messages, and, before there is a pose, each second what is needed for it. Raises `InputError`
-    if no line is a sample, or if no sample has both sensors.
+    Args:
+        tracker: A `filtering.Tracker`.
+        arrivals: What comes from the source, on one clock, in order and checked.
+        nature: What is known about the source.
+        result: The results, which are updated with each sample.
+        on_pose: A function that is called after each clone step.
+        say: A function that gets messages, and, before there is a pose, each second what is needed
+            for it.
+
+    Raises:
+        InputError: No line is a sample, or no sample has both sensors.
     """
     begin = time.monotonic()
     latest, spoken, is_silent = begin, 0, False
     for arrival in arrivals:
         if arrival.notice:
             result.notices.append(arrival.notice)
+            del result.notices[:-MOST_NOTICES]
             say(arrival.notice)
         if arrival.refusal:
             result.refuse(arrival.refusal)
@@ -204,7 +215,10 @@ def follow(
         if result.lost:
             break
         if pose is not None:
+            is_first = result.pose is None
             result.add(pose)
+            if is_first and result.rough:
+                say(f"warning: {result.warnings()[0]}")
             on_pose(result)
         now = time.monotonic()
         if result.pose is None:

@@ -12,8 +12,6 @@ from gnio_jax.apps.live.session import Followed
 
 MOST_POINTS = 20_000
 """Points of the path in one answer, at most."""
-MOST_NOTICES = 20
-"""Newest messages that are shown."""
 
 
 def describe(
@@ -34,14 +32,14 @@ def describe(
         "samples": result.samples,
         "refused": result.refused,
         "reason": result.reasons[1],
-        "messages": result.notices[-MOST_NOTICES:],
+        "messages": list(result.notices),
         "warnings": result.warnings(),
     }
     if pose is None:
         return shown
     begin = result.path[0] if result.path else pose.time
-    is_finite = bool(np.isfinite(pose.position).all() and np.isfinite(pose.covariance).all())
-    if not pose.healthy or not is_finite:
+    numbers = (pose.position, pose.velocity, pose.rotation, pose.covariance)
+    if not pose.healthy or not all(np.isfinite(values).all() for values in numbers):
         return shown | {"state": "diverged", "reason": pose.failure}
     covariance = pose.covariance[6:8, 6:8]
     return shown | {

@@ -115,4 +115,9 @@ def measure(models: Models, window: Float[np.ndarray, "1 n 6"]) -> dict[str, np.
     prediction = run(models.network, {"window": window})
     log_std = np.maximum(prediction["log_std"][0].astype(float), models.log_std_min)
     displacement = prediction["displacement"][0].astype(float)
-    return {"displacement": displacement, "covariance": np.diag(np.exp(2 * log_std))}
+    covariance = np.diag(np.exp(2 * log_std))
+    if "axes" in prediction:
+        cosine, sine = prediction["axes"][0].astype(float)
+        turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+        covariance = turn @ covariance @ turn.T
+    return {"displacement": displacement, "covariance": covariance}

@@ -7,7 +7,8 @@ deployed filter is
     displacement, log_std = network(window),
     state, pose = filter_step(state, gyro, accel, displacement, covariance),
 
-with covariance = diag(exp(2 max(log_std, log_std_min))). The window can be cut before the step,
+with covariance = diag(exp(2 max(log_std, log_std_min))), turned about z by the angle whose cosine
+and sine are the network's output `axes`, if it has one. The window can be cut before the step,
 because a step changes neither the attitude of the oldest clone nor the biases before it measures.
 
 Other programs know no NamedTuples: the name of an array of the state is its path in it, e.g.
@@ -25,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import Filter, FilterState, Pose, level_state
 from gnio_jax.filtering.checks import checked_state
 from gnio_jax.filtering.displacement import scaled_displacement
@@ -70,14 +72,21 @@ class DeployedState(NamedTuple):
 
 
 def programs(network: Network, ekf: Filter) -> list[Program]:
-    """The four programs of a network and its filter. JAX's x64 must be on."""
+    """The four programs of a network and its filter. JAX's x64 must be on. Raises `InputError` for
+    a filter that measures something else of the network than its displacement."""
     config, noise = ekf.config, ekf.noise
+    for other in ekf.measurements:
+        if getattr(other, "needs", ()):
+            problem = "is not measured by an exported filter, which takes displacements"
+            remedy = "set it to null: the filter then takes the network's displacement"
+            raise InputError(f"filter.measurements.{other.name}", problem, remedy)
     samples = jax.ShapeDtypeStruct((config.reach, 6), jnp.float64)
     shape = DeployedState(state_shapes(config, noise, jnp.float64), samples)
 
     def infer(arrays: Arrays) -> dict[str, Array]:
         prediction = network.apply(network.variables, arrays["window"])
-        return {"displacement": prediction.displacement, "log_std": prediction.log_std}
+        outputs = {"displacement": prediction.displacement, "log_std": prediction.log_std}
+        return outputs if prediction.axes is None else {**outputs, "axes": prediction.axes}
 
     def start(arrays: Arrays) -> dict[str, Array]:
         """`level_state` of a second at rest."""
@@ -121,7 +130,7 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
     read_by_window = {STATE + name: state[STATE + name] for name in _READ_BY_WINDOW}
     interval = {"gyro": float64(n, 3), "accel": float64(n, 3)}
     measured = {"displacement": float64(3), "covariance": float64(3, 3)}
-    network_input = jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32)
+    network_input = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
     return [
         Program("network", infer, {"window": network_input}),
         Program(

@@ -42,7 +42,8 @@ CONVENTIONS = (
     "world. gyro and accel are raw, in the body frame, at `rate`, without holes; accel includes "
     "gravity. A displacement is expressed in the gravity frame of its window's first sample after "
     "the context, whose yaw is zero. covariance of a measurement: diag(exp(2 max(log_std, "
-    "log_std_min))), m²; a displacement of NaN is no measurement. Errors of rotations are in the "
+    "log_std_min))), m², turned about z by the angle whose cosine and sine are the output axes, if "
+    "there is one; a displacement of NaN is no measurement. Errors of rotations are in the "
     "world frame, left-multiplied."
 )
 

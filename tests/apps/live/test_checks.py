@@ -101,12 +101,21 @@ FLIP = np.array([-1.0, 1.0, 1.0])
     ("change", "problem"),
     [
         (lambda g, a: (-g, a), "gravity turns against the gyro"),
-        (lambda g, a: (g[:, SWAP], a[:, SWAP]), "gravity turns against the gyro"),
+        (lambda g, a: (g[:, SWAP], a[:, SWAP]), "against the gyro.*two axes of both sensors$"),
         (lambda g, a: (FLIP * g, FLIP * a), "gravity turns against the gyro"),
-        (lambda g, a: (np.degrees(g).clip(-90, 90), a), "its gyro looks like deg/s"),
-        (lambda g, a: (g[:, [1, 2, 0]], a), "gravity does not turn as the gyro says"),
+        (
+            lambda g, a: (np.degrees(g).clip(-90, 90), a),
+            "its gyro looks like deg/s.*--gyro-unit deg/s$",
+        ),
+        (lambda g, a: (g[:, [1, 2, 0]], a), "not turn as the gyro says.*the same axes$"),
     ],
-    ids=["gyro negated", "x and y exchanged", "x mirrored", "degrees", "axes of the gyro turned"],
+    ids=[
+        "gyro negated",
+        "x and y exchanged",
+        "x mirrored",
+        "degrees",
+        "axes of the gyro turned",
+    ],
 )
 def test_sensors_that_contradict_each_other_end_the_stream(change, problem):
     """Nine seconds after its begin, or with the next look at it, as a recording is refused."""
@@ -115,6 +124,19 @@ def test_sensors_that_contradict_each_other_end_the_stream(change, problem):
     with pytest.raises(InputError, match=rf"udp:5: .*{problem}"):
         seen += (arrival.sample.time for arrival in stage if arrival.sample)
         raise AssertionError(f"followed for {len(seen) / 100} s")
+
+
+@pytest.mark.parametrize(
+    ("remedy", "wanted"),
+    [
+        ("the clock is wrong: give --time-unit (s per stamp) or --sample-rate (Hz)", "in seconds"),
+        ("state the unit of the gyro, as by --gyro-unit 131/deg/s", "or send it in rad/s"),
+        ("state the unit of the gyro, as by --gyro-unit deg/s", "--gyro-unit deg/s"),
+        ("give both sensors the same axes, as by --columns gyro_x=gyro_y", "the same axes"),
+    ],
+)
+def test_a_remedy_names_no_option_that_a_stream_lacks(remedy, wanted):
+    assert checks._for_streams(remedy).endswith(wanted)
 
 
 def test_the_walk_as_it_is_passes_without_a_word():

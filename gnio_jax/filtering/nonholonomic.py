@@ -1,0 +1,84 @@
+"""The non-holonomic constraint of a vehicle as a measurement: a point of it moves neither sideways
+nor up (Dissanayake et al. 2001; in every step with a learnt covariance: Brossard et al. 2020,
+AI-IMU).
+
+With the rotation C (car ← body) and the lever l from the IMU to the point, in the body,
+
+    0 = [C (Rᵀ v + (ω − b_g) × l)]_{left, up} + w,   w ~ N(0, diag(σ_left², σ_up²)).
+
+The velocities that remain are some centimetres a second and last for seconds. They come from the
+springs, the slope of the road and an error of C. So the errors of successive intervals are not
+independent, and a σ must be several times their size.
+
+The three angles and the lever are settings, and no states (ours). Yaw and pitch of C move the
+measured velocity by the speed times the angle, as an error of the attitude does. A filter without
+positions can hardly tell the two apart in one drive. `gnio_jax.filtering.mounting` finds the angles
+in a drive.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from gnio_jax.config.schema import ABOVE_ZERO, FINITE, Number
+from gnio_jax.filtering.state import FilterState
+from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
+from gnio_jax.geometry import hat, matmul
+from gnio_jax.types import Array
+
+THRESHOLD = 13.816
+"""99.9 % of χ² with two degrees of freedom."""
+
+
+class NonHolonomic(NamedTuple):
+    """Measures a velocity of zero to the left and up of a car."""
+
+    lateral_std: Annotated[Number, ABOVE_ZERO] = 1.0
+    """Standard deviation of the velocity to the left, m/s."""
+    vertical_std: Annotated[Number, ABOVE_ZERO] = 1.0
+    """Standard deviation of the velocity up, m/s."""
+    yaw: Annotated[Number, FINITE] = 0.0
+    """Mounting of the IMU, body ← car: R_z(yaw) R_y(pitch) R_x(roll), where the car's axes point
+    ahead, left and up, rad. With zeros the body's axes are the car's."""
+    pitch: Annotated[Number, FINITE] = 0.0
+    roll: Annotated[Number, FINITE] = 0.0
+    lever_x: Annotated[Number, FINITE] = 0.0
+    """Lever from the IMU to the point that does not move sideways, in the body, m. In a car that is
+    steered in front this point is the middle of the rear axle."""
+    lever_y: Annotated[Number, FINITE] = 0.0
+    lever_z: Annotated[Number, FINITE] = 0.0
+    name = "nonholonomic"
+
+    def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
+        """Where the car slides sideways or jumps, the measurement fails a χ² test of 99.9 % and is
+        refused. There is none where the last sample of the interval is missing."""
+        dtype = state.offset.dtype
+        across = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)[1:]
+        lever = jnp.stack([jnp.asarray(x, dtype) for x in self[-3:]])
+        rate = step.imu.gyro[-1] - state.gyro_bias
+        if step.imu.gap is not None:
+            rate = jnp.where(step.imu.gap.gyro_variance[-1] == 0, rate, jnp.nan)
+        velocity = matmul(state.rotation.T, state.velocity[:, None])[:, 0] + jnp.cross(rate, lever)
+        of_velocity = matmul(across, state.rotation.T)
+        linear = linearise(
+            state,
+            -matmul(across, velocity[:, None])[:, 0],
+            jnp.diag(jnp.stack([jnp.asarray(std, dtype) ** 2 for std in self[:2]])),
+            velocity=of_velocity,
+            rotation=matmul(of_velocity, hat(state.velocity)),
+            gyro_bias=matmul(across, hat(lever)),
+        )
+        return measure(state, linear, step, THRESHOLD)
+
+
+def car_axes(yaw: Number, pitch: Number, roll: Number) -> Float[Array, "3 3"]:
+    """C, car ← body: its rows are the car's axes ahead, left and up in the body."""
+    turns = []
+    for angle, (i, j) in ((roll, (1, 2)), (pitch, (2, 0)), (yaw, (0, 1))):
+        cosine, sine = jnp.cos(angle), jnp.sin(angle)
+        turn = jnp.eye(3).at[i, i].set(cosine).at[j, j].set(cosine)
+        turns.append(turn.at[i, j].set(sine).at[j, i].set(-sine))
+    return matmul(turns[0], matmul(turns[1], turns[2]))

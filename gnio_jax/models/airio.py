@@ -1,0 +1,166 @@
+"""AirIO (Qiu et al., "AirIO: Learning Inertial Odometry with Enhanced IMU Feature Observability",
+IEEE RA-L 2025), and the encoder that it shares with AirIMU.
+
+The network sees the samples in the body's frame, with gravity, and the attitude as an input of its
+own. It predicts the velocity in the body, which the filter may measure
+(`filtering.velocity.BodyVelocity`).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jaxtyping import Array, Float, Int
+
+from gnio_jax.config.schema import Count, Probability
+from gnio_jax.models.bidirectional import Bidirectional
+from gnio_jax.models.convolution import convolve, convolve_forward
+from gnio_jax.models.layers import EPSILON, FLOAT32, MOMENTUM, linear
+from gnio_jax.types import Prediction
+
+STRIDE = 9
+"""Samples from one output to the next: two convolutions of stride 3."""
+FIRST_LABEL = 14
+"""Sample of the window whose velocity is the target of the first output."""
+LOG_VARIANCE_SHIFT = 5.0
+"""A variance is exp(x − 5) of the decoder's output x."""
+
+
+class AirIO(nn.Module):
+    """Windows of 12 channels (`data.window_rotation: body_axes`) to the velocity in the body and
+    its uncertainty at every ninth sample, and to the displacement to which they add up.
+
+    Two encoders, of [accel, gyro] in the body and of the attitude as a rotation vector, a
+    projection, two layers of GRU in both directions, and two decoders: 354,278 parameters.
+
+    Published: the velocity in m/s at each sample 14 + 9k, from windows of 5 s, with the attitude
+    in the world. Ours: velocities in metres per window, which are m/s for windows of 1 s; the
+    attitude in the frame in which the window's start has zero yaw, so that a turned world turns the
+    displacement; a displacement with the variance that the outputs have if their errors are the
+    same in the whole window. Outputs whose sample comes after the window are not used.
+
+    `width` scales all layers. Training needs the random stream `dropout`.
+    """
+
+    width: Count = 64
+    dropout: Probability = 0.5
+    channels = 12
+
+    @nn.compact
+    def __call__(self, windows: Float[Array, "b n 12"], train: bool = False) -> Prediction:
+        windows = windows.astype(jnp.float32)
+        rotation = body_axes(windows)
+        imu = windows[..., :6].reshape(*windows.shape[:2], 2, 3)
+        body = jnp.einsum("bnij,bnki->bnkj", rotation, imu).reshape(*windows.shape[:2], 6)
+        parts = {"imu": body, "attitude": rotation_vector(rotation)}
+        features = [
+            StridedEncoder(self.width, self.dropout, name=name)(signal, train)
+            for name, signal in parts.items()
+        ]
+        x = nn.Dropout(self.dropout, deterministic=not train)(jnp.concatenate(features, axis=-1))
+        x = norm("projection_norm", train)(linear(self.width, "projection")(x))
+        x = nn.gelu(x, approximate=False)
+        for layer, units in (("gru1", self.width), ("gru2", 2 * self.width)):
+            x, _ = Bidirectional(units, "gru", name=layer)(x)
+        velocity = Decoder(2 * self.width, name="displacement")(x)
+        log_std = 0.5 * (Decoder(2 * self.width, name="log_std")(x) - LOG_VARIANCE_SHIFT)
+        rows = label_rows(windows.shape[1])
+        velocity, log_std = velocity[:, : len(rows)], log_std[:, : len(rows)]
+        to_window = rotation[:, rows]
+        displacement = jnp.einsum("bnij,bnj->bi", to_window, velocity) / len(rows)
+        variance = jnp.einsum("bnij,bnj->bi", to_window**2, jnp.exp(2 * log_std)) / len(rows)
+        diagnostics = {"body_velocity": velocity, "body_velocity_log_std": log_std}
+        return Prediction(displacement, 0.5 * jnp.log(variance), diagnostics)
+
+
+class StridedEncoder(nn.Module):
+    """Two convolutions of 7 samples and stride 3, each with normalisation and GELU: (b, n, c) to
+    (b, ⌈⌈n/3⌉/3⌉, width). Dropout is within (AirIMU), or is left to the caller (AirIO)."""
+
+    width: int
+    dropout: float
+    within: bool = False
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b n c"], train: bool) -> Float[Array, "b m d"]:
+        for layer, features in (("1", max(self.width // 2, 1)), ("2", self.width)):
+            x = nn.Conv(
+                features,
+                (7,),
+                (3,),
+                [(3, 3)],
+                conv_general_dilated=convolve if train else convolve_forward,
+                name=f"filter{layer}",
+                **FLOAT32,
+            )(x)
+            x = nn.gelu(norm(f"norm{layer}", train)(x), approximate=False)
+            if self.within:
+                x = nn.Dropout(self.dropout, deterministic=not train)(x)
+        return x
+
+
+class Decoder(nn.Module):
+    """Linear, GELU, linear to three axes."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b n d"]) -> Float[Array, "b n 3"]:
+        return linear(3, "fc2")(nn.gelu(linear(self.width, "fc1")(x), approximate=False))
+
+
+def norm(name: str, train: bool) -> nn.BatchNorm:
+    """A batch normalisation that inference does not fold: behind a layer with a bias, or before
+    one."""
+    options = {"momentum": MOMENTUM, "epsilon": EPSILON, "name": name, **FLOAT32}
+    return nn.BatchNorm(use_running_average=not train, **options)
+
+
+def label_rows(samples: int) -> Int[np.ndarray, "m"]:
+    """The samples of a window whose velocities are predicted."""
+    rows = np.arange(FIRST_LABEL, samples, STRIDE)
+    if not len(rows):
+        raise ValueError(f"windows must have more than {FIRST_LABEL} samples, found {samples}")
+    return rows
+
+
+def body_axes(windows: Float[Array, "b n 12"]) -> Float[Array, "b n 3 3"]:
+    """Attitude body → window of every sample: its columns are the body's axes."""
+    x, y = windows[..., 6:9], windows[..., 9:12]
+    return jnp.stack([x, y, jnp.cross(x, y)], axis=-1)
+
+
+def rotation_vector(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
+    """Rotation vectors, rad, of angles up to π, with finite derivatives everywhere.
+
+    It is computed from the quaternion, whose largest component is computed first. At π the sign of
+    the axis jumps, as in every rotation vector.
+    """
+    diagonal = jnp.stack([rotation[..., i, i] for i in range(3)], axis=-1)
+    trace = diagonal.sum(axis=-1, keepdims=True)
+    squares = jnp.concatenate([1 + trace, 1 + 2 * diagonal - trace], axis=-1)
+    pairs = [(2, 1), (0, 2), (1, 0)]
+    skew = [rotation[..., i, j] - rotation[..., j, i] for i, j in pairs]
+    even = [rotation[..., i, j] + rotation[..., j, i] for i, j in pairs]
+    table = jnp.stack(
+        [
+            jnp.stack([squares[..., 0], *skew], axis=-1),
+            jnp.stack([skew[0], squares[..., 1], even[2], even[1]], axis=-1),
+            jnp.stack([skew[1], even[2], squares[..., 2], even[0]], axis=-1),
+            jnp.stack([skew[2], even[1], even[0], squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = jax.lax.stop_gradient(jnp.argmax(squares, axis=-1))
+    row = jnp.take_along_axis(table, largest[..., None, None], axis=-2)[..., 0, :]
+    row = row / jnp.sqrt(jnp.sum(row**2, axis=-1, keepdims=True))
+    row = jnp.where(row[..., :1] < 0, -row, row)
+    squared = jnp.sum(row[..., 1:] ** 2, axis=-1, keepdims=True)
+    small = squared < 1e-8
+    sine = jnp.sqrt(jnp.where(small, 1.0, squared))
+    factor = jnp.where(
+        small, 2 / row[..., :1].clip(0.5), 2 * jnp.arctan2(sine, row[..., :1]) / sine
+    )
+    return factor * row[..., 1:]

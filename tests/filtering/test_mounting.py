@@ -1,0 +1,67 @@
+"""The mounting of an IMU in a car: of simulated drives, and drives that do not show it."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import filtering
+from gnio_jax.errors import InputError
+from gnio_jax.filtering.mounting import find_mounting
+from gnio_jax.filtering.nonholonomic import NonHolonomic
+from tests.support.cars import drive
+
+RATE = 50.0
+NOISE = filtering.NoiseModel(3e-4, 3e-3, 1e-5, 1e-4)
+STD = filtering.InitialStd(gyro_bias=1e-3, accel_bias=0.05)
+
+
+def recording(seed, angles, seconds=100):
+    constraint = NonHolonomic(yaw=angles[0], pitch=angles[1], roll=angles[2])
+    intervals = round(seconds * RATE / 5)
+    ride = drive(seed, 1, intervals, 5, 1 / RATE, NOISE, STD, constraint, 0.05, 0.05)
+    return ride.gyro[0], ride.accel[0]
+
+
+@pytest.mark.parametrize(
+    "degrees", [(0, 0, 0), (170, -20, 5), (-90, 10, 180), (45, 60, -100), (120, -80, 30)]
+)
+def test_the_mounting_is_that_of_the_drive(degrees):
+    angles = np.radians(degrees)
+    mounting = find_mounting(*recording(1, angles), RATE, "drive")
+    turn = Rotation.from_euler("ZYX", angles).inv() * Rotation.from_euler("ZYX", mounting[:3])
+    roll, *ahead = turn.as_rotvec(degrees=True)
+    assert np.hypot(*ahead) < 1.5 and abs(roll) < 2.0
+    assert mounting.std < np.radians(2.0)
+
+
+def test_the_standard_deviation_is_that_of_the_errors():
+    errors, stds = [], []
+    for seed in range(12):
+        mounting = find_mounting(*recording(seed, (0.3, 0.1, 0.0), 40), RATE, "drive")
+        errors.append(max(abs(mounting.yaw - 0.3), abs(mounting.pitch - 0.1)))
+        stds.append(mounting.std)
+    assert np.sqrt(np.mean(np.square(errors))) < 1.5 * np.sqrt(np.mean(np.square(stds)))
+
+
+@pytest.mark.parametrize(
+    "change, problem",
+    [
+        (lambda gyro, accel: (gyro[:900], accel[:900]), "18 s are too short to find the mounting"),
+        (
+            lambda gyro, accel: (0 * gyro, 0 * accel + [0.0, 0.0, 9.81]),
+            "drives at 0.0 m/s in the mean, too slowly",
+        ),
+        (
+            # A motorway: the speed is constant, and there is no turn.
+            lambda gyro, accel: (
+                0 * gyro,
+                0.02 * np.random.default_rng(0).normal(size=accel.shape) + [0.0, 0.0, 9.81],
+            ),
+            "in the mean, too slowly|turns and brakes too little",
+        ),
+    ],
+)
+def test_a_drive_that_does_not_show_the_mounting_is_refused(change, problem):
+    signals = change(*recording(1, (0.0, 0.0, 0.0), 60))
+    with pytest.raises(InputError, match=rf"^drive: .*({problem}).*; give yaw, pitch and roll"):
+        find_mounting(*signals, RATE, "drive")

@@ -1,0 +1,105 @@
+"""AirIO against plain NumPy, and its velocity in the filter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import models
+from gnio_jax.config import LossConfig
+from gnio_jax.models import airio
+from gnio_jax.training.losses import loss_stage, losses
+from gnio_jax.types import Prediction, Windows
+from tests.support.compiling import quick
+from tests.support.networks import drawn, predicted
+from tests.support.numpy_layers import batch_norm, both_ways, conv, float64, gelu, linear
+
+RNG = np.random.default_rng(4)
+
+
+def with_axes(attitude, accel, gyro):
+    """Windows of 12 channels from samples in the body, one window after the other."""
+    parts = [
+        np.einsum("nij,nj->ni", turn, vector)
+        for turn, *vectors in zip(attitude, accel, gyro, strict=True)
+        for vector in vectors
+    ]
+    first, second = (np.stack(parts[k::2]) for k in (0, 1))
+    return np.float32(np.concatenate([first, second, *np.moveaxis(attitude[..., :2], 3, 0)], -1))
+
+
+def encoded(x, q, s):
+    for k in "12":
+        x = conv(x, q[f"filter{k}"]["kernel"], 3, 3) + q[f"filter{k}"]["bias"]
+        x = gelu(batch_norm(x, q[f"norm{k}"], s[f"norm{k}"]))
+    return x
+
+
+def decoded(x, q):
+    return linear(gelu(linear(x, q["fc1"])), q["fc2"])
+
+
+def test_forward_against_numpy():
+    attitude = Rotation.random(2 * 40, RNG).as_matrix().reshape(2, 40, 3, 3)
+    accel, gyro = RNG.standard_normal((2, 2, 40, 3))
+    model = models.create("airio", width=4)
+    variables = drawn(models.variable_shapes(model, 40))
+    (q, s), wanted = float64(variables), []
+    for turn, a, w in zip(attitude, accel, gyro, strict=True):
+        vector = Rotation.from_matrix(turn).as_rotvec()
+        parts = {"imu": np.hstack([a, w]), "attitude": vector}
+        x = np.hstack([encoded(parts[k], q[k], s[k]) for k in parts])
+        x = gelu(batch_norm(linear(x, q["projection"]), q["projection_norm"], s["projection_norm"]))
+        for layer in ("gru1", "gru2"):
+            x, _ = both_ways(x, q[layer], "gru")
+        rows = [14, 23, 32]
+        v, variance = decoded(x, q["displacement"]), np.exp(decoded(x, q["log_std"]) - 5)
+        moved = np.mean([turn[r] @ v[k] for k, r in enumerate(rows)], axis=0)
+        spread = [np.diag(turn[r] @ np.diag(variance[k]) @ turn[r].T) for k, r in enumerate(rows)]
+        wanted.append((v[:3], moved, np.log(np.mean(spread, axis=0)) / 2))
+    velocity, moved, log_std = (np.stack(part) for part in zip(*wanted, strict=True))
+    for found in predicted(model, variables, with_axes(attitude, accel, gyro), False):
+        np.testing.assert_allclose(found.diagnostics["body_velocity"], velocity, atol=1e-5)
+        np.testing.assert_allclose(found.displacement, moved, atol=1e-5)
+        np.testing.assert_allclose(found.log_std, log_std, atol=1e-5)
+
+
+def test_rotation_vectors_are_scipys_and_their_derivative_is_finite_at_the_identity():
+    angles = np.concatenate([[1e-9, 1e-5, 1e-3], np.linspace(0.1, np.pi - 1e-3, 40)])
+    axis = RNG.standard_normal((len(angles), 3))
+    vectors = angles[:, None] * axis / np.linalg.norm(axis, axis=1)[:, None]
+    matrices = Rotation.from_rotvec(vectors).as_matrix()
+    found = quick(airio.rotation_vector)(jnp.asarray(matrices))
+    np.testing.assert_allclose(found, vectors, atol=1e-9)
+    slope = quick(jax.jacrev(airio.rotation_vector))(jnp.eye(3))
+    # The vector of I + hat(v) is v to first order.
+    hat = np.array([[0, -3, 2], [3, 0, -1], [-2, 1, 0]]) * 1.0
+    np.testing.assert_allclose(np.einsum("ijk,jk->i", slope, hat), [1, 2, 3], atol=1e-9)
+
+
+def test_the_loss_is_hubers_and_the_likelihood_of_the_velocity_in_the_body():
+    samples, rows = 30, [14, 23]
+    attitude = Rotation.random(samples, RNG).as_matrix()[None]
+    zeros = np.zeros((1, samples, 3))
+    steps = RNG.standard_normal((1, samples, 3))
+    velocity, log_std = RNG.standard_normal((2, 1, 2, 3))
+    # One error is within Huber's bound.
+    truth = np.stack([attitude[0, r].T @ steps[0, r] * samples for r in rows])
+    velocity[0, 0] = truth[0] + 0.004
+    error, bound = truth - velocity[0], 0.005
+    huber = np.where(abs(error) < bound, error**2 / 2, bound * (abs(error) - bound / 2))
+    likelihood = error**2 / np.exp(2 * log_std[0]) + 2 * log_std[0]
+    wanted = 100 * (huber.mean() + 1e-4 * likelihood.mean())
+    says = {"body_velocity": jnp.asarray(velocity), "body_velocity_log_std": jnp.asarray(log_std)}
+    prediction = Prediction(jnp.zeros((1, 3)), jnp.zeros((1, 3)), says)
+    imu = jnp.asarray(with_axes(attitude, zeros, zeros), jnp.float32)
+    windows = Windows(imu, jnp.zeros((1, 3)), jnp.asarray(steps))
+    config = LossConfig(name="body_velocity")
+    found = losses(prediction, windows, config, loss_stage(config, 0, 1)).total
+    np.testing.assert_allclose(found, wanted, rtol=1e-5)
+
+
+def test_windows_that_are_too_short_are_refused():
+    with pytest.raises(ValueError, match="more than 14 samples, found 14"):
+        airio.label_rows(14)

@@ -1,0 +1,84 @@
+"""VeloBins' head and its loss."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import norm
+
+from gnio_jax import models
+from gnio_jax.config import LossConfig
+from gnio_jax.models.bins import BinHead
+from gnio_jax.training.losses import loss_stage, losses
+from gnio_jax.types import Prediction, Windows
+from tests.support.compiling import quick
+from tests.support.networks import count, drawn
+from tests.support.numpy_layers import linear, softmax
+
+RNG = np.random.default_rng(7)
+HIDDEN = RNG.standard_normal((2, 5))
+CENTRES = np.array([-1.5, -0.5, 0.5, 1.5])
+
+
+def test_6848_parameters_whatever_the_number_of_bins():
+    for bins in (512, 16):
+        shapes = jax.eval_shape(BinHead(bins).init, jax.random.key(0), jnp.zeros((1, 48)))
+        assert count(shapes["params"]) == 6_848
+
+
+def test_mean_and_variance_are_those_of_the_bins():
+    head = BinHead(bins=4, reach=2.0)
+    variables = drawn(jax.eval_shape(head.init, jax.random.key(0), jnp.asarray(HIDDEN)))
+    found, says = quick(head.apply)(variables, jnp.float32(HIDDEN))
+    q = jax.tree.map(lambda x: np.asarray(x, float), variables["params"])
+    code = []
+    for centre in CENTRES:
+        angles = [centre / 2 * 0.5 * 64 ** (j / 31) for j in range(32)]
+        code.append(np.sin(q["code_scale"] * [*np.sin(angles), *np.cos(angles)]))
+    embedding = linear(np.array(code), q["embedding"])
+    for h, mean, log_std in zip(HIDDEN, found, says["log_std"], strict=True):
+        query = linear(h, q["query"]).reshape(3, 32)
+        shares = softmax(query @ embedding.T)
+        wanted = shares @ CENTRES
+        variance = shares @ CENTRES**2 - wanted**2 + 1 / 12  # uniform within a bin of 1 m
+        np.testing.assert_allclose(mean, wanted, atol=1e-5)
+        np.testing.assert_allclose(np.exp(2 * log_std), variance, rtol=1e-4)
+
+
+def label_of(truth, std):
+    """A Gaussian in four bins, tilted to the exact mean by a root search."""
+    weight = np.diff(norm.cdf([-2, -1, 0, 1, 2], truth, std))
+
+    def tilted(tilt):
+        p = weight * np.exp(tilt * CENTRES)
+        return p / p.sum()
+
+    return tilted(brentq(lambda tilt: tilted(tilt) @ CENTRES - truth, -40, 40))
+
+
+def test_the_loss_is_hubers_and_the_divergence_from_a_label_with_the_true_mean():
+    logits = RNG.standard_normal((1, 3, 4))
+    mean = softmax(logits) @ CENTRES
+    truth = mean + np.array([[0.05, -0.6, 0.3]])
+    prediction = Prediction(
+        jnp.asarray(mean),
+        jnp.zeros((1, 3)),
+        {"bin_logits": jnp.asarray(logits), "bin_reach": jnp.full(1, 2.0)},
+    )
+    config, wanted = LossConfig(name="bins"), 0.0
+    for axis in (0, 1):
+        error = abs(truth[0, axis] - mean[0, axis])
+        label = label_of(truth[0, axis], max(error, 0.1))
+        p = softmax(logits[0, axis])
+        wanted += 0.1 * (error - 0.05) if error > 0.1 else error**2 / 2
+        wanted += np.sum(label * np.log(np.maximum(label, 1e-300) / p))
+    windows = Windows(jnp.zeros((1, 5, 6)), jnp.asarray(truth), jnp.zeros((1, 5, 3)))
+    found = losses(prediction, windows, config, loss_stage(config, 0, 1), 2).total
+    np.testing.assert_allclose(found, wanted, rtol=1e-3)
+
+
+def test_a_network_with_bins_has_their_uncertainty():
+    model = models.create("trunk", width=3, head="bins", reach=2.0)
+    shapes = models.variable_shapes(model, 40)
+    assert "uncertainty" not in shapes["params"] and "head" in shapes["params"]
+    assert "uncertainty" not in models.variable_shapes(models.create("gnio", head="bins"))["params"]

@@ -1,0 +1,74 @@
+"""Simulated rides of a car as the filter assumes them to be: a point of it moves ahead, and by
+white noise to the left and up."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.support.walks import GRAVITY, Runs
+
+
+def drive(seed, runs, intervals, n, dt, noise, std, constraint, left_std, up_std, slide=0.0):
+    """Rides with turns, hills, speeds of 2 to 18 m/s and the mounting of a `NonHolonomic`. Sensors,
+    biases and start are disturbed as `noise` and `std` say, and velocities of the point to the left
+    and up at the ends of intervals have the given standard deviations. `slide` is added to the one
+    to the left, m/s at every sample."""
+    rng = np.random.default_rng(seed)
+    samples = intervals * n
+    t = np.arange(samples + 1)[None] * dt
+    phases = rng.uniform(0, 2 * np.pi, (6, runs, 1))
+    speed = 10 + 5 * np.sin(0.35 * t + phases[0]) + 3 * np.sin(0.9 * t + phases[1])
+    yaw = 1.2 * np.sin(0.2 * t + phases[2]) + 0.3 * np.sin(0.7 * t + phases[3])
+    pitch, roll = 0.05 * np.sin(0.5 * t + phases[4]), 0.03 * np.sin(0.8 * t + phases[5])
+    mounting = Rotation.from_euler("ZYX", [constraint.yaw, constraint.pitch, constraint.roll])
+    car = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], -1).reshape(-1, 3)).as_matrix()
+    body = (car @ mounting.as_matrix().T).reshape(runs, samples + 1, 3, 3)
+    turns = np.swapaxes(body[:, :-1], 2, 3) @ body[:, 1:]
+    rate = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(runs, samples, 3) / dt
+
+    across = rng.normal(size=(runs, intervals + 1, 2)) * [left_std, up_std]
+    ends = np.arange(intervals + 1) * n
+    across = np.stack(
+        [[np.interp(np.arange(samples + 1), ends, row) for row in run.T] for run in across]
+    )
+    across[:, 0] += slide
+    of_point = np.concatenate([speed[:, :, None], np.moveaxis(across, 1, 2)], axis=2)
+    lever = np.array([constraint.lever_x, constraint.lever_y, constraint.lever_z])
+    rate_before = np.concatenate([rate[:, :1], rate], axis=1)
+    in_body = of_point @ mounting.as_matrix().T - np.cross(rate_before, lever)
+    velocity = np.einsum("rkij,rkj->rki", body, in_body)
+    force = np.diff(velocity, axis=1) / dt
+    position = np.cumsum(0.5 * dt * (velocity[:, 1:] + velocity[:, :-1]), axis=1)
+
+    start = rng.normal(size=(runs, 9)) * np.repeat(
+        [std.tilt, std.yaw, std.velocity, std.position], [2, 1, 3, 3]
+    )
+    first = (
+        Rotation.from_rotvec(-start[:, :3]).as_matrix() @ body[:, 0],
+        velocity[:, 0] - start[:, 3:6],
+        -start[:, 6:9],
+    )
+    biases, readings = [], []
+    for size, walk, density, signal in (
+        (std.gyro_bias, noise.gyro_bias_walk, noise.gyro_density, rate),
+        (
+            *(std.accel_bias, noise.accel_bias_walk, noise.accel_density),
+            np.einsum("rkji,rkj->rki", body[:, :-1], force - GRAVITY),
+        ),
+    ):
+        steps = walk * np.sqrt(dt) * rng.normal(size=(runs, samples, 3))
+        bias = size * rng.normal(size=(runs, 1, 3)) + np.cumsum(steps, axis=1)
+        white = density / np.sqrt(dt) * rng.normal(size=(runs, samples, 3))
+        readings.append(signal + bias - steps + white)
+        biases.append(bias[:, n - 1 :: n])
+    rows = slice(n, None, n)
+    return Runs(
+        *first,
+        *readings,
+        np.full((runs, intervals, 3), np.nan),
+        body[:, rows],
+        velocity[:, rows],
+        position[:, n - 1 :: n],
+        *biases,
+    )

@@ -1,0 +1,85 @@
+"""RIDI against scikit-learn's own predictions, and its run."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.models import ridi
+from gnio_jax.training import support_vectors
+from gnio_jax.training.support_vectors import LabelledWindows
+
+RNG = np.random.default_rng(10)
+CONFIG = TrainConfig(data=DataConfig(rate=10.0), model=ModelConfig(name="ridi"))
+
+
+def windows_of(count, names=("hand", "leg", "bag")):
+    """Windows whose displacement follows from the mean acceleration, in another way for each
+    placement, which shows in the rate."""
+    label = RNG.integers(len(names), size=count)
+    windows = RNG.normal(0, 0.3, (count, 10, 6)).astype(np.float32)
+    windows[..., 2] += 9.81
+    windows[..., :2] += RNG.normal(0, 1, (count, 1, 2))
+    windows[..., 3] += 2.0 * label[:, None]
+    factor = np.array([1.0, -0.5, 2.0])[label]
+    displacement = windows[..., :2].mean(1) * factor[:, None]
+    return LabelledWindows(windows, displacement, [names[k] for k in label])
+
+
+def test_features_are_the_smoothed_samples_without_gravity():
+    windows = RNG.standard_normal((2, 30, 6)).astype(np.float32)
+    wanted = windows.astype(float)
+    wanted[..., 2] -= 9.81
+    wanted = gaussian_filter1d(wanted, 2.0, axis=1, mode="nearest", truncate=4.0)
+    found = ridi.features(jnp.asarray(windows))
+    np.testing.assert_allclose(found, wanted.reshape(2, -1), atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_predictions_are_those_of_scikit_learn(count):
+    svm = pytest.importorskip("sklearn.svm")
+    data, held_out = (windows_of(90, ("hand", "leg", "bag")[:count]) for _ in range(2))
+    network = support_vectors.fit(data, held_out, CONFIG)
+    found = jax.jit(network.model.apply)(network.variables, jnp.asarray(held_out.windows))
+    smooth = jax.jit(ridi.features)  # to the bit, because the fits stop at a tolerance
+    x, other = (np.asarray(smooth(jnp.asarray(d.windows)), float) for d in (data, held_out))
+    names, gamma = sorted(set(data.placement)), 1 / 60
+    labels = np.array([names.index(name) for name in data.placement])
+    classes = np.zeros(90, int)
+    if count > 1:
+        classes = svm.SVC(C=10.0, gamma=gamma).fit(x, labels).predict(other)
+    np.testing.assert_array_equal(np.argmax(found.diagnostics["placement"], axis=1), classes)
+    wanted, grid = np.zeros((90, 3)), [(c, e) for c in (1.0, 10.0) for e in (0.001, 0.01)]
+    for k in range(count):
+        rows = labels == k
+        for axis, y in enumerate(data.displacement[rows].T):
+            machines = [svm.SVR(C=c, epsilon=e, gamma=gamma) for c, e in grid]
+            scores = [score(machine, x[rows], y) for machine in machines]
+            machine = machines[int(np.argmax(scores))].fit(x[rows], y)
+            wanted[classes == k, axis] = machine.predict(other)[classes == k]
+    np.testing.assert_allclose(found.displacement, wanted, atol=1e-4)
+    rms = np.sqrt(np.mean((held_out.displacement - wanted[:, :2]) ** 2, axis=0))
+    np.testing.assert_allclose(np.exp(found.log_std[0, :2]), rms, rtol=1e-3)
+    assert rms.max() < 0.3 * held_out.displacement.std()  # it has learnt
+
+
+def score(machine, x, y):
+    """Mean R² of three folds in their order, by which a regressor is chosen."""
+    scores = []
+    for part in np.array_split(np.arange(len(x)), 3):
+        others = np.setdiff1d(np.arange(len(x)), part)
+        error = y[part] - machine.fit(x[others], y[others]).predict(x[part])
+        scores.append(1 - np.sum(error**2) / np.sum((y[part] - y[part].mean()) ** 2))
+    return np.mean(scores)
+
+
+def test_a_placement_with_too_few_windows_is_refused():
+    pytest.importorskip("sklearn")
+    data = windows_of(5, ("hand",))
+    with pytest.raises(InputError, match="'hand' has 5 windows, 9 are needed"):
+        support_vectors.fit(data, data, dataclasses.replace(CONFIG))
