@@ -26,12 +26,13 @@ NETWORKS = {
     "ionext": "convolutions that choose between three sizes of kernel (arXiv 2507.17089)",
     "trunk": "one trunk with four kinds of block, for ideas published without sizes (ours)",
     "experts": "a ResNet-18 each for low and high speed, behind a router (ours)",
+    "ridi": "support vectors on features of the window (Yan et al. 2018)",
     "gru": "a gated recurrent unit with memory, the smallest (ours)",
     "state_space": "a state-space network with memory (ours)",
 }
 """Networks of --model.name, in the order of the help, and what each is."""
-DATASETS = ("blackbird", "csv", "euroc", "idol", "indoor_location", "kitti", "oxiod", "ridi")
-DATASETS += ("ronin", "synthetic", "tlio", "tumvi", "tyrex")
+DATASETS = ("blackbird", "comma2k19", "csv", "euroc", "idol", "indoor_location", "kitti")
+DATASETS += ("oxiod", "ridi", "ronin", "synthetic", "tlio", "tumvi", "tyrex")
 """Datasets of --dataset."""
 
 
