@@ -30,8 +30,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The folder is created if it is missing. A reader sees the old file or the whole new one, which
     is on the disk before it replaces the old one. A link stays, and the file that it names is
-    replaced. What killed processes left there is removed. Raises `InputError` if `path` is there
-    and is neither a file nor a folder: a pipe or a device would become a file.
+    replaced. Temporary files of processes that were killed are removed. Raises `InputError` if
+    `path` exists and is neither a file nor a folder: a pipe or a device would become a file.
     """
     path = _target(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -44,7 +44,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary, handle = _locked(create)
     try:
         yield temporary
-        os.fsync(handle)  # it has the errors that some file systems report late
+        os.fsync(handle)  # some file systems report an error only here
         umask = os.umask(0)
         os.umask(umask)
         # mkstemp makes it private: give it the mode of any other new file.
@@ -86,8 +86,9 @@ _LEFTOVER = re.compile(rf"\.(.+){re.escape(PART)}[a-z0-9_]{{8}}(\..*)?")
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what killed processes were writing into a folder. What a process still writes is
-    locked and stays. A folder that was moved away to be replaced returns."""
+    """Remove the temporary files and folders of killed processes in a folder. Those that a process
+    still writes are locked, and they stay. A folder that was moved away to be replaced is moved
+    back."""
     with contextlib.suppress(OSError):
         for path in list(folder.iterdir()):
             if match := _LEFTOVER.fullmatch(path.name):
@@ -146,7 +147,8 @@ def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
 
 def file_in(folder: Path, name: str | Path) -> Path:
     """The file `name` in a folder, or the only one there whose name differs from it in case alone,
-    as systems that do not tell cases apart may have written it. The first if there is neither."""
+    as systems that do not tell cases apart may have written it. If there is neither, it is the path
+    of that name."""
     path = folder / name
     if path.exists():
         return path
@@ -210,7 +212,8 @@ def shown_name(name: str, length: int = 60) -> str:
 
 
 _OLD, _CONTENTS = "old", "contents"
-"""Names inside a temporary folder of the folder that it replaces, or of what was in that."""
+"""Names in a temporary folder: of the folder that is replaced, and of one for its contents if it
+cannot be renamed."""
 
 
 @contextmanager
@@ -218,8 +221,8 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     """Yield an empty folder beside `path`. On success it replaces `path`; on failure it is removed
     and `path` stays.
 
-    The working folder and one that is mounted cannot be renamed: what is in them is replaced. Of a
-    link the folder is replaced that it names. Raises `InputError` if `path` is a file.
+    The working folder and one that is mounted cannot be renamed, so their contents are replaced. If
+    `path` is a link, the folder that it names is replaced. Raises `InputError` if `path` is a file.
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_dir():
@@ -260,12 +263,12 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 
 def _is_fixed(path: Path) -> bool:
-    """Whether a folder cannot be renamed, because it is mounted or has the working folder."""
+    """Whether a folder cannot be renamed, because it is mounted or contains the working folder."""
     return path.is_dir() and (os.path.ismount(path) or Path.cwd().is_relative_to(path))
 
 
 def _replace_contents(path: Path, new: Path, temporary: Path) -> None:
-    """Replace what is in the folder `path` by what is in `new`. On failure it is as before."""
+    """Replace the contents of the folder `path` by those of `new`. On failure they are restored."""
     contents = temporary / _CONTENTS
     contents.mkdir()
     moves: list[tuple[Path, Path]] = []

@@ -142,14 +142,16 @@ _LONG = 16
 def contract_left(
     da: Float[jax.Array, "p k *n"], b: Float[jax.Array, "k q *n"]
 ) -> Float[jax.Array, "p q *n"]:
-    """da b as one product and one sum; so is its transpose, a sum over the columns of b."""
+    """da b as one product and one sum. Its transpose has the same form, with a sum over the columns
+    of b."""
     return _contract(da, b, max(b.shape[:2]))
 
 
 def contract_right(
     a: Float[jax.Array, "p k *n"], db: Float[jax.Array, "k q *n"]
 ) -> Float[jax.Array, "p q *n"]:
-    """a db as one product and one sum; so is its transpose, a sum over the rows of a."""
+    """a db as one product and one sum. Its transpose has the same form, with a sum over the rows of
+    a."""
     return _contract(a, db, max(a.shape[:2]))
 
 
@@ -254,10 +256,12 @@ def exp_rigid(phi: Vector, x: Vector) -> tuple[Matrix, Vector]:
 
 @exp_rigid.defjvp
 def _exp_rigid_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    """dR = hat(J_l dφ) R and dt = J_l dx + K dφ. With u = φ × x, w = φ × u, b = (1 − cos θ)/θ² and
-    c = (θ − sin θ)/θ³ it is t = x + b u + c w, and with the slopes b', c' by θ²
+    """dR = hat(J_l dφ) R and dt = J_l dx + K dφ.
 
-    K = (2 b' u + 2 c' w − 2 c x) φᵀ + c (φ xᵀ + φ·x I) − b hat(x)."""
+    With u = φ × x, w = φ × u, b = (1 − cos θ)/θ² and c = (θ − sin θ)/θ³ the translation is
+    t = x + b u + c w. With the derivatives b', c' by θ²,
+
+        K = (2 b' u + 2 c' w − 2 c x) φᵀ + c (φ xᵀ + φ·x I) − b hat(x)."""
     (phi, x), (d_phi, d_x) = primals, tangents
     eye, generators = np.eye(3, dtype=phi.dtype), _GENERATORS.astype(phi.dtype)
     squared, along = jnp.sum(phi * phi), jnp.sum(phi * x)
@@ -300,9 +304,12 @@ def planar_alignment(
 ) -> tuple[Float[jax.Array, "2 2"], Float[jax.Array, "2"]]:
     """Rotation Q and shift t of the plane with the least Σ w ‖target − (Q source + t)‖².
 
-    With the points a, b relative to their weighted means, the angle of Q is that of the vector (Σ w
-    a · b, Σ w a × b). If its length is 0, as for a single point or points in one place, Q is the
-    identity with zero derivative. The sum of `weight` must be positive.
+    With the points a, b relative to their weighted means, the angle of Q is that of the vector
+
+        (Σ w a · b, Σ w a × b).
+
+    If its length is 0, as for a single point or points in one place, Q is the identity with zero
+    derivative. The sum of `weight` must be positive.
     """
     share = weight[:, None] / jnp.sum(weight)
     means = jnp.sum(share * source, axis=0), jnp.sum(share * target, axis=0)
@@ -319,6 +326,16 @@ def yaw_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:
     derivative.
     """
     return direction(rotation[0, 0], rotation[1, 0])
+
+
+def twist_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:
+    """(cos, sin) of the turn about z in `rotation` = Rz(turn) S, where S turns about a horizontal
+    axis.
+
+    It does not depend on the horizontal axes, as the yaw of a tilted rotation does. Where S turns
+    by 180° it is undefined: (1, 0) is returned, with zero derivative.
+    """
+    return direction(rotation[0, 0] + rotation[1, 1], rotation[1, 0] - rotation[0, 1])
 
 
 def rotation_z(angle: Scalar) -> Matrix:

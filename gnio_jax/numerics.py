@@ -62,7 +62,7 @@ def quaternions(rotation: Rotation) -> Float[np.ndarray, "*k 4"]:
 
 
 def quaternion_product(p: np.ndarray, q: np.ndarray, axis: int = -1) -> np.ndarray:
-    """left ⊗ right of quaternions along `axis`, all other axes broadcast.
+    """p ⊗ q of quaternions along `axis`; all other axes are broadcast.
 
     With the components along the first axis, `axis=0`, long stacks are multiplied several times
     faster.

@@ -126,7 +126,7 @@ class Prediction(NamedTuple):
     model has them."""
     axes: Float[Array, "*b 2"] | None = None
     """Cosine and sine of the angle about z by which the axes of `log_std` are turned; None: they
-    are those of `displacement`. So the covariance is full in the plane."""
+    are those of `displacement`. With turned axes the covariance is full in the plane."""
 
     def covariance(self, least: float, dtype: Any) -> Float[jax.Array, "*b 3 3"]:
         """Covariance of `displacement`, m²: A diag(exp 2u) Aᵀ with the axes A, u raised to

@@ -44,7 +44,7 @@ class AlignedRecording(NamedTuple):
 
     imu: Float[Array, "t c"]
     """[accel m/s², gyro rad/s]: in the body for `single`, else in the world; for `body_axes` with
-    the x and y axes of the body behind them (12 channels)."""
+    the x and y axes of the body after them (12 channels)."""
     rotation: Float[Array, "m 3 3"]
     """Rotation from the frame of `imu` to the gravity-aligned frame of each window."""
 

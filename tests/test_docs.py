@@ -127,9 +127,12 @@ def test_a_measurement_of_ones_own(capsys):
     assert int(accepted.split()[1]) > 390 and heights == "heights 200"
 
 
-def test_the_mounting_in_a_car(capsys):
+def test_a_car_and_the_other_sensors_of_a_phone(capsys):
     run("docs/vehicles.md", code_of("docs/vehicles.md"))
-    assert capsys.readouterr().out.startswith("yaw 0.50 rad, ±0.0")
+    mounting, *errors = capsys.readouterr().out.splitlines()
+    assert mounting.startswith("yaw 0.50 rad, ±0.0")
+    without, magnetometer = (abs(float(line.split()[-1].strip("°"))) for line in errors)
+    assert without > 40 and magnetometer < 10
 
 
 def test_weights_that_are_loaded(tmp_path, monkeypatch):

@@ -163,6 +163,26 @@ def test_what_a_killed_writer_left_is_removed_and_what_is_being_written_stays(tm
     assert (tmp_path / "walk.h5").read_text() == "whole"
 
 
+def test_a_file_that_is_taken_for_a_leftover_is_made_again(tmp_path):
+    """Another process may find it before it is locked."""
+    made = []
+
+    def create():
+        path = tmp_path / f"part{len(made)}"
+        handle = os.open(path, os.O_CREAT | os.O_WRONLY)
+        made.append(path)
+        if len(made) == 1:
+            path.unlink()
+        if len(made) == 2:  # and a third process has the name
+            path.unlink()
+            path.touch()
+        return str(path), handle
+
+    path, handle = files._locked(create)
+    os.close(handle)
+    assert path == made[2] and len(made) == 3
+
+
 def test_a_folder_that_a_killed_writer_moved_away_returns(tmp_path):
     old = tmp_path / f".eval{files.PART}abcd1234" / "old"
     old.mkdir(parents=True)

@@ -58,7 +58,7 @@ class Summary(NamedTuple):
     """Horizontal distance of the end from the start, m."""
     expected_error: float
     """Expected horizontal error at the end, root mean square by the filter's covariance, m. NaN if
-    there are no steps: then the path is no walk's, and no covariance shows how wrong it is."""
+    there are no steps or the filter has diverged: no covariance shows how wrong the path is."""
     steps: float | None
     """Share of the seconds that are within a walk (`detect_gait`); None if it is too short."""
     at_rest: float
@@ -98,6 +98,7 @@ def summarise(
     filtered, sequence = estimate.filtered, recording.sequence
     assert filtered is not None
     rows = int(np.flatnonzero(estimate.trajectory.known)[-1]) + 1
+    has_diverged = rows < len(estimate.trajectory.time)
     time, position = estimate.trajectory.time[:rows], estimate.trajectory.position[:rows]
     used = filtered.accepted[:rows]
     used = used[np.isfinite(used)]
@@ -114,7 +115,7 @@ def summarise(
         if rows < 2
         else metrics.path_length(position[:, :2], float(time[1] - time[0])),
         from_start=float(np.linalg.norm((position[-1] - position[0])[:2])),
-        expected_error=error if gait.has_steps else np.nan,
+        expected_error=error if gait.has_steps and not has_diverged else np.nan,
         steps=float(gait.walking.mean()) if len(gait.walking) else None,
         at_rest=_share_at_rest(ready, ekf),
         running=float(gait.running.mean()) if len(gait.running) else 0.0,
@@ -124,14 +125,14 @@ def summarise(
         warnings=(),
         notes=(*recording.notes, *ready.notes),
     )
-    recorded_rate = 1.0 / float(np.median(np.diff(sequence.time)))
-    recorded_rate = min(recorded_rate, float(sequence.attributes.get(RECORDED_RATE, recorded_rate)))
+    rate = 1.0 / float(np.median(np.diff(sequence.time)))
+    recorded_rate = min(rate, float(sequence.attributes.get(RECORDED_RATE, rate)) or rate)
     warnings = (
+        *(note for note in estimate.notes if note not in ready.notes),  # of a divergence
         *_warnings_of_gait(gait, summary.steps),
         *recording.warnings,
         *_warnings(summary, recorded_rate, ekf),
         *_warnings_of_start(ready, recording, ekf),
-        *(note for note in estimate.notes if note not in ready.notes),  # of a divergence
     )
     return summary._replace(warnings=warnings)
 

@@ -179,8 +179,11 @@ def _draw(
     view = make_view(result, alignment=None)
     length = f"{summary.path_length:.1f} m in {summary.seconds:.0f} s"
     error = summary.expected_error
-    expected = "no walk" if np.isnan(error) else f"expected error at the end {error:.1f} m"
-    title = f"{shown_name(summary.recording)}: {length}, {expected}"
+    title = f"{shown_name(summary.recording)}: {length}"
+    if np.isnan(error):
+        title += f", {summary.warnings[0].partition(':')[0]}"
+    else:
+        title += f", expected error at the end {error:.1f} m"
     drawing.save(folder / "track.png", plots.sequence(view, title))
     aligned = "start position and yaw" if result.waypoints is None else tabulate.TO_WAYPOINTS
     share = np.isfinite(result.reference.position).all(axis=1).mean()

@@ -81,9 +81,9 @@ def compare_filters(
     """The errors of the trajectories that the filter has with the settings of a run (`before`) and
     with the calibrated ones (`after`).
 
-    Both run on the displacements that the calibration was fitted to, as in the loose coupling. With
-    the network in its loop, as an evaluation has it, a large network would need as much time as the
-    whole calibration. The ATE of the two differed by up to 8 % in trials. (ours)
+    Both run on the displacements that the calibration was fitted to, as in the loose coupling
+    (ours). With the network in its loop, as in an evaluation, a large network would need as much
+    time as the whole calibration. In trials the ATE of the two couplings differed by up to 8 %.
     """
     # Recordings of two datasets may have one name.
     numbered = [recording._replace(name=str(k)) for k, recording in enumerate(recordings)]
@@ -93,7 +93,7 @@ def compare_filters(
     groups = {recording.name: recording.group for recording in numbered}
     errors = {}
     for metric in METRICS:
-        # With the filters as its seeds, a summary is over what has not diverged with either.
+        # With the filters as its seeds, a summary is over the recordings that diverge with neither.
         means = summarise(scores, metric, groups).seeds
         errors[metric] = Change(*means) if means else Change(None, None)
     diverged = (sum(measures.diverged for measures in row.values()) for row in scores)

@@ -1,5 +1,5 @@
-"""The data of a calibration: recordings, and the displacements that a network predicts for them
-which was not trained on them."""
+"""The data of a calibration: recordings, and the displacements that a network predicts for them.
+The network was not trained on them."""
 
 from __future__ import annotations
 

@@ -253,9 +253,8 @@ def terminal(shown: bool = True) -> Iterator[Terminal]:
         progress.TextColumn("{task.fields[numbers]}", table_column=cut),
     )
     disable = not (shown and console.is_terminal)
-    with progress.Progress(
-        *columns, console=console, transient=True, disable=disable, speed_estimate_period=120
-    ) as bars:
+    settings = {"transient": True, "disable": disable, "speed_estimate_period": 120, "expand": True}
+    with progress.Progress(*columns, console=console, **settings) as bars:
         yield Terminal(bars)
 
 

@@ -170,8 +170,9 @@ def _open(request: LiveOptions, running: contextlib.ExitStack) -> tuple[Any, Cal
         holds_rest = any(one.name == "zero_velocity" for one in measurements)
         server.state = partial(state.describe, result, source.nature, run.name, holds_rest)
 
-    where = "" if server.is_local else " (everybody in this network can look at it)"
-    console.say(f"page: {server.address}{where}")
+    able = "can look at it" if server.inbox is None else "can send samples and look at it"
+    note = "" if server.is_local else f" (everybody in this network {able})"
+    console.say(f"page: {server.address}{note}")
     return source, show
 
 

@@ -21,6 +21,11 @@ NETWORKS = {
     "ctin": "a contextual transformer with two branches (Rao et al. 2022)",
     "imot": "an inertial motion transformer (Nguyen et al. 2025)",
     "imot_text": "the same, in those details in which its text differs",
+    "airio": "velocities in the body's axes, with the attitude as an input (Qiu et al. 2025)",
+    "ionet": "a bidirectional LSTM for polar displacements (Chen et al. 2018)",
+    "ionext": "convolutions that choose between three sizes of kernel (arXiv 2507.17089)",
+    "trunk": "one trunk with four kinds of block, for ideas published without sizes (ours)",
+    "experts": "a ResNet-18 each for low and high speed, behind a router (ours)",
     "gru": "a gated recurrent unit with memory, the smallest (ours)",
     "state_space": "a state-space network with memory (ours)",
 }
@@ -31,8 +36,11 @@ DATASETS += ("ronin", "synthetic", "tlio", "tumvi", "tyrex")
 
 
 def check_names(networks: Iterable[str] = (), datasets: Iterable[str] = ()) -> None:
-    """Raise `InputError` for a network or dataset that does not exist. Names are not checked where
-    a plugin, or the program that has imported JAX, may have added others."""
+    """Raise `InputError` for a network or dataset that does not exist.
+
+    Names are not checked where a plugin, or the program that has imported JAX, may have added
+    others: the registries check them later.
+    """
     added = "jax" in sys.modules or environ.get(plugins.VARIABLE)
     if added or entry_points(group=plugins.GROUP):
         return

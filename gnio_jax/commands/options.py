@@ -349,7 +349,8 @@ def _overview(group: Group, prog: str) -> str:
     for name, command in group.commands.items():
         is_group = isinstance(command, Group)
         text = command.help if is_group else inspect.getdoc(function(command)) or ""
-        lines.append(f"  {name:<11}{text.partition(chr(10))[0]}")
+        indents = {"initial_indent": f"  {name:<11}", "subsequent_indent": " " * 13}
+        lines.append(textwrap.fill(text.partition("\n")[0], WIDTH, **indents))
     return "\n".join(
         [
             f"{description}\nusage: {prog} COMMAND [OPTIONS]\n",

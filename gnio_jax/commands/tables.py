@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import sys
 
 from rich import box
@@ -55,7 +56,9 @@ def tables(request: TablesConfig, _call: options.Call) -> None:
 def _table(lines: list[str]) -> Table:
     """A table of Markdown for a terminal. One with many columns is turned: the rows become
     columns."""
-    header, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
+    split = re.compile(r"(?<!\\)\|").split  # a bar in a cell is escaped
+    cells = [[cell.strip().replace("\\|", "|") for cell in split(line)[1:-1]] for line in lines]
+    header, _, *rows = cells
     if len(header) > MOST_COLUMNS:
         header, *rows = map(list, zip(header, *rows, strict=True))
     table = Table(box=box.SIMPLE_HEAD)

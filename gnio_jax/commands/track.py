@@ -69,15 +69,15 @@ def track(request: TrackOptions, call: options.Call) -> None:
         details = {"command": str(call), "rerun_file": request.rerun}
         result = tracking.track(recording, trained, out, request.format, **details)
     summary = result.summary
-    no_walk = summary.warnings[:1] if math.isnan(summary.expected_error) else ()
-    for warning in no_walk:  # before every figure
+    first = summary.warnings[:1] if math.isnan(summary.expected_error) else ()
+    for warning in first:  # it says why there is no expected error, before every figure
         console.say(f"warning: {warning}")
     for note in summary.notes:
         console.say(f"  {note}")
     console.say(_table(summary))
-    for warning in summary.warnings[len(no_walk) :]:
+    for warning in summary.warnings[len(first) :]:
         console.say(f"warning: {warning}")
-    if not no_walk:  # what was measured are walks
+    if not first:  # what was measured are whole walks
         measured = summary.measured or "its error was not measured (gnio evaluate)"
         console.say(f"network {summary.network}: {measured}")
     console.say(f"results: {result.folder} (open report.html, or look at track.png)")

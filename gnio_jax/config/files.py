@@ -223,8 +223,8 @@ def check_value(hint: Any, content: Any, location: Location, base: Any = None) -
 
 
 def _read_mapping(hint: Any, content: Any, location: Location, base: Mapping) -> Entries:
-    """The mapping `base` with the entries of another one, whose values have the type `hint`; an
-    entry that is null goes."""
+    """The mapping `base` with the entries of another one, whose values have the type `hint`. An
+    entry that is null is removed."""
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         location.refuse(f"must be a mapping of names, found {_show(content)}")
     entries = dict(base)

@@ -1,5 +1,6 @@
-"""The options of the commands other than `gnio train`: frozen dataclasses whose field comments are
-the text of `--help`."""
+"""The options that functions of the library take from a command: frozen dataclasses whose field
+comments are the text of `--help`. `gnio train` takes a `TrainConfig`. Options that only a command
+reads are in its file in `commands/`."""
 
 from __future__ import annotations
 

@@ -236,8 +236,8 @@ class AugmentConfig:
     walkway: Annotated[tuple[Factor, Factor], FILE_ONLY] = (0.45, 2.0)
     """Smallest and largest factor of the mean speed on a walkway."""
     alternating_gain: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
-    """Smallest and largest factor of what is not slow in position and acceleration, for segments
-    (ours)."""
+    """Smallest and largest factor of the fast part of position and acceleration, for segments: of
+    the gait without the mean motion (ours)."""
     time_stretch: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
     """Smallest and largest factor of the pace at which a segment is played (ours)."""
 
@@ -493,7 +493,7 @@ class FilterOptions:
     rest_accel: NonNegative = 0.3
     """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
     rest_seconds: NonNegative = 0.5
-    """How long the IMU is quiet before it rests, s."""
+    """How long the IMU must be quiet before it counts as at rest, s."""
     bridge_seconds: NonNegative = 0.1
     """For this long, s, the last IMU sample stands in for missing ones; then the filter coasts with
     constant attitude and velocity, and windows are no measurements."""
@@ -544,7 +544,7 @@ class FilterSettings(FilterOptions):
 
 
 SHORTEST_HORIZON = 1.0
-"""Times of the relative errors in the losses through the filter, s."""
+"""Shortest time over which the losses through the filter compare displacements, s."""
 Part = Literal["noise", "measurement", "start", "uncertainty", "head", "encoder", "all"]
 """A part of network and filter that can be trained."""
 

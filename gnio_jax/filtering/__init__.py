@@ -1,16 +1,19 @@
 """Stochastic-cloning extended Kalman filter: inertial propagation, displacement measurements,
 network in the loop.
 
-The network is any function from windows to a `Prediction`.
+The network is any function from windows to a `Prediction`, or a network that carries a memory from
+one clone interval to the next (`network`). `Filter` is the filter as one value, and `scan` runs it.
 """
 
 from gnio_jax.config import ConsideredStd, CorrelatedError, FilterSettings, InitialStd, NoiseModel
+from gnio_jax.filtering.barometer import Barometer, barometer_on_intervals
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.consider import considered_covariance, sensitivity, with_considered
 from gnio_jax.filtering.displacement import displacements
 from gnio_jax.filtering.filter import Filter, make_filter
 from gnio_jax.filtering.fix import Fix, fixes_on_intervals
 from gnio_jax.filtering.history import FilterHistory, explain_failure
+from gnio_jax.filtering.magnetometer import Magnetometer, magnetometer_on_intervals
 from gnio_jax.filtering.measurements import register
 from gnio_jax.filtering.mounting import Mounting, find_mounting
 from gnio_jax.filtering.nonholonomic import NonHolonomic
@@ -25,6 +28,7 @@ from gnio_jax.filtering.waypoints import WaypointPoses, waypoint_poses
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
 
 __all__ = [
+    "Barometer",
     "ConsideredStd",
     "CorrelatedError",
     "Filter",
@@ -36,6 +40,7 @@ __all__ = [
     "GateState",
     "InitialStd",
     "Linearised",
+    "Magnetometer",
     "Mounting",
     "NoiseModel",
     "NonHolonomic",
@@ -46,6 +51,7 @@ __all__ = [
     "Tracker",
     "WaypointPoses",
     "ZeroVelocity",
+    "barometer_on_intervals",
     "considered_covariance",
     "cores_as_devices",
     "displacements",
@@ -55,6 +61,7 @@ __all__ = [
     "initial_state",
     "level_state",
     "linearise",
+    "magnetometer_on_intervals",
     "make_filter",
     "measure",
     "over_sequences",

@@ -100,8 +100,9 @@ def check_rotation(name: str, value: jax.Array) -> None:
 
 
 def check_covariance(name: str, value: jax.Array, kinds: Int[np.ndarray, " n"]) -> None:
-    """Refuse a matrix that is not symmetric and positive semi-definite, up to rounding. Entries of
-    one of the `kinds` are compared by the largest of them."""
+    """Refuse a matrix that is not symmetric and positive semi-definite, up to rounding. `kinds` has
+    the kind of each row; rows of one kind are scaled by the largest standard deviation among
+    them."""
     if isinstance(value, Tracer):
         return
     matrix = np.asarray(value, np.float64)
@@ -131,7 +132,7 @@ def check_number(name: str, value: Any, least: float, unit: str) -> None:
 
 
 def check_bounds(name: str, number: Any, limits: Iterable[Bound]) -> None:
-    """Refuse what is neither None nor one number within the limits."""
+    """Refuse anything but None, or one number within the limits."""
     if np.shape(number) != ():
         raise ValueError(f"{name}: must be one number, found shape {np.shape(number)}")
     for bound in limits:
@@ -159,8 +160,9 @@ def checked_inputs(
     imu_valid: Any,
     measurements: tuple[Any, ...],
 ) -> FilterInputs:
-    """The arguments that every run takes, checked and in the state's precision. Of the values of
-    measurements only those of a `Fix` are checked: NaN is no measurement."""
+    """The arguments that every run takes, checked and in the state's precision. The values of
+    measurements are not checked, because a NaN means that there is none; only those of a `Fix`
+    are."""
     check_filter(ekf)
     config, state = ekf.config, checked_state(state, ekf)
     dtype, n = state.offset.dtype, config.samples_per_clone
@@ -202,8 +204,9 @@ def checked_inputs(
 
 
 def check_measurements(argument: str, measurements: Any, others: tuple[Any, ...] = ()) -> None:
-    """Refuse what is no tuple of objects with a method `update` and a name of its own, which none
-    of the `others` has; a `Fix` alone is a tuple of arrays."""
+    """Refuse anything but a tuple of objects, each with a method `update` and a name that no other
+    one of them and none of the `others` has. A single `Fix` is refused, because it is a tuple of
+    arrays."""
     alone = callable(getattr(measurements, "update", None))
     if alone or not isinstance(measurements, tuple | list):
         kind = type(measurements).__name__
@@ -224,9 +227,9 @@ def check_measurements(argument: str, measurements: Any, others: tuple[Any, ...]
 
 
 def check_fix(name: str, fix: Fix) -> None:
-    """Refuse fixes of other shapes, and those that cannot be: with a covariance that is not
-    symmetric and positive definite, or with another number that is NaN or out of bounds. Rows
-    without a component are not checked."""
+    """Refuse fixes of wrong shapes or with impossible numbers: a covariance that is not symmetric
+    and positive definite, or another number that is NaN or out of bounds. Rows without a component
+    are not checked."""
     count = len(fix.position)
     axes = fix.position.shape[1] if fix.position.ndim == 2 else 0
     if axes not in THRESHOLDS:
@@ -258,7 +261,7 @@ def check_fix(name: str, fix: Fix) -> None:
 
 
 def check_filter(ekf: Any) -> None:
-    """Refuse what is no `Filter`, or one with impossible parts."""
+    """Refuse anything but a `Filter`, and a filter with impossible parts."""
     if not isinstance(ekf, Filter):
         kind = type(ekf).__name__
         raise ValueError(f"ekf: must be a Filter, e.g. Filter(FilterConfig(...)), found {kind}")
@@ -314,7 +317,7 @@ def checked_state(state: FilterState, ekf: Filter) -> FilterState:
 def checked_displacements(
     displacement: Any, covariance: Any, inputs: FilterInputs
 ) -> tuple[jax.Array, jax.Array]:
-    """A displacement and its covariance for every clone interval of a run, in its precision. Those
+    """A displacement and its covariance for every clone interval of a run, in its precision. Rows
     with a NaN are not checked."""
     config = inputs.ekf.config
     dtype, count = inputs.gyro.dtype, len(inputs.gyro) // config.samples_per_clone

@@ -80,9 +80,9 @@ def with_considered(
     """The covariances of θ, v, p, b_g, b_a that a filter or a smoother with `config` reports, with
     S C Sᵀ = `added`.
 
-    In the invariant form the arc of the place (`state.arc_covariance`) is that of the yaw's whole
-    uncertainty. The arc has no part in the yaw's own rows, so the reported covariance shows the
-    filter's part of it.
+    In the invariant form the arc of the position (`state.arc_covariance`) is that of the yaw's
+    whole uncertainty, and replaces the arc of the filter's part, which `covariance` contains. That
+    one is computed from the rows of the yaw, to which an arc adds nothing.
     """
     total = covariance + added
     if not config.invariant:

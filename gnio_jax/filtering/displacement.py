@@ -43,7 +43,7 @@ from gnio_jax.filtering.update import (
 from gnio_jax.types import Array
 
 LEAST_WEIGHT = 1e-6
-"""Smallest weight of a measurement behind a gate with a slope, so that its covariance is
+"""Smallest weight that a gate with a slope gives to a measurement, so that its covariance is
 bounded."""
 GIMBAL = 1e-5
 """Below this |cos pitch| the yaw of the oldest clone has no derivative, and a displacement that is
@@ -62,6 +62,7 @@ class Displacement:
     covariance: Float[Array, "*k 3 3"]
     """Covariance after scaling, m²; positive definite even where there is no displacement."""
     present: Bool[Array, "*k"]
+    """Whether there is a displacement."""
     frame: YawFrame = field(metadata={"static": True})
     """The yaw frame: by the filter's own attitude of the oldest clone, or by another one
     (`YawFrame`)."""
@@ -87,7 +88,7 @@ class Displacement:
             weaker = linear._replace(covariance=linear.covariance + (factor - 1) * self.covariance)
             _, correction = project(state, weaker, step)
             accepted = tested
-        # What is no covariance must spoil the state, which `healthy` reports.
+        # A matrix that is no covariance must spoil the state, and `healthy` then reports it.
         accepted = accepted | (outcome.present & jnp.isnan(outcome.nis))
         outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
         return correct(state._replace(gate=gate), outcome, correction, step)

@@ -39,8 +39,8 @@ class Fix(NamedTuple):
     """A horizontal (m = 2) or a three-dimensional position (m = 3), or a row for each of K clone
     intervals. It is an entry of `measurements` of `run_filter`, `run_odometry` and `smooth`.
 
-    Outside `jit` these refuse a fix that cannot be, naming the field. Inside `jit`, where values
-    are not known, such a fix is none.
+    Outside `jit` these three refuse a fix with impossible numbers, naming the field. Inside `jit`,
+    where values are not known, such a fix counts as missing.
     """
 
     position: Float[Array, "*k m"]
@@ -92,8 +92,8 @@ class Fix(NamedTuple):
 
 
 def improper(fix: Fix) -> Bool[Array, ""]:
-    """Whether one fix cannot be: its covariance is not symmetric and positive definite, or another
-    number is NaN or out of bounds."""
+    """Whether one fix has impossible numbers: its covariance is not symmetric and positive
+    definite, or another number is NaN or out of bounds."""
     present = jnp.isfinite(fix.position)
     pairs = present[:, None] & present[None]
     covariance = jax.lax.stop_gradient(jnp.where(pairs, fix.covariance, jnp.eye(len(present))))

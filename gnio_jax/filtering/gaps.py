@@ -27,7 +27,7 @@ class Gap(NamedTuple):
     gyro_variance: Float[Array, "*n"]
     """Added to the variance of the white noise, (rad/s)²."""
     accel_variance: Float[Array, "*n"]
-    """The same, (m/s²)²."""
+    """The same of the accelerometer, (m/s²)²."""
     used: Float[Array, "*n"]
     """1, or 0 where the filter coasts."""
 
@@ -51,8 +51,8 @@ def no_gap(n: int, dtype: np.dtype) -> Gap:
 def after_window(
     stream: Imu, window: Float[Array, "r 7"] | None, config: FilterConfig
 ) -> tuple[Imu, Float[Array, "r 7"]]:
-    """The stream behind the samples of `FilterState.window` (zeros if there are none yet), and the
-    last samples of both, as the window for a later run."""
+    """The samples of `FilterState.window` (zeros if there are none yet) with the stream after them,
+    and the last samples of the two together, which are the window of a later run."""
     used = np.ones(len(stream.gyro)) if stream.gap is None else stream.gap.used
     dtype, reach = stream.gyro.dtype, config.reach
     used = jnp.asarray(used, dtype)[:, None]

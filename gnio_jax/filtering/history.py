@@ -123,7 +123,7 @@ def describe_failure(mean: Mean, variances: Float[np.ndarray, "15"], config: Fil
 
 
 class StepRecord(NamedTuple):
-    """The addition of one clone step to the history, or of K steps, stacked."""
+    """What one clone step adds to the history, or what K steps add, stacked."""
 
     mean: Mean
     covariance: Array

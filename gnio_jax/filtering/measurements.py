@@ -1,8 +1,7 @@
 """The measurements by name: those that a file may list in `filter.measurements`.
 
 A measurement of your own is a NamedTuple of numbers with a `name` and a method `update` (see
-`update.Measurement`). `register` makes it known. docs/differentiable_filter.md has
-an example.
+`update.Measurement`). `register` makes it known. docs/measurements.md has an example.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
 """The mounting of an IMU in a car, found from a drive without any position (ours).
 
-In pieces of some seconds the IMU shows the velocity in its own axes but for a few numbers. With the
-attitude R_t that the gyro gives since the start of the piece,
+Over a piece of some seconds the IMU determines the velocity in its own axes up to a few numbers.
+With the attitude R_t since the start of the piece, which the gyro gives,
 
     u_t = R_tᵀ (v_0 + Σ R f Δt + γ t),
 
-where v_0 is the velocity at the start and γ gravity, both in the axes of the start. γ is known to
-the tilt and the bias of the accelerometer. A car goes along its axis ahead a, so for the right a,
-v_0 and γ the part of u_t across a is small. For each a the best v_0 and γ are a linear
-least-squares problem, so a search over a remains, which is two angles. The car goes ahead and not
-back, so a · u_t is positive in the mean. The axis up is that of the mean force across a.
+where v_0 is the velocity at the start and γ gravity, both in the axes of the start. γ is known up
+to the tilt and the bias of the accelerometer. A car moves along its axis ahead a, so for the right
+a, v_0 and γ the part of u_t across a is small. For each a the best v_0 and γ are the solution of a
+linear least-squares problem. So a search over a remains, which has two angles. The car drives ahead
+and not back, so a · u_t is positive in the mean. The axis up is the direction of the mean force
+across a.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ EVERY = 0.2
 GRAVITY_STD, VELOCITY_STD, ACROSS_STD = 0.3, 20.0, 0.1
 """Standard deviations of a component of γ, m/s², of v_0, m/s, and of the velocity across, m/s."""
 CORRELATED_SECONDS = 2.0
-"""For this long an error of the velocity across lasts, s."""
+"""Time for which an error of the velocity across lasts, s."""
 LEAST_SPEED = 1.0
-"""Mean speed below which a drive is none, m/s."""
+"""Mean speed below which a recording does not count as a drive, m/s."""
 LARGEST_STD = np.radians(5.0)
 """Standard deviation of the axis ahead, above which no mounting is given, rad."""
 

@@ -73,8 +73,7 @@ def has_memory(predict: Predict | PredictWithMemory) -> TypeGuard[PredictWithMem
 
 def first_memory(predict: PredictWithMemory, ekf: Filter, state: FilterState) -> Memory:
     """The memory at the start of a run: that of the state, or an empty one. Raises `ValueError` if
-    the state has the memory of another network, and for windows that a network with memory has
-    not."""
+    the state has the memory of another network, or if `window_rotation` is not "per_sample"."""
     if ekf.config.window_rotation != "per_sample":
         problem = "a network with memory rotates every sample with its own attitude"
         raise ValueError(f"ekf.config.window_rotation: {problem}: it must be 'per_sample'")
@@ -111,8 +110,12 @@ def memory_step(predict: PredictWithMemory, ekf: Filter) -> MemoryStep:
             memory = jax.tree.map(lambda x, new: jnp.where(coasted, new, x), memory, empty)
         window = config.clones_per_window
         whole = (memory.intervals >= window) & (state.step >= window)
-        displacement = jnp.where(whole, prediction.displacement, jnp.nan)
-        return memory, Recall(prediction._replace(displacement=displacement), memory.heading)
+        displacement, diagnostics = jax.tree.map(
+            lambda leaf: jnp.where(whole, leaf, jnp.nan),
+            (prediction.displacement, prediction.diagnostics),
+        )
+        prediction = Prediction(displacement, prediction.log_std, diagnostics)
+        return memory, Recall(prediction, memory.heading)
 
     return advance
 
@@ -125,10 +128,14 @@ def recalled_displacement(
     dtype = state.offset.dtype
     to_world = geometry.heading_rotation(*recall.heading.astype(dtype))
     turn = geometry.matmul(geometry.yaw_rotation(state.clone_rotation[oldest]).T, to_world)
-    covariance = recall.prediction.covariance(ekf.config.log_std_min, dtype)
-    covariance = geometry.matmul(geometry.matmul(turn, covariance), turn.T)
     displacement = recall.prediction.displacement.astype(dtype)
-    turned = geometry.matmul(turn, displacement[:, None])[:, 0]
+    covariance = recall.prediction.covariance(ekf.config.log_std_min, dtype)
+    # No NaN may enter the products, because otherwise the derivatives would be NaN too.
+    finite = jnp.isfinite(displacement).all() & jnp.isfinite(covariance).all()
+    turned = geometry.matmul(turn, jnp.where(finite, displacement, 0.0)[:, None])[:, 0]
+    turned = jnp.where(finite, turned, jnp.nan)
+    covariance = jnp.where(finite, covariance, jnp.eye(3, dtype=dtype))
+    covariance = geometry.matmul(geometry.matmul(turn, covariance), turn.T)
     symmetric = 0.5 * (covariance + covariance.T)
     measured = scaled_displacement(turned, symmetric, ekf.noise, ekf.config.displacement_frame)
     return measured, recall.prediction.diagnostics
@@ -197,13 +204,14 @@ def _check(prediction: Any) -> None:
     if not isinstance(prediction, Prediction):
         kind = type(prediction).__name__
         raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")
-    axes = prediction.axes
-    if axes is not None and axes.shape != (1, 2):
-        raise ValueError(f"predict: axes must be (1, 2) for one window, found {axes.shape}")
-    for name, value in {**prediction._asdict(), **prediction.diagnostics}.items():
-        if name in ("displacement", "log_std") and value.shape != (1, 3):
-            raise ValueError(f"predict: {name} must be (1, 3) for one window, found {value.shape}")
-        if name in prediction.diagnostics and value.shape[:1] != (1,):
+    axes = () if prediction.axes is None else (("axes", prediction.axes, 2),)
+    vectors = ("displacement", prediction.displacement, 3), ("log_std", prediction.log_std, 3)
+    for name, value, size in (*vectors, *axes):
+        if value.shape != (1, size):
+            shapes = f"must be (1, {size}) for one window, found {value.shape}"
+            raise ValueError(f"predict: {name} {shapes}")
+    for name, value in prediction.diagnostics.items():
+        if value.shape[:1] != (1,):
             problem = f"must have a leading axis of one window, found {value.shape}"
             raise ValueError(f"predict: diagnostics['{name}'] {problem}")
 

@@ -6,14 +6,14 @@ With the rotation C (car ← body) and the lever l from the IMU to the point, in
 
     0 = [C (Rᵀ v + (ω − b_g) × l)]_{left, up} + w,   w ~ N(0, diag(σ_left², σ_up²)).
 
-The velocities that are left, some centimetres a second, last for seconds: springs, slope of the
-road, an error of C. Measured every interval they are not white, so a σ must be several times their
-size.
+The velocities that remain are some centimetres a second and last for seconds. They come from the
+springs, the slope of the road and an error of C. So the errors of successive intervals are not
+independent, and a σ must be several times their size.
 
-The three angles and the lever are settings, and no states (ours): yaw and pitch of C move the
-measured velocity by the speed times the angle, as an error of the attitude does, so a filter
-without positions can hardly tell them apart in one drive. `gnio_jax.filtering.mounting` finds the
-angles in a drive.
+The three angles and the lever are settings, and no states (ours). Yaw and pitch of C move the
+measured velocity by the speed times the angle, as an error of the attitude does. A filter without
+positions can hardly tell the two apart in one drive. `gnio_jax.filtering.mounting` finds the angles
+in a drive.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class NonHolonomic(NamedTuple):
     pitch: Annotated[Number, FINITE] = 0.0
     roll: Annotated[Number, FINITE] = 0.0
     lever_x: Annotated[Number, FINITE] = 0.0
-    """Point that does not move sideways, from the IMU, in the body, m: in a car that is steered in
-    front it is in the middle of the rear axle."""
+    """Lever from the IMU to the point that does not move sideways, in the body, m. In a car that is
+    steered in front this point is the middle of the rear axle."""
     lever_y: Annotated[Number, FINITE] = 0.0
     lever_z: Annotated[Number, FINITE] = 0.0
     name = "nonholonomic"

@@ -89,7 +89,8 @@ def integrate(start: Mean, imu: Imu, noise: NoiseModel, dt: float) -> Interval:
     # to the velocity and the position.
     later = jnp.pad(by_tilt[:, :, :, 1:], ((0, 0), (0, 0), (0, 0), (0, 1)))
     right_jacobians = jax.vmap(geometry.right_jacobian, out_axes=2)(turns)
-    # A reduction is computed once; a sum that is written out, again in everything that reads it.
+    # A reduction is computed once. A sum that is written out would be computed again in everything
+    # that reads it.
     theta = dt * geometry.contract_right(after, right_jacobians)
     of_gyro = [theta, matmul(later[:, :, 0], theta), matmul(later[:, :, 1], theta)]
     velocity = dt * before

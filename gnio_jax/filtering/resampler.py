@@ -39,14 +39,14 @@ LONGEST_TRUSTED = 1.0
 """A stamp further than this from the one before is accepted when a second one agrees with it, s
 (ours): a clock may be wrong for one sample."""
 
-# In intervals of the IMU (ours). A sample that comes sooner after another is left out before the
-# low-pass, because noise would make the spline oscillate. Samples further apart than the second
-# limit are joined by a line, because the spline would be unconstrained there. Samples between which
-# at most one is lost belong to one run.
+# Three limits in intervals of the IMU (ours). A sample that follows another one sooner than the
+# first is left out before the low-pass, because noise would make the spline oscillate. Samples
+# further apart than the second are joined by a line, because the spline would be unconstrained
+# there. Samples not further apart than the third belong to one run: at most one is lost.
 _CLOSEST, _LINE, _LOST = 0.25, 1.75, 2.5
 
-# In intervals of the grid (ours). A longer interval is a stop of the IMU and does not count for its
-# rate; a shorter one may be jitter. The rate is known after this number of grid samples.
+# Two limits in intervals of the grid (ours). An interval longer than the first is a stop of the IMU
+# and does not count for its rate; a shorter one may be jitter. The rate is known after the second.
 _STOP, _RATE_KNOWN = 5.0, 100
 _TOO_FAST = 1.05
 """Largest rate, as a multiple of the fastest rate for which the low-pass is made."""
@@ -60,7 +60,7 @@ class Grid(NamedTuple):
     dt: float
     """Time between grid samples, s."""
     hole: float
-    """Grid samples between stamps further apart are missing, s."""
+    """Grid samples between stamps that are further apart than this are missing, s."""
     imu_rate: float
     """Hz, nominal."""
     factor: int

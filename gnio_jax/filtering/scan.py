@@ -133,7 +133,7 @@ def run_odometry(
 
     A network with memory (`PredictWithMemory`) is called once in every interval, with the samples
     of this interval alone. Its memory is carried from interval to interval, and the final state has
-    it. It begins anew behind an interval in which the filter coasted.
+    it. It begins anew after an interval in which the filter coasted.
 
     Jit it from outside. It is also differentiable in the values that `predict` closes over.
 
@@ -220,11 +220,12 @@ def clone_steps(
     sample of each interval, s.
 
     measure(number, stream, row, state, oldest) returns the displacement of an interval and the
-    network's diagnostics: `number` counts the intervals from 0; `stream` is the whole stream behind
-    the last `FilterConfig.reach` samples before it; `row` is the interval's row of `displacement`,
-    and `oldest` the slot of the oldest clone. keep(slot, state, record, trace) takes the slot of
-    the newest clone and what `clone_step` returns. A network with memory takes its own step before
-    the filter does, remember(memory, state, imu), and what it returns is the interval's `row`.
+    network's diagnostics. `number` counts the intervals from 0. `stream` is the whole stream with
+    the `FilterConfig.reach` samples that came before it in front. `row` is the interval's row of
+    `displacement`, and `oldest` the slot of the oldest clone. keep(slot, state, record, trace)
+    takes the slot of the newest clone and what `clone_step` returns. A network with memory takes
+    its step before the filter does: remember(memory, state, imu) returns the next memory and the
+    interval's `row`.
     """
     ekf, start, config = inputs.ekf, inputs.state, inputs.ekf.config
     signals = inputs.gyro, inputs.accel, inputs.imu_valid

@@ -62,9 +62,10 @@ class FilterConfig(FilterOptions):
     history: Literal["diagonal", "core"] = "diagonal"
     """Keep the diagonal of the core covariance at every interval, or the whole 15×15 block too."""
     window_rotation: Literal["per_sample", "single", "body_axes", "tlio"] = "per_sample"
-    """Rotate each sample of the network's window with its own attitude, or all with that of the
-    start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
-    earlier, and without subtracting the biases."""
+    """How the network's window is rotated. per_sample: each sample with its own attitude. single:
+    all with that of the start (paper eq. 1 read literally). body_axes: as per_sample, with the x
+    and y axes of the body as six more channels. tlio: the window is cut and rotated as in TLIO's
+    tracker, one sample earlier and without subtracting the biases."""
     gate_softness: NonNegative = 0.0
     """0 accepts or rejects; above 0 the gate has a slope, for training: a measurement's information
     is weighted by the logistic function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
@@ -147,7 +148,8 @@ class FilterConfig(FilterOptions):
         return self.error == "invariant" or (self.error is None and self.window_rotation != "tlio")
 
     def whole_samples(self, seconds: float) -> int:
-        """t·dt > seconds ⇔ t > this number, independently of the rounding of seconds / dt."""
+        """Largest number t of samples with t·dt ≤ seconds, independently of the rounding of
+        seconds / dt."""
         return int(np.floor(seconds / self.dt + 1e-6))
 
 

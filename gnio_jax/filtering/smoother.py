@@ -212,7 +212,7 @@ def _pull_back_propagation(
     size, core = len(adjoint.vector), CORE + len(transition.decay)
 
     def step(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
-        """F rows."""
+        """The product of F and `rows`."""
         moved, clones = transition(rows[:core]), rows[core:]
         pose = jnp.concatenate([moved[THETA], moved[OFFSET]])
         return jnp.concatenate([moved, put(clones, pose, CLONE * slot, 0)])

@@ -138,7 +138,7 @@ def level_state(ekf: Filter, gyro: Any, accel: Any) -> FilterState:
     return initial_state(ekf, rotation, zeros, zeros, gyro_bias)
 
 
-# One program, as in `without_clones`.
+# jit: one compiled program, as in `without_clones`.
 @functools.partial(jax.jit, static_argnames="config")
 def _level(
     gyro: Array, accel: Array, bias_std: Array, config: FilterConfig

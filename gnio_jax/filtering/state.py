@@ -4,7 +4,7 @@ of its positions.
 The error state is δ = (θ, v, o, b_g, b_a, a, s, b | θ_0, o_0, θ_1, o_1, …): 21 core entries and
 those of b, then 6 for each clone. Rotation errors are in the world frame and on the left,
 R ← exp(δθ) R; everything else adds. b is the temporally correlated part of the displacements'
-errors (see `update`): no entries, or 3.
+errors (see `displacement`): no entries, or 3.
 
 In the invariant form (`FilterConfig.error`) the covariance inside a run is not that of the error δx
 of a velocity or a position, but that of
@@ -64,8 +64,8 @@ class GateState(NamedTuple):
     converged: Bool[Array, ""]
     """True from the first update on whose oldest clone is old enough."""
     last_success: Int[Array, ""]
-    """Sample of the last measurement that was not rejected, plus the samples since in which there
-    was no measurement; −1 before the first."""
+    """Sample of the last measurement that was not rejected; −1 before the first. It moves along
+    while there is no measurement."""
     pause_end: Int[Array, ""]
     """First sample at which the gate may be active again."""
 
@@ -76,9 +76,9 @@ class ImuMemory(NamedTuple):
     gyro: Float[Array, "3"]
     """The last sample that was not missing, rad/s, raw; NaN before there was one."""
     accel: Float[Array, "3"]
-    """The same, m/s²."""
+    """The last sample that was not missing, m/s², raw; NaN before there was one."""
     missing: Int[Array, ""]
-    """Number of samples missing since."""
+    """Number of samples that are missing since then."""
     quiet: Int[Array, ""]
     """Number of successive clone intervals in which the IMU was quiet; `ZeroVelocity` counts
     them."""
@@ -176,7 +176,7 @@ def gyro_bias_covariance(
     return vertical**2 * eye + (level**2 - vertical**2) * (eye - up[:, None] * up[None, :])
 
 
-# One program in place of thirty, which take three times as long at the first call.
+# jit: one compiled program instead of thirty, in a third of the time at the first call.
 @functools.partial(jax.jit, static_argnames="clones")
 def without_clones(
     pose: Mean, std: InitialStd, clones: int, level_gyro_bias: Array | float | None = None
@@ -328,7 +328,7 @@ def additive_core(state: FilterState, rows: Float[Array, "n k"]) -> Float[Array,
 
 
 def _additive_clones(state: FilterState, rows: Float[Array, "m k"]) -> Float[Array, "m k"]:
-    """The same for the clones' errors."""
+    """Rows of the clones' errors δx from those of ξ, as `additive_core` for the core."""
     theta, offset = jnp.split(rows.reshape(-1, CLONE, rows.shape[1]), 2, axis=1)
     offset = offset - jax.vmap(matmul)(jax.vmap(hat)(state.clone_shift), theta)
     return jnp.concatenate([theta, offset], axis=1).reshape(rows.shape)

@@ -20,8 +20,8 @@ A measurement is an object with a `name` and a method
 
     update(state, step) -> (state, Outcome, Correction),
 
-which linearises it (`linearise`) and applies it (`measure`); see `Displacement`, `ZeroVelocity`,
-and "A measurement of your own" in docs/differentiable_filter.md.
+which linearises it (`linearise`) and applies it (`measure`); see `Displacement`, `ZeroVelocity`
+and docs/measurements.md.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import functools
 import math
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 import chex
 import jax
@@ -109,9 +109,9 @@ class Correction(NamedTuple):
     residual: Float[Array, "m"]
     """L⁻¹ r."""
     core: Float[Array, "m n"]
-    """Y against the core …"""
+    """Rows of Y for the error of the core."""
     clones: Float[Array, "m c"]
-    """… and against the clones."""
+    """Rows of Y for the errors of the clones."""
     jacobian: dict[str, Float[Array, "m 3"]]
     """The blocks of L⁻¹ H."""
 
@@ -125,7 +125,7 @@ class Step(NamedTuple):
     """The clone interval at whose end a measurement is taken."""
 
     imu: Imu
-    """Its samples."""
+    """The samples of the interval."""
     newest: Array | int
     """Slot of the newest clone in the ring."""
     oldest: Array | int
@@ -136,7 +136,7 @@ class Step(NamedTuple):
     """Outcomes of the measurements of this interval before this one, by their names; the first is
     the displacement."""
     diagnostics: Mapping[str, Array] = MappingProxyType({})
-    """What the network says beside its displacement; NaN where it was not called."""
+    """The network's diagnostics by their names; NaN where it was not called."""
 
 
 @runtime_checkable
@@ -236,7 +236,13 @@ def measure(
     Returns:
         The updated state, the outcome, and the correction. If S is not positive definite, the state
         becomes NaN, which `FilterHistory.healthy` reports.
+
+    Raises:
+        ValueError: `frame` is another word.
     """
+    if frame not in get_args(MeasuredFrame):
+        names = " or ".join(map(repr, get_args(MeasuredFrame)))
+        raise ValueError(f"measure: frame must be {names}, found {frame!r}")
     outcome, correction = project(state, linear, step)
     tested = outcome.present & jnp.isfinite(threshold)
     accepted = outcome.present & ~(outcome.nis > threshold)

@@ -83,7 +83,8 @@ class WaypointPoses(NamedTuple):
     """The walk with a pose and a velocity at every sample in the frame of the map, z relative to
     the start. It is valid from the first waypoint to the last, and has no waypoints."""
     smoothed: SmoothedHistory
-    """The same at the end of every clone interval that the walk fills, with covariances."""
+    """Poses and velocities at the end of every clone interval that the walk fills, with
+    covariances."""
     weight: Float[np.ndarray, "f"]
     """Weight of each waypoint: above 1 on the path, towards 0 far from it."""
 
@@ -260,11 +261,12 @@ def _start_std(sequence: Sequence, ekf: Filter, level: FilterState) -> InitialSt
 def _aligned(
     path: Float[np.ndarray, "f 2"], taps: Waypoints, least: float, config: FilterConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """The rotation and shift that align a path with the waypoints, the weights of the waypoints
-    (Cauchy's, whose scale is a distance that half of them and one more do not exceed, or `least` m
-    if that is larger), and the median error of the path over the legs between them, m/s.
+    """The rotation and shift that align a path with the waypoints, the weights of the waypoints,
+    and the median error of the path over the legs between them, m/s.
 
-    A leg that is shorter than a window counts as if it took as long, because it shows no speed.
+    The weights are Cauchy's. Their scale is a distance that half of the waypoints and one more do
+    not exceed, or `least` m if that is larger. A leg that is shorter than a window counts as if it
+    took as long as one, because it shows no speed.
     """
     weight = np.ones(len(path))
     for _ in range(10):
@@ -301,7 +303,8 @@ def _fixes(
     config: FilterConfig,
 ) -> Fix:
     """The taps as fixes in the rows of the intervals that the walk fills, with their weights. No
-    test refuses one: the covariance of the filter does not know of the errors of the path."""
+    test refuses one, because the covariance of the filter does not contain the errors of the
+    path."""
     fixes = fixes_on_intervals(
         np.clip(taps.time, sequence.time[0], sequence.time[-1]),
         taps.position,

@@ -1,4 +1,5 @@
-"""Networks, which map windows of IMU samples to a `Prediction`."""
+"""Networks, which map windows of IMU samples to a `Prediction`. Some of them also carry a memory
+from one clone interval to the next (`models.memory`)."""
 
 from gnio_jax.models.inference import Inference, InferenceVariables, Network, inference_variables
 from gnio_jax.models.registry import (

@@ -80,8 +80,8 @@ class AirIMU(nn.Module):
 
 
 class Corrected(nn.Module):
-    """A network behind a corrector, which sees the same windows of 12 channels with corrected
-    samples, or their first six channels.
+    """A network after a corrector. The network sees the same windows of 12 channels with corrected
+    samples, or only their first six channels.
 
     The parameters of the network keep their names. The diagnostics have the corrected samples and
     their variances, from which `preintegration_loss` learns.
@@ -187,7 +187,7 @@ def preintegration_loss(
     likelihood of these errors with the propagated covariance. The gradient passes through both.
 
     prediction: that of `Corrected`. windows: with the true attitude; steps: true displacements from
-    sample to sample, m. Preintegration begins with the truth behind the first 9 samples (ours: the
+    sample to sample, m. Preintegration begins with the truth after the first 9 samples (ours: the
     velocity there is the mean of both neighbouring steps). Raises `ValueError` for windows too
     short to have a target.
     """

@@ -39,7 +39,7 @@ class AirIO(nn.Module):
     in the world. Ours: velocities in metres per window, which are m/s for windows of 1 s; the
     attitude in the frame in which the window's start has zero yaw, so that a turned world turns the
     displacement; a displacement with the variance that the outputs have if their errors are the
-    same in the whole window. Outputs whose sample lies behind the window are not used.
+    same in the whole window. Outputs whose sample comes after the window are not used.
 
     `width` scales all layers. Training needs the random stream `dropout`.
     """
@@ -135,8 +135,8 @@ def body_axes(windows: Float[Array, "b n 12"]) -> Float[Array, "b n 3 3"]:
 def rotation_vector(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
     """Rotation vectors, rad, of angles up to π, with finite derivatives everywhere.
 
-    It is that of the quaternion of which the largest component is taken first. At π the sign of the
-    axis jumps, as in every rotation vector.
+    It is computed from the quaternion, whose largest component is computed first. At π the sign of
+    the axis jumps, as in every rotation vector.
     """
     diagonal = jnp.stack([rotation[..., i, i] for i in range(3)], axis=-1)
     trace = diagonal.sum(axis=-1, keepdims=True)

@@ -41,9 +41,9 @@ class CTIN(nn.Module):
     goes through a decoder whose self-attention is causal and which attends to the encoder. The
     publication gives the parts and the total of 0.56 M parameters, but not the sizes. Ours are 96
     features, 64 in the encoder, 192 in the feed-forward parts, 48 LSTM units a direction and 8
-    heads: 555,364 with `output_dim = 2`, as published, for windows of 200 samples (the number of
-    positions is that of the samples), and two for the loss below. A third axis adds 98. Training
-    needs the random stream `dropout`.
+    heads. They give 555,364 parameters with `output_dim = 2`, as published, for windows of 200
+    samples (there is a position for each sample), and the loss below has two more. A third axis
+    adds 98. Training needs the random stream `dropout`.
 
     Velocities are in metres per duration of the window, m/s for the publication's 1 s. The window's
     displacement is their mean, m. Ours: its standard deviation per axis is the root mean square of

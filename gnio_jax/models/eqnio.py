@@ -77,7 +77,7 @@ class EqNIO(Equivariant):
     ) -> Prediction:
         heading, sign = self.frame(windows)
         turned = turn_windows(windows, opposite(heading))
-        reflected = jnp.asarray(REFLECTED[None], windows.dtype)
+        reflected = jnp.asarray(np.asarray(REFLECTED)[None], windows.dtype)
         signs = jnp.where(sign[:, None] < 0, reflected, 1)
         if not self.reflections:  # the rate is turned as an ordinary vector
             signs = signs.at[:, 3:].set(signs[:, :3])

@@ -151,7 +151,7 @@ def quarter_turn(vectors: Float[Array, "*k 2"]) -> Float[Array, "*k 2"]:
 
 
 def opposite(heading: Float[Array, "b 2"]) -> Float[Array, "b 2"]:
-    """The headings of the opposite angles."""
+    """The headings of the same angles with the opposite sign."""
     return heading * jnp.array([[1, -1]], heading.dtype)
 
 
@@ -217,6 +217,6 @@ def reflect_prediction(prediction: Prediction, sign: Float[Array, "b"]) -> Predi
 def _components(
     heading: Float[Array, "b 2"], axes: int
 ) -> tuple[Float[Array, "b *n"], Float[Array, "b *n"]]:
-    """Both columns, with `axes` axes of length 1 after the batch."""
+    """Cosine and sine of every row, with `axes` axes of length 1 after the batch."""
     columns = heading.reshape(-1, *[1] * axes, 2)
     return columns[..., 0], columns[..., 1]

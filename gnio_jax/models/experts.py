@@ -1,4 +1,5 @@
-"""Experts for low and high speed behind a router that sees the spectrum of the window (ours)."""
+"""Experts for low and high speed, weighted by a router that sees the spectrum of the window
+(ours)."""
 
 from __future__ import annotations
 
@@ -27,9 +28,9 @@ class Experts(nn.Module):
 
     The router sees the logarithms of the power of |accel| and |gyro| at the lowest frequencies of
     the window, which do not change if the phone or the world is turned. Displacement and variance
-    are those of the mixture: d̂ = Σ p d, σ² = Σ p (σ_k² + (d_k − d̂)²). The loss holds the shares
-    together by `loss.balance_weight` (`training.network_losses.balance`), because otherwise one
-    expert may take every window. Which expert has which speed is learnt.
+    are those of the mixture: d̂ = Σ p d, σ² = Σ p (σ_k² + (d_k − d̂)²). `loss.balance_weight` keeps
+    the shares of the experts near each other (`training.network_losses.balance`), because otherwise
+    one expert may take every window. The networks learn which expert has which speed.
 
     `width`: channels of the first group of every expert.
     """

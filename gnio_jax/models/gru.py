@@ -25,9 +25,9 @@ class GRUState(NamedTuple):
     samples: Float[Array, "b 4 6"]
     """The samples that the first convolution needs again."""
     maps: Float[Array, "b 3 w"]
-    """The same for the second one."""
+    """The features that the second convolution needs again."""
     hidden: Float[Array, "b d"]
-    """The unit."""
+    """The state of the unit."""
 
 
 class GRUNetwork(NetworkWithMemory):

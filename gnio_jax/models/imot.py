@@ -1,5 +1,5 @@
 """iMoT (Nguyen et al., "iMoT: Inertial Motion Transformer for Inertial Navigation", AAAI 2025,
-arXiv 2412.12190), from its text."""
+arXiv 2412.12190), written from the text of the publication."""
 
 from __future__ import annotations
 

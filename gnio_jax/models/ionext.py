@@ -32,10 +32,10 @@ class IONext(nn.Module):
     A stem of stride 4, and four stages of 96, 192, 384 and 768 channels, between which a
     convolution of stride 2 halves the length. A block is x ← x + ADM(norm x), x ← x + AGU(norm x);
     there are no other nonlinearities. Assumed, because the publication does not say it: a norm
-    before the head and behind the stem, the softmax over the branches, three samples in the gate's
+    before the head and after the stem, the softmax over the branches, three samples in the gate's
     convolution. Published: the mean horizontal velocity over 1 s at 200 Hz. Ours: the displacement.
 
-    `width` are the channels of the first stage.
+    `width`: channels of the first stage.
     """
 
     width: Count = 96

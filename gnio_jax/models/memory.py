@@ -8,7 +8,7 @@ the attitude R_m that the filter has at sample m, its biases b and the yaw rotat
 
 At the first step R_F is the yaw rotation of the attitude, so that the memory begins with zero yaw.
 Between two steps the filter corrects its attitude, from R to exp(δ) R. Then R_F turns with it, by
-the yaw of exp(δ), and
+the turn about z in exp(δ) = Rz S, where S is a tilt (`geometry.twist_direction`), and
 
 - neither the samples nor the memory show a step of the yaw, since R_Fᵀ R_m changes only by the
   corrected tilt. The gyro tells the turn between neighbouring samples far better than an update
@@ -205,7 +205,7 @@ def turned_heading(memory: Memory, attitude: Float[Array, "3 3"]) -> Float[Array
     """The heading of the memory's frame after the filter has corrected the attitude at the end of
     the last interval to `attitude`; before the first step that of `attitude` itself."""
     correction = geometry.matmul(attitude, memory.attitude.T)
-    cosine, sine = geometry.yaw_direction(correction)
+    cosine, sine = geometry.twist_direction(correction)
     x, y = memory.heading
     turned = jnp.stack([cosine * x - sine * y, sine * x + cosine * y])
     first = jnp.stack(geometry.yaw_direction(attitude))

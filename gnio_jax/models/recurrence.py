@@ -24,9 +24,9 @@ def causal_conv(
     train: bool,
     name: str,
 ) -> tuple[Float[Array, "b p c"], Float[Array, "b m d"]]:
-    """A convolution with bias whose last input of each output is the newest one, and the p = size −
-    stride inputs that the next call needs. t is a multiple of the stride. Call it within a
-    module."""
+    """The p = size − stride inputs that the next call needs, and the outputs of a causal
+    convolution with bias: the last input of each output is the newest one. t is a multiple of the
+    stride. Call it within a module."""
     x = jnp.concatenate([past, x], axis=1)
     conv = nn.Conv(
         features,

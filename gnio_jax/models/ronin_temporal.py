@@ -4,8 +4,7 @@ TCN after Bai, Kolter and Koltun 2018). The sizes are those of their public code
 
 Both see every sample. Published: the velocity at every sample along two axes, from [gyro, accel].
 Ours: the displacement over the last window at the end of every interval, from [accel, gyro], along
-three axes unless two are asked for, and a constant uncertainty, on which GNIO's bank and heads can
-be put.
+three axes unless two are asked for; a constant uncertainty; GNIO's bank and heads as options.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ MIXED = 24
 TCN_CHANNELS = (16, 32, 64, 128, 72, 36)
 """Features of the residual blocks; the dilation of block i is 2^i."""
 TCN_SIZE = 3
-"""Samples of each kernel: 253 samples are seen."""
+"""Samples of each kernel. The whole network sees 253 samples."""
 
 
 class RoNINTemporal(NetworkWithMemory):

@@ -5,8 +5,8 @@ A layer is linear in its memory x, P complex numbers that decay and turn, each b
 
     x' = exp(λ Δ) x + B̄ u,   y = 2 Re(C x') + D ⊙ u,   B̄ = (exp(λ Δ) − 1) / λ · B.
 
-So a recording is one `associative_scan`, and the filter's loop one product a step. Complex numbers
-are pairs of real ones, because memories and exported programs hold real numbers.
+So a recording needs one `associative_scan`, and a step of the filter's loop one product. Complex
+numbers are pairs of real ones, because memories and exported programs hold real numbers.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class StateSpaceMemory(NamedTuple):
 
 
 class StateSpaceNetwork(NetworkWithMemory):
-    """A low-pass, one sample of `decimation`, and `layers` state-space layers of `width` features,
-    each with a memory of `state` complex numbers.
+    """A low-pass, of whose output every `decimation`-th sample is kept, and `layers` state-space
+    layers of `width` features, each with a memory of `state` complex numbers.
 
     At 100 Hz and the default decimation of 5 a layer makes 20 steps a second. The low-pass is a
     Hann window of four steps, whose first zero is half the new rate; it delays the signal by two
@@ -83,8 +83,8 @@ class StateSpaceNetwork(NetworkWithMemory):
 def decimate(
     past: Float[Array, "b p 6"], signals: Float[Array, "b t 6"], factor: int
 ) -> tuple[Float[Array, "b p 6"], Float[Array, "b m 6"]]:
-    """The signals behind a Hann window of 4 `factor` samples, one of `factor` of them, and the last
-    3 `factor` samples."""
+    """The last 3 `factor` samples, which the next call needs, and the signals after a low-pass at
+    every `factor`-th sample. The low-pass is a Hann window of 4 `factor` samples."""
     window = np.sin(np.pi * (np.arange(4 * factor) + 0.5) / (4 * factor)) ** 2
     window = (window / window.sum()).astype(np.float32).reshape(4, factor)
     x = jnp.concatenate([past, signals], axis=1)

@@ -108,8 +108,8 @@ def name_of(path: Path) -> str:
 
 
 def evaluations_folder(path: Path) -> Path:
-    """The folder for the evaluations of a network: eval/ in the folder of a run. A published
-    network is not written to, so that its evaluations are in evaluations/NAME."""
+    """The folder for the evaluations of a network: eval/ in the folder of a run. Nothing is written
+    into a published network, so its evaluations are in evaluations/NAME."""
     published = path.is_file() or has_card(path)
     return Path("evaluations") / name_of(path) if published else path / "eval"
 
@@ -229,7 +229,8 @@ def _digest(facts: dict[str, Any]) -> str:
 
 
 def _read_file(path: Path, name: str, most: int) -> bytes:
-    """The content of a file of a folder or zip, if it has at most so many bytes."""
+    """The content of a file of a folder or zip. Raises `InputError` if it has more than `most`
+    bytes."""
     content = _read_start(path, name, max(most, 0) + 1)
     if len(content) > most:
         raise InputError(path, f"'{name}' is larger than {most} bytes", DAMAGED)

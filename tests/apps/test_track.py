@@ -13,7 +13,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.apps.importing import Imported, import_recording
-from gnio_jax.apps.summary import Summary, _warnings, _warnings_of_gait, _warnings_of_start
+from gnio_jax.apps.summary import (
+    Summary,
+    _warnings,
+    _warnings_of_gait,
+    _warnings_of_start,
+    summarise,
+)
 from gnio_jax.apps.track import estimate_recording, track
 from gnio_jax.config import DataConfig, EvaluateConfig, FilterSettings, ModelConfig, TrainConfig
 from gnio_jax.data.gait import Gait
@@ -324,6 +330,20 @@ def test_a_gap_that_the_filter_does_not_count_is_told(runs, std, counted):
     warnings = _warnings_of_start(ready, Imported(without_poses("walk", time), (), ()), ekf)
     (gaps,) = [warning for warning in warnings if warning.startswith("gaps: ")]
     assert ("more so than the filter says" in gaps) == counted
+
+
+def test_a_track_that_diverged_has_no_expected_error(runs):
+    walk = without_poses("walk", np.arange(620) / 100)
+    network = read_network(runs / "walker")
+    estimate, ready, ekf = estimate_recording(walk, network)
+    given = ({}, ready, Imported(walk, (), ()), network, ekf)
+    assert summarise(estimate, *given).expected_error > 0
+    path = estimate.trajectory
+    early = np.arange(len(path.time))[:, None] < 2
+    lost = path._replace(position=np.where(early, path.position, np.nan))
+    note = "filter: diverged at 0.1 s (a cause)"
+    summary = summarise(estimate._replace(trajectory=lost, notes=(note,)), *given)
+    assert np.isnan(summary.expected_error) and summary.warnings[0] == note
 
 
 def test_a_part_without_steps_is_named():

@@ -1,6 +1,8 @@
 """The terminal: exit statuses and one-line errors, no control characters, the compilers' cache."""
 
+import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -113,6 +115,28 @@ def test_a_stream_that_is_closed_is_no_fault(closed, status):
     command = f"{sys.executable} -m gnio_jax weights {closed}"
     result = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True)
     assert (result.returncode, result.stderr) == (status, "")
+
+
+def test_the_line_of_progress_shows_its_times_in_80_columns(monkeypatch):
+    screen = io.StringIO()
+    options = {"file": screen, "force_terminal": True, "width": 80, "stderr": False}
+    plain = console._Plain
+    monkeypatch.setattr(console, "_Plain", lambda **_: plain(**options))
+    numbers = "38/57  epoch 2  loss 65.09  lr 7.34e-04  5,744 windows/s"
+    with console.terminal() as terminal:
+        terminal.progress("training", 0.67, numbers)
+        terminal._bars.refresh()
+    line = re.findall(
+        r"training[^\r\n]*", re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.getvalue())
+    )[-1]
+    assert re.search(r"67% 0:00:\d\d (0:\d\d:\d\d|-:--:--) 38/57  epoch 2  loss", line)
+    assert len(line) <= 80
+
+
+def test_lines_of_a_table_in_a_pipe_have_no_blanks_at_their_ends(capsys):
+    console.say(console.pairs([("name", "short"), ("other", "a longer value")]))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == ["name   short", "other  a longer value"]
 
 
 def test_another_copy_of_the_package_in_the_working_folder_is_told(tmp_path, monkeypatch, capsys):

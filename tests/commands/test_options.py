@@ -50,7 +50,10 @@ def test_spellings_and_values_of_options():
         (["train", "--gpu", "1"], "did you mean '--devices'?"),
         (["track", "walk.csv", "--output", "x"], "did you mean '--out'?"),
         (["evaluate", "--weights", "x"], "did you mean '--network'?"),
-        (["train", "--model.head", "foo"], "must be one of gated, linear or null, found 'foo'"),
+        (
+            ["train", "--model.head", "foo"],
+            "must be one of gated, linear, bins or null, found 'foo'",
+        ),
         (["train", "--optim.epochs"], "--optim.epochs: expected one argument"),
         (["train", "stray"], "'stray': is not an option; options are --name VALUE"),
         (["train", "--resume=yes"], "--resume: ignored explicit argument 'yes'"),

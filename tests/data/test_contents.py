@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 from gnio_jax.data.contents import CONTENT, STATE, describe_contents, find_change
+from tests.support import oxiod_files
 from tests.support.layouts import LAYOUTS
 
 LATER = 2_000_000_000
@@ -34,6 +35,22 @@ def test_every_file_of_a_recording_counts(name, tmp_path):
         problem = find_change(*place, first)
         assert problem == f"recording {recording} in {tmp_path} has changed since"
         path.write_bytes(content)
+
+
+def test_every_form_of_a_recording_counts(tmp_path):
+    """The second form is read where the first is refused."""
+    folder = tmp_path / "handheld" / "data1"
+    for write in (oxiod_files.write_raw, oxiod_files.write_syn):
+        write(folder, 1, oxiod_files.Truth(), 1.0)
+    place = "oxiod", tmp_path, "sessions_train"
+    first = describe_contents(*place)
+    for kind in ("raw", "syn"):
+        path = folder / kind / "imu1.csv"
+        content = path.read_bytes()
+        path.write_bytes(content + b"\n")
+        assert find_change(*place, first).endswith("has changed since"), kind
+        path.write_bytes(content)
+    assert find_change(*place, first) == ""
 
 
 def test_a_recording_that_is_new_or_gone_is_named(tmp_path):

@@ -55,6 +55,9 @@ def test_hdf5_that_is_cut_short_or_foreign_is_named(tmp_path):
         del file["gyro"]
         file["gyro"] = h5py.SoftLink("/accel")
     fails("field 'gyro' is a link")
+    with h5py.File(path, "a") as file:
+        file.attrs["format"] = "gnio-jax sequence 2"
+    fails("is not a 'gnio-jax sequence 1' file (format: 'gnio-jax sequence 2')")
     with h5py.File(path, "w") as file:
         file["synced"] = 1.0
     fails("format")

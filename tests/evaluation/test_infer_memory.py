@@ -73,4 +73,6 @@ def test_the_filter_runs_with_it_over_several_recordings(walks):
         )
         measured = np.isfinite(one.displacements.value).all(1)
         np.testing.assert_array_equal(np.flatnonzero(measured)[0], W + 1)
-        assert measured[W + 1 :].all() and set(one.displacements.diagnostics) == {"gate", "scale"}
+        diagnostics = one.displacements.diagnostics
+        assert measured[W + 1 :].all() and set(diagnostics) == {"gate", "scale"}
+        np.testing.assert_array_equal(np.isfinite(diagnostics["gate"]).all(1), measured)

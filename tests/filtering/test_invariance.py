@@ -325,3 +325,47 @@ def test_an_update_is_that_of_the_group():
         offsets = np.asarray(after.anchor) + np.asarray(after.clone_offset)
         np.testing.assert_allclose(offsets, clones, atol=1e-10)
         np.testing.assert_allclose(covariance(after), whole, atol=1e-9)
+
+
+@quick
+def updated_twice(state, residual, spread):
+    """A run's state after two updates in one interval, for several second ones: with errors of one
+    form throughout, and with errors that are expressed at the new estimate in between."""
+    config = config_of("invariant")
+    step = Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), CLONES, 0, config, NOISE)
+    eye, pairs = np.eye(3), []
+    inside = invariant_errors(state, config)
+    linear = filtering.linearise(inside, residual, spread, since_oldest=eye, oldest_rotation=eye)
+    first, _, _ = filtering.measure(inside, linear, step)
+    anew = invariant_errors(unroll_clones(first, 0), config)
+    for frame in ("carrier", "world"):
+        for jacobian in (
+            {"position": eye, "velocity": -0.3 * eye},
+            {"velocity": eye, "rotation": 0.2 * eye},
+            {"since_oldest": eye, "oldest_rotation": 0.5 * eye},
+        ):
+            pair = []
+            for before in (first, anew):
+                linear = filtering.linearise(before, -0.5 * residual, spread, **jacobian)
+                after, _, _ = filtering.measure(before, linear, step, frame=frame)
+                pair.append(unroll_clones(after, 0))
+            pairs.append(pair)
+    return first, pairs
+
+
+def test_a_second_update_knows_what_the_first_has_moved():
+    state = run_pieces("invariant", [24])
+    first, pairs = updated_twice(state, np.array([0.8, -0.6, 0.2]), 0.01 * np.eye(3))
+    assert np.abs(first.shift.position).max() > 0.1 and np.abs(first.shift.velocity).max() > 0.1
+    assert np.abs(first.clone_shift[0]).max() > 0.05
+    for after, expected in pairs:
+        for name in ("rotation", "velocity", "position", "clone_rotation", "gyro_bias"):
+            np.testing.assert_allclose(
+                getattr(after, name), getattr(expected, name), atol=1e-10, err_msg=name
+            )
+        places, expected_places = (
+            np.asarray(end.anchor) + np.asarray(end.clone_offset) for end in (after, expected)
+        )
+        np.testing.assert_allclose(places, expected_places, atol=1e-10)
+        np.testing.assert_allclose(covariance(after), covariance(expected), atol=1e-10)
+        assert np.abs(covariance(after) - covariance(unroll_clones(first, 0))).max() > 1e-4

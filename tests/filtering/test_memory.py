@@ -222,6 +222,29 @@ def test_gradients_go_through_filter_and_memory():
     assert np.abs(np.subtract(*kernels)).max() > 1e-4
 
 
+def test_gradients_are_finite_where_there_is_no_measurement():
+    """Before the first whole window and behind a hole; by the first bias they are those of central
+    differences."""
+    model, variables = network().apply.model, network().variables.variables
+    gyro, accel = recording()
+    valid = np.ones(len(gyro), bool)
+    valid[5 * N + 2 : 7 * N + 5] = False
+
+    def end(bias, variables):
+        predict = Network.of(model, variables).predict()
+        state = start()._replace(gyro_bias=bias)
+        history = filtering.run_odometry(predict, EKF, state, gyro, accel, valid)[1]
+        return jnp.sum(history.position[-1])
+
+    bias = jnp.array([0.02, -0.01, 0.03])
+    gradient, of_network = quick(jax.grad(end, argnums=(0, 1)))(bias, variables)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(of_network))
+    # The float32 numbers of the network bound the precision of differences.
+    value, step = quick(end), 1e-3 * np.array([0.6, -0.5, 0.6])
+    difference = float(value(bias + step, variables) - value(bias - step, variables))
+    assert 2 * float(gradient @ step) == pytest.approx(difference, rel=2e-2)
+
+
 def test_a_memory_of_another_network_is_refused():
     state, _ = run()
     other = models.create("gru", width=6)

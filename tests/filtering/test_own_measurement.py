@@ -110,6 +110,16 @@ def test_rows_that_are_missing_are_refused_by_name():
         filtering.linearise(start(), [0.0], [[1.0]], height=[[0.0, 0.0, 1.0]])
 
 
+def test_a_frame_that_does_not_exist_is_refused():
+    """With a word that is not known a place would be measured as if it turned with the carrier."""
+    state = start()
+    linear = filtering.linearise(state, np.zeros(3), np.eye(3), position=np.eye(3))
+    step = filtering.Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), CLONES, 0, CONFIG, NOISE)
+    words = r"^measure: frame must be 'carrier' or 'world', found 'World'$"
+    with unchecked(), pytest.raises(ValueError, match=words):
+        filtering.measure(state, linear, step, frame="World")
+
+
 def test_known_displacements_are_those_of_the_filter():
     rng = np.random.default_rng(0)
     (rotation, _, _), turn = START, rng.normal(size=3)

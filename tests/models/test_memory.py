@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import models
 from gnio_jax.errors import InputError
 from gnio_jax.models import Network
+from gnio_jax.models.memory import turned_heading
 from gnio_jax.models.state_space import decimate, linear_recurrence
+from gnio_jax.types import Memory
 from tests.support.compiling import quick
 from tests.support.networks import SMALL, drawn
 
@@ -125,6 +127,22 @@ def test_the_frame_turns_with_the_attitude_that_the_filter_corrects():
         np.testing.assert_allclose(np.append(other[1], 0), turn @ before, atol=1e-12)
         expected = turn @ before if k >= 12 else before
         np.testing.assert_allclose(np.append(corrected[1], 0), expected, atol=1e-12)
+
+
+def test_a_corrected_tilt_turns_the_frame_of_no_walk():
+    """Whatever its horizontal axis is, and so whatever the heading of the walk is; a correction of
+    the yaw besides it turns the frame by this yaw."""
+    attitude = Rotation.from_euler("zyx", [0.7, 0.3, -1.2])
+    heading = np.array([np.cos(0.2), np.sin(0.2)])
+    memory = Memory({}, jnp.asarray(heading), jnp.asarray(attitude.as_matrix()), jnp.int32(5))
+    for direction in np.linspace(0, 2 * np.pi, 7):
+        tilt = Rotation.from_rotvec([0.3 * np.cos(direction), 0.3 * np.sin(direction), 0.0])
+        for yaw in (0.0, -0.9):
+            corrected = Rotation.from_euler("z", yaw) * tilt * attitude
+            turned = turned_heading(memory, jnp.asarray(corrected.as_matrix()))
+            np.testing.assert_allclose(
+                turned, [np.cos(0.2 + yaw), np.sin(0.2 + yaw)], atol=1e-12, err_msg=str(direction)
+            )
 
 
 def test_a_memory_has_gradients_at_its_beginning():

@@ -12,6 +12,7 @@ from gnio_jax.types import Sequence
 from tests.support import (
     asl_files,
     blackbird_files,
+    comma_files,
     csv_writers,
     idol_files,
     indoor_location_files,
@@ -160,6 +161,7 @@ LAYOUTS = {
         lambda root, seconds: blackbird_files.write(root / FLIGHT, seconds=seconds),
         {"test.txt": f"# flights\n{FLIGHT}\n"},
     ),
+    "comma2k19": Layout("comma2k19", "train", comma_files.write),
     "tyrex Nexus": _tyrex("val", tyrex_files.NEXUS),
     "tyrex iPhone": _tyrex("train", tyrex_files.IPHONE),
     "indoor_location": Layout("indoor_location", "test", _indoor_location),

@@ -20,7 +20,8 @@ import: accel (with gravity), linear (without) and gravity, raw (with gravity)."
 PATIENCE = 2.0
 """A sensor that is behind the gyro by more is not waited for, s (ours)."""
 RESTART = 1.0
-"""Rows that are all behind the last sample by more begin anew, s (ours): the clock was set back."""
+"""A batch of the gyro that is behind the last sample by more begins anew, s (ours): the clock was
+set back."""
 LONGEST_BATCH, MOST_ROWS = 60.0, 100_000
 """Rows of a batch that are further from its middle, s, have wrong stamps; number of rows of a
 sensor that wait, at most (ours)."""
@@ -48,9 +49,9 @@ class Batches:
     def add(self, kind: str, rows: list[tuple[float, Vector]]) -> int:
         """Add rows (stamp in s, values) of a sensor, in any order, and return the number of those
         that are left out, because their stamps are far from the others."""
-        middle = statistics.median(stamp for stamp, _ in rows)
+        middle = statistics.median_low(stamp for stamp, _ in rows)
         near = [row for row in rows if abs(row[0] - middle) <= LONGEST_BATCH]
-        if max(near)[0] < self._last - RESTART:
+        if kind == "gyro" and max(near)[0] < self._last - RESTART:
             for waiting in self._rows.values():
                 waiting.clear()
             self._last = -math.inf

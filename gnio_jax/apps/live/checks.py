@@ -20,10 +20,10 @@ from gnio_jax.data.parsing.stamps import RATES, is_rate
 from gnio_jax.errors import InputError
 
 FIRST_SECONDS = 1.0
-"""Time of a stream over which its rate is measured, s …"""
+"""The rate of a stream is measured over this time, s."""
 FIRST_SAMPLES = 21
-"""… and smallest number of samples for it, from which the units of accelerometer and stamps are
-recognised (ours)."""
+"""Smallest number of samples from which the rate is measured, and the units of accelerometer and
+stamps are recognised (ours)."""
 MOST_HELD = 20_000
 """Number of samples after which the first second must be over, at any rate of an IMU."""
 SECONDS_WITHOUT_A_SENSOR = 10.0
@@ -51,12 +51,13 @@ class Nature(NamedTuple):
 def measured(
     arrivals: Iterator[Arrival], nature: Nature, begin: Callable[[float], None]
 ) -> Iterator[Arrival]:
-    """The same arrivals, with Android's sign. The samples of the first second are held until their
-    rate, Hz, is given to `begin`.
+    """Hold back the samples of the first second, measure their rate, Hz, and call `begin` with it;
+    then pass all samples on, with Android's sign.
 
     Raises `InputError` while it runs, if the stamps are not in seconds, if the stated rate is
     wrong, if the accelerometer of a device at rest does not read gravity, or if after eight
-    seconds, or later, gravity does not turn as the gyro does. What is in doubt is a notice.
+    seconds, or later, gravity does not turn as the gyro does. Where there is only a doubt, it
+    yields a notice.
     """
     held: list[Arrival] = []
     samples: list[Sample] = []

@@ -135,5 +135,5 @@ def _check_unit(stamps: list[float], name: str) -> None:
         interval = float(np.median(np.abs(np.diff(stamps))))
         problem = f"its samples come {interval:g} s apart by their stamps"
         if interval > LONGEST_INTERVAL:
-            raise InputError(name, problem, "stamps must be in seconds, not in ms")
+            raise InputError(name, problem, "they must be in seconds, not in ms, and of one sender")
         del stamps[:AGREEING]

@@ -29,6 +29,8 @@ STRETCH = 1.0
 """Time between the points by which a walk is measured, s, as in `metrics.path_length`."""
 STEP = 0.2
 """Distance between points of the path that are drawn, m (ours)."""
+MOST_NOTICES = 20
+"""Newest messages that are kept for the page."""
 QUIET_SECONDS = 5.0
 """Time without a sample after which a message says so, s."""
 OFTEN = 10
@@ -63,7 +65,7 @@ class Followed:
     waiting: str = ""
     """What is needed before there can be a pose, or why nothing comes."""
     notices: list[str] = field(default_factory=list)
-    """Messages so far."""
+    """The newest messages."""
     samples: int = 0
     first: float = math.nan
     """Stamp of the first sample, s."""
@@ -197,6 +199,7 @@ def follow(
     for arrival in arrivals:
         if arrival.notice:
             result.notices.append(arrival.notice)
+            del result.notices[:-MOST_NOTICES]
             say(arrival.notice)
         if arrival.refusal:
             result.refuse(arrival.refusal)

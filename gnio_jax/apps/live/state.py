@@ -12,8 +12,6 @@ from gnio_jax.apps.live.session import Followed
 
 MOST_POINTS = 20_000
 """Points of the path in one answer, at most."""
-MOST_NOTICES = 20
-"""Newest messages that are shown."""
 
 
 def describe(
@@ -34,7 +32,7 @@ def describe(
         "samples": result.samples,
         "refused": result.refused,
         "reason": result.reasons[1],
-        "messages": result.notices[-MOST_NOTICES:],
+        "messages": list(result.notices),
         "warnings": result.warnings(),
     }
     if pose is None:

@@ -3,6 +3,7 @@
 from gnio_jax.data.dataset import Dataset
 from gnio_jax.data.readers import (
     blackbird,
+    comma2k19,
     csv_files,
     euroc,
     idol,
@@ -20,6 +21,7 @@ DATASETS: dict[str, Dataset] = {
     dataset.name: dataset
     for dataset in (
         blackbird.DATASET,
+        comma2k19.DATASET,
         csv_files.DATASET,
         *euroc.DATASETS,
         idol.DATASET,

@@ -3,15 +3,19 @@
 import bz2
 import sqlite3
 import tracemalloc
+from functools import partial
 
 import lz4.frame
+import numpy as np
 import pytest
 import yaml
 import zstandard
+from mcap.writer import Writer as McapWriter
 from rosbags import rosbag1, rosbag2
 
 from gnio_jax.apps.importing import bags
 from gnio_jax.errors import InputError
+from tests.support import bag_files
 from tests.support.bag_files import Maker, imu, write
 from tests.support.importing import imported, refused
 
@@ -114,6 +118,18 @@ def test_the_name_of_a_folder_leads_to_no_other_file(tmp_path):
     refused(folder, "has %, . or # in its name; rename it, or its folder")
     (file,) = folder.glob("*.db3")
     refused(file, "has %, . or # in its name; rename it, or its folder")
+
+
+def test_messages_come_in_the_order_in_which_they_were_logged(tmp_path, monkeypatch):
+    """Chunks of a recorder may overlap; those without the topic are not read."""
+    monkeypatch.setattr(bag_files, "McapWriter", partial(McapWriter, chunk_size=3000))
+    entries = imu(Maker(), seconds=2.0)
+    order = np.argsort(np.arange(len(entries)) + np.random.default_rng(0).uniform(0, 40, 200))
+    path = bag_files.write_mcap(tmp_path / "walk.mcap", "mcap", [entries[n] for n in order])
+    with bags.opened(path, "mcap") as bag:
+        times = [time for _, time, _ in bag.messages(["/imu/data"])]
+        assert list(bag.messages([])) == []
+    assert times == sorted(entry[2] for entry in entries) and len(times) == 200
 
 
 def test_the_files_of_a_split_bag_are_one_recording(tmp_path):

@@ -9,7 +9,7 @@ from gnio_jax.filtering import tracker as trackers
 from tests.support import tiny_run
 from tests.support.live_streams import RATE
 
-PATIENCE = 120
+PATIENCE = 300
 """s, after which a test waits for what never comes."""
 SETTINGS = FilterSettings(measurements={"zero_velocity": {"std": 0.02}})
 

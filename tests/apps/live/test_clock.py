@@ -99,5 +99,7 @@ def test_a_short_stream_is_passed_on(count):
 
 @pytest.mark.parametrize("step", [10.0, 5.0, 20_000.0])
 def test_stamps_in_another_unit_are_said(step):
-    with pytest.raises(InputError, match=rf"udp:5: .* {step:g} s apart.*seconds, not in ms"):
+    with pytest.raises(
+        InputError, match=rf"udp:5: .* {step:g} s apart.*seconds, not in ms, and of one"
+    ):
         clocked(np.arange(100) * step)

@@ -2,11 +2,10 @@
 
 import dataclasses
 import importlib.util
-import os
+import io
 import signal
 import socket
 import sys
-import threading
 import time
 
 import numpy as np
@@ -224,39 +223,31 @@ def test_a_recording_played_gives_the_track_of_it(
 def test_a_signal_ends_the_stream_and_nothing_is_lost(
     request, capsys, run, recorded, monkeypatch, tmp_path, number, status, said
 ):
-    lines, out = as_lines(recorded), tmp_path / "live.txt"
+    content, out = "\n".join(as_lines(recorded)).encode(), tmp_path / "live.txt"
     # A shell starts background jobs with Ctrl-C ignored; this one is to hear it.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
-    pushed, push = [], Tracker.push
-    monkeypatch.setattr(Tracker, "push", lambda *row: pushed.append(row[1]) or push(*row))
+    push = Tracker.push
 
     for samples in (10, 155):
-        reading, writing = os.pipe()
-        last = recorded[0][samples - 1] if samples > 50 else -1.0
+        pushed = []
 
-        def write(writing=writing, samples=samples, last=last):
-            os.write(writing, "".join(f"{line}\n" for line in lines[:samples]).encode())
-            end = time.monotonic() + 60
-            while last > 0 and time.monotonic() < end and (pushed or [0])[-1] < last - 0.07:
-                time.sleep(0.01)
-            time.sleep(0.1)
-            os.kill(os.getpid(), number)
+        def push_and_signal(*row, pushed=pushed, samples=samples):
+            pushed.append(row)
+            pose = push(*row)
+            if len(pushed) == samples + 1:
+                signal.raise_signal(number)
+            return pose
 
         assert list(tmp_path.iterdir()) == []
-        monkeypatch.setattr(sys, "stdin", os.fdopen(reading))
-        writer = threading.Timer(0 if samples > 50 else 3.0, write)
-        writer.daemon = True
-        writer.start()
+        monkeypatch.setattr(Tracker, "push", push_and_signal)
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
         with pytest.raises(SystemExit, match=str(status)):
             console.run(lambda: app.main(["live", "--network", str(run), "--out", str(out)]))
-        assert said in capsys.readouterr().err
-        os.close(writing)
-    # Whole intervals of 0.1 s; the first pose is that of the end of the rest, and the last samples
-    # still waited for others.
-    found = read_tum(out).time
-    np.testing.assert_allclose(found, np.arange(10, 10 + len(found)) / 10, atol=1e-6)
-    assert len(found) in (21, 22)
+        assert capsys.readouterr().err == said
+    # 31 whole intervals of 0.1 s; the first pose is that of the end of the rest.
+    time = read_tum(out).time
+    np.testing.assert_allclose(time, np.arange(10, 32) / 10, atol=1e-6)
 
 
 class Diverging:

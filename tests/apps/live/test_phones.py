@@ -164,6 +164,18 @@ def test_a_sensor_that_is_missing_or_falls_silent_is_missing_in_the_samples():
         assert sum(map(len, batches._rows.values())) < 300
 
 
+def test_rows_with_far_stamps_are_left_out():
+    """Also of two rows the one, and of a sensor that is far behind the others."""
+    batches = Batches()
+    assert batches.add("gyro", [(0.0, (0.0, 0.0, 1.0)), (1e9, (0.0, 0.0, 1.0))]) == 1
+    assert batches.add("gyro", [(t / 100, (0.0, 0.0, 1.0)) for t in range(500)]) == 0
+    batches.add("accel", [(0.0, (0.0, 0.0, 1.0))])
+    count = len(list(batches.samples()))
+    batches.add("accel", [(0.01, (0.0, 0.0, 1.0))])
+    found = list(batches.samples())
+    assert count == 301 and found == []  # one came twice, and none comes again
+
+
 def test_a_clock_that_is_set_back_begins_anew():
     batches, found = Batches(), []
     for begin in (100.0, 101.0, 50.0, 51.0):

@@ -108,7 +108,7 @@ def test_phyphox_gives_the_path_of_its_lines(gnio, follow, run, port, tmp_path):
 @pytest.mark.slow
 def test_the_example_by_a_phone_is_the_example_by_lines(gnio, port, tmp_path):
     """With the network that comes with gnio-jax."""
-    rows, seen = np.loadtxt(WALK, delimiter=",", skiprows=1)[:3000], []
+    rows, seen = np.loadtxt(WALK, delimiter=",", skiprows=1)[:1500], []
     recorded = rows[:, 0], rows[:, 1:4], rows[:, 4:]
     thread = pushed_by_a_phone(port, messages(*recorded, period=1.0, kind="total"), seen)
     gnio("live", f"http:{port}", "--silence", "2", "--out", tmp_path / "http.txt")

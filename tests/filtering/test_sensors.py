@@ -1,0 +1,215 @@
+"""Magnetometer and barometer: updates against finite differences, squared errors of simulated
+walks, rows from readings, and readings that cannot be."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import filtering
+from gnio_jax.errors import InputError
+from gnio_jax.filtering.gaps import Imu
+from tests.support import manifold
+from tests.support.compiling import optimised, quick
+from tests.support.random_walk import random_walk
+from tests.support.walks import errors, simulate
+from tests.support.whole_covariance import covariance
+
+N, DT, RUNS, INTERVALS = 5, 0.02, 60, 200
+NOISE = filtering.NoiseModel(5e-4, 5e-3, 2e-4, 1e-4)
+STD = filtering.InitialStd(0.01, 0.2, 0.2, 1e-3, 1e-3, 0.05)
+CONFIG = filtering.FilterConfig(DT, N, 1, history="core")
+CLONES, SIGMA = 10, 0.05
+WORLD = np.array([15.0, 12.0, -40.0])
+"""Field of the world, µT."""
+DIRECTION, STRENGTH = np.arctan2(WORLD[1], WORLD[0]), np.linalg.norm(WORLD)
+DIP = np.arcsin(-WORLD[2] / STRENGTH)
+ENDS = 0.1 * np.arange(1, INTERVALS + 1)
+
+
+def predicted_azimuth(poses, field):
+    east_north_up = np.einsum("...ij,j->...i", poses[0], field)
+    return np.arctan2(east_north_up[..., 1], east_north_up[..., 0])[..., None]
+
+
+@pytest.mark.parametrize("sensor", ["magnetometer", "barometer"])
+def test_an_update_is_the_textbooks_with_the_derivatives_by_finite_differences(sensor):
+    config = dataclasses.replace(CONFIG, clones_per_window=4, error="additive")
+    start, *signals = random_walk(5, n=N, clones=4, intervals=12, dt=DT, nan_rows=range(12))
+    ekf = filtering.Filter(config, NOISE, filtering.InitialStd(0.1, 0.1, 3.0, 1.0, 0.01, 0.1))
+    state, _ = filtering.run_filter(ekf, filtering.initial_state(ekf, *start), *signals)
+    poses = [np.asarray(part) for part in state.mean]
+    if sensor == "magnetometer":
+        # The filter errs by a turn of a tenth of a radian, across the jump of the azimuth.
+        field = poses[0].T @ Rotation.from_euler("z", np.pi - DIRECTION - 0.02).apply(WORLD)
+        direction = -np.pi + 0.08
+        measurement = filtering.Magnetometer(field, direction, STRENGTH, DIP, 0.2)
+        function, std, residual = lambda x: predicted_azimuth(x, field), 0.2, np.array([0.1])
+    else:
+        measurement = filtering.Barometer(poses[2][2] + 0.7, 0.5, 0.3)
+        function, std, residual = lambda x: x[2][..., 2:], 0.5, np.array([1.0])
+    jacobian = manifold.differences(lambda error: function(manifold.plus(poses, error)), 15)
+    before = np.asarray(covariance(state))
+    rows = np.pad(jacobian, ((0, 0), (0, len(before) - 15)))
+    spread = rows @ before @ rows.T + std**2
+    gain = np.linalg.solve(spread, rows @ before).T
+
+    @quick
+    def updated(state):
+        step = filtering.Step(Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), None), 0, 1, config, NOISE)
+        return measurement.update(state, step)[:2]
+
+    after, outcome = updated(state)
+    assert bool(outcome.accepted)
+    np.testing.assert_allclose(outcome.residual, residual, atol=1e-12)
+    np.testing.assert_allclose(outcome.nis, residual**2 / spread[0], rtol=1e-6)
+    np.testing.assert_allclose(covariance(after), before - gain @ rows @ before, atol=1e-7)
+    moved = manifold.plus(poses, (gain @ residual)[:15])
+    for value, expected in zip(after.mean, moved, strict=True):
+        np.testing.assert_allclose(value, expected, atol=1e-7)
+
+
+def test_squared_errors_of_walks_are_as_the_covariance_says():
+    """By degree of freedom, of 60 walks of 20 s with an uncertain yaw; a mean over the walks has a
+    standard deviation of 0.18."""
+    noise = NOISE._replace(measurement_scale=1.0)
+    config = dataclasses.replace(CONFIG, clones_per_window=CLONES, gate_threshold=1e9)
+    walks = simulate(1, RUNS, INTERVALS, N, CLONES, DT, noise, STD, SIGMA)
+    rng = np.random.default_rng(3)
+    turned = Rotation.from_euler("z", rng.normal(0, 0.1, (RUNS * INTERVALS, 1))).apply(WORLD)
+    field = np.einsum("rkji,rkj->rki", walks.rotation, turned.reshape(RUNS, INTERVALS, 3))
+    height = walks.position[:, :, 2] - walks.position0[:, None, 2]
+    height = height + 0.5 * rng.normal(size=height.shape)
+    # A reading that jumps by a kilometre, and a field that a magnet has turned or enlarged.
+    height[:, 50], field[:, 60] = 1000.0, -field[:, 60]
+    field[:, 61] *= 1.5
+    shape = np.ones((RUNS, INTERVALS))
+    sensors = (
+        filtering.Magnetometer(
+            field, DIRECTION * shape, STRENGTH * shape, DIP * shape, 0.1 * shape
+        ),
+        filtering.Barometer(height, 0.5 * shape, walks.position0[:, 2:] * shape),
+    )
+
+    def run(rotation, velocity, position, gyro, accel, displacement, measurements):
+        ekf = filtering.Filter(config, noise, STD)
+        state = filtering.initial_state(ekf, rotation, velocity, position)
+        spread = jnp.tile(SIGMA**2 * jnp.eye(3)[None], (INTERVALS, 1, 1))
+        signals = ekf, state, gyro, accel, displacement, spread
+        return filtering.run_filter(*signals, measurements=measurements)[1]
+
+    history = optimised(jax.vmap(run))(*walks[:6], sensors)
+    error, spread = errors(walks, history), np.asarray(history.covariance)
+    for row in (29, 99, INTERVALS - 1):
+        for name, axis in (("yaw", 2), ("climb", 5), ("height", 8), ("bias", 11)):
+            nees = np.mean(error[:, row, axis] ** 2 / spread[:, row, axis, axis])
+            assert 0.5 < nees < 1.6, (row, name, nees)
+    assert error[:, -1, 2].std() < 0.06 and error[:, -1, 8].std() < 0.3
+    refused = np.asarray(history.outcomes["barometer"].accepted)
+    assert not refused[:, 50].any() and refused.mean() > 0.98
+    magnet = history.outcomes["magnetometer"]
+    assert not np.asarray(magnet.present)[:, 60:62].any()
+    assert np.asarray(magnet.accepted).mean() > 0.97
+
+
+def rotations(count):
+    time = 0.1 * np.arange(1, count + 1)
+    angles = np.stack([0.8 * time, 0.3 * np.sin(time), 0.2 * np.cos(0.7 * time)], axis=1)
+    return Rotation.from_euler("ZYX", angles)
+
+
+def readings(iron=0.0):
+    time = 0.02 * np.arange(5 * INTERVALS + 10)
+    angles = np.stack([0.8 * time, 0.3 * np.sin(time), 0.2 * np.cos(0.7 * time)], axis=1)
+    field = Rotation.from_euler("ZYX", angles).inv().apply(WORLD) + iron
+    return time + 7.0, field + 0.3 * np.random.default_rng(0).normal(size=field.shape)
+
+
+def test_the_first_turns_show_the_phones_own_field():
+    iron = np.array([20.0, -35.0, 10.0])
+    time, field = readings(iron)
+    field[301:339] = np.nan
+    attitude = rotations(INTERVALS).as_matrix()
+    rows = filtering.magnetometer_on_intervals(time, field, attitude, CONFIG, 7.0, 0.2)
+    missing = np.isnan(rows.field[:, 0])
+    assert (np.flatnonzero(missing) == np.arange(60, 67)).all()
+    expected = rotations(INTERVALS).inv().apply(WORLD)
+    assert np.abs(rows.field - expected)[~missing].max() < 1.5
+    assert abs(rows.direction[0] - DIRECTION) < 0.02 and abs(rows.dip[0] - DIP) < 0.02
+    assert abs(rows.strength[0] - STRENGTH) < 1.0 and (rows.std == 0.2).all()
+
+
+def pressure_at(height):
+    """The barometric formula with a constant gradient of temperature."""
+    return 101325.0 * (1 - 0.0065 * height / 288.15) ** (9.80665 / (287.053 * 0.0065))
+
+
+def test_pressures_become_heights_above_the_first():
+    time = 3.0 + np.arange(0, 25.0, 0.2)
+    height = 200.0 + 0.5 * (time - 3.0)
+    pressure = pressure_at(height)
+    rows = filtering.barometer_on_intervals(time, pressure, INTERVALS, CONFIG, 3.0, 1.0, 0.5, 4.0)
+    # The height of the first two seconds is their median; the air at 200 m is 0.5 % thinner.
+    np.testing.assert_allclose(rows.height, 0.5 * ENDS - 0.525, atol=0.1)
+    np.testing.assert_allclose(rows.std**2, 1 + 0.25 * ENDS)
+    assert (rows.start == 4.0).all()
+
+
+MAGNETIC = [
+    (lambda time, field: (time, field / 100), "is 0.444 µT.*; multiply by 100"),
+    (lambda time, field: (time, field * 1e-6), "is 4.44e-05 µT.*; multiply by 1e\\+06"),
+    (lambda time, field: (time, field * 1e3), "multiply by 0.001"),
+    (lambda time, field: (time + 1e9, field), "0 of the first 30 s have a reading; give it stamps"),
+    (lambda time, field: (time[::-1], field), "time: does not increase; sort"),
+    (lambda time, field: (time, field[:-1]), r"must be \(f,\), \(f, 3\) and \(K, 3, 3\), found"),
+    (lambda time, field: (time, np.nan * field), "0 of the first 30 s have a reading"),
+]
+BAROMETRIC = [
+    (lambda time, pressure: (time, pressure / 100), "the median is 1013.2 Pa.*; multiply by 100"),
+    (lambda time, pressure: (time, pressure * 10), "leave it out"),
+    (lambda time, pressure: (time - 1e9, pressure), "no two stamps are within the 20 s of the IMU"),
+    (lambda time, pressure: (np.zeros_like(time), pressure), "time: does not increase"),
+    (lambda time, pressure: (time, pressure[:-1]), r"must be \(f,\), found"),
+    (lambda time, pressure: (time, np.nan * pressure), "no two stamps are within"),
+]
+
+
+@pytest.mark.parametrize("change, words", MAGNETIC)
+def test_a_field_that_cannot_be_is_refused(change, words):
+    attitude = rotations(INTERVALS).as_matrix()
+    with pytest.raises(InputError, match=rf"^magnetometer: .*{words}"):
+        filtering.magnetometer_on_intervals(*change(*readings()), attitude, CONFIG, 7.0)
+
+
+@pytest.mark.parametrize("change, words", BAROMETRIC)
+def test_a_pressure_that_cannot_be_is_refused(change, words):
+    time = np.arange(0, 25.0, 0.2)
+    with pytest.raises(InputError, match=rf"^barometer: .*{words}"):
+        rows = change(time, np.full(len(time), 101325.0))
+        filtering.barometer_on_intervals(*rows, INTERVALS, CONFIG)
+
+
+def test_derivatives_are_finite_where_there_is_no_heading_or_no_reading():
+    ekf = filtering.Filter(CONFIG)
+
+    def loss(field, numbers, pressure):
+        state = filtering.initial_state(ekf, jnp.eye(3), jnp.ones(3), jnp.zeros(3))
+        step = filtering.Step(Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), None), 0, 1, CONFIG, NOISE)
+        state, magnet, _ = filtering.Magnetometer(field, *numbers).update(state, step)
+        state, height, _ = filtering.Barometer(*pressure).update(state, step)
+        return jnp.sum(state.rotation**3) + state.position[2] + magnet.nis + height.nis
+
+    gradient = quick(jax.grad(loss, (0, 1, 2)))
+    usual = np.array([DIRECTION, STRENGTH, DIP, 0.2]), np.array([1.0, 0.5, 0.0])
+    for field in (WORLD, [0.0, 0.0, -40.0], [0.0, 0.0, 0.0], [np.nan, 1.0, 1.0], [1e9, 0.0, 0.0]):
+        slopes = gradient(np.array(field), *usual)
+        assert all(np.isfinite(slope).all() for slope in slopes), field
+    for numbers, pressure in (
+        (np.array([np.nan, 45.0, DIP, 0.2]), np.array([np.nan, 0.5, 0.0])),
+        (np.array([DIRECTION, 45.0, DIP, 0.0]), np.array([1.0, 0.0, 0.0])),
+    ):
+        slopes = gradient(WORLD, numbers, pressure)
+        assert all(np.isfinite(slope).all() for slope in slopes)
