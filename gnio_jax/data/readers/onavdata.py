@@ -89,7 +89,8 @@ def read(drive: Path) -> list[Sequence]:
     )
     if not (np.abs(geodetic[:, :2]) <= LARGEST_ANGLES).all():
         raise damaged(paths["position"], "field 'Latitude' or 'Longitude' is no angle in rad")
-    position = project(*np.degrees(geodetic[:, :2].T), geodetic[:, 2])
+    latitude, longitude = np.degrees(geodetic[:, 0]), np.degrees(geodetic[:, 1])
+    position = project(latitude, longitude, geodetic[:, 2])
     to_world = TO_EAST_NORTH_UP @ Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()
     start = float(stamps[0])
     poses = Poses(
