@@ -1,10 +1,11 @@
 """What a stream does not say about itself: its rate, the unit and the sign of its accelerometer,
-and whether its gyro and its accelerometer belong together."""
+whether its gyro and its accelerometer belong together, and whether somebody walks."""
 
 from __future__ import annotations
 
 import itertools
 import re
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from gnio_jax.apps.importing import units
 from gnio_jax.apps.live.clock import LONGEST_INTERVAL
 from gnio_jax.apps.live.samples import Arrival, Sample, is_missing
 from gnio_jax.data import physics
+from gnio_jax.data.gait import detect_gait
 from gnio_jax.data.parsing.stamps import RATES, is_rate
 from gnio_jax.errors import InputError
 
@@ -33,6 +35,13 @@ RATE_SHARE = 0.75
 """Smallest ratio of a stated rate to the measured one, and of the measured one to it (ours)."""
 TURNING_SECONDS = (8.0, 16.0, 32.0, 64.0)
 """Times after which the rotation of gravity is compared with the gyro, s (ours)."""
+
+GAIT_SECONDS, GAIT_EVERY = 40.0, 10.0
+"""Steps are looked for in the newest 40 s, every 10 s (ours)."""
+GAIT_RATE = 50.0
+"""Rate at which the samples are given to `detect_gait`, Hz."""
+MOSTLY_QUIET = 0.5
+"""Share of quiet seconds from which a stream without steps is a rest (ours)."""
 
 
 class Nature(NamedTuple):
@@ -57,7 +66,7 @@ def measured(
     Raises `InputError` while it runs, if the stamps are not in seconds, if the stated rate is
     wrong, if the accelerometer of a device at rest does not read gravity, or if after eight
     seconds, or later, gravity does not turn as the gyro does. Where there is only a doubt, it
-    yields a notice.
+    yields a notice, and so it does where a moving device shows no steps, and where they return.
     """
     held: list[Arrival] = []
     samples: list[Sample] = []
@@ -83,12 +92,13 @@ def measured(
         sign = _sign_of(np.array([sample.accel for sample in whole]), nature, notices)
     for notice in notices:
         yield Arrival(held[-1].clock, notice=notice)
-    watch = _Turning(nature.name)
+    watches = _Turning(nature.name), _Steps()
     for arrival in itertools.chain(held, arrivals):
         if (sample := arrival.sample) is not None:
             x, y, z = (sign * axis for axis in sample.accel)
             arrival = arrival._replace(sample=sample._replace(accel=(x, y, z)))
-            yield from watch.notices(arrival)
+            for watch in watches:
+                yield from watch.notices(arrival)
         yield arrival
 
 
@@ -175,3 +185,41 @@ class _Turning:
             self._due.clear()
         if not self._due:
             self._rows.clear()
+
+
+class _Steps:
+    """Looks for steps in the newest samples. A network reads the path from them."""
+
+    def __init__(self) -> None:
+        self._rows, self._due, self._walks = deque[tuple[float, ...]](), np.nan, True
+
+    def notices(self, arrival: Arrival) -> Iterator[Arrival]:
+        """A warning where a moving device no longer shows steps, and a message where it does
+        again."""
+        sample = arrival.sample
+        if sample is None or not sample.whole:
+            return
+        self._rows.append((sample.time, *sample.gyro, *sample.accel))
+        while sample.time - self._rows[0][0] > GAIT_SECONDS:
+            self._rows.popleft()
+        if np.isnan(self._due):
+            self._due = sample.time + GAIT_SECONDS
+        if sample.time < self._due:
+            return
+        self._due = sample.time + GAIT_EVERY
+        walks = _walks(np.array(self._rows))
+        if self._walks and not walks:
+            problem = f"no steps in the last {GAIT_SECONDS:.0f} s. In a vehicle or on a trolley the"
+            text = f"warning: no walk: {problem} path is wrong, and no covariance shows it"
+            yield Arrival(arrival.clock, notice=text)
+        elif walks and not self._walks:
+            yield Arrival(arrival.clock, notice="there are steps again")
+        self._walks = walks
+
+
+def _walks(rows: Float[np.ndarray, "n 7"]) -> bool:
+    """Whether somebody walks or rests: rows of time (s), gyro and accel."""
+    grid = np.arange(rows[0, 0], rows[-1, 0], 1 / GAIT_RATE)
+    signals = np.stack([np.interp(grid, rows[:, 0], signal) for signal in rows[:, 1:].T], axis=1)
+    gait = detect_gait(signals[:, :3], signals[:, 3:], GAIT_RATE)
+    return gait.has_steps or bool(gait.quiet.mean() > MOSTLY_QUIET)

@@ -167,3 +167,29 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_said():
     parsed = [samples.parse_line(line, samples.Units("deg/s")) for line in lines]
     found = samples_of(measured(arrivals(parsed), Nature("udp:5"), print))
     np.testing.assert_allclose([s.gyro for s in found], known_walk.rate(time), atol=1e-9)
+
+
+def ride_and_walk():
+    """A minute in a vehicle, whose engine shakes and whose road turns it, and then a minute of the
+    known walk."""
+    time, random = np.arange(0, 60, 0.02), np.random.default_rng(4)
+    turn, push = 0.05 * np.sin(0.3 * time), 0.8 * np.sin(0.2 * time)
+    noise = random.normal(0, [0.01] * 3 + [0.4] * 3, (len(time), 6))
+    ride = np.stack([0 * time, 0 * time, turn, push, 20 * turn, 9.81 + 0 * time], axis=1) + noise
+    steps = np.hstack([known_walk.rate(time), known_walk.force(time)])
+    rows = np.column_stack([np.arange(0, 120, 0.02), np.vstack([ride, steps])])
+    return [",".join(map(repr, row)) for row in rows.tolist()]
+
+
+def test_a_ride_is_no_walk_until_there_are_steps():
+    notices = texts_of(measured(of_lines(ride_and_walk()), Nature("udp:5"), print))
+    ride, *again = [notice for notice in notices if "steps" in notice]
+    assert ride.startswith("warning: no walk: no steps in the last 40 s")
+    assert again == ["there are steps again"]
+
+
+def test_a_device_at_rest_is_no_ride():
+    values = np.random.default_rng(2).normal([0, 0, 0, 0, 0, 9.81], 0.005, (3000, 6))
+    rows = np.column_stack([np.arange(3000) / 50, values])
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    assert texts_of(measured(of_lines(lines), Nature("udp:5"), print)) == []
