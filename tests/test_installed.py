@@ -95,7 +95,7 @@ def test_train_and_evaluate_from_anywhere(gnio, tmp_path):
 def test_the_path_of_a_recording_without_any_training(gnio, tmp_path):
     tracked = gnio("track", ROOT / "examples" / "walk.csv")
     assert tracked.returncode == 0, tracked.stderr
-    assert "limits: " in tracked.stdout and "by pedestrian" in tracked.stdout
+    assert "typical error" in tracked.stdout and "by pedestrian" in tracked.stdout
     folder = tmp_path / "tracks" / "walk"
     for name in ("trajectory.txt", "track.png", "report.html", "summary.json"):
         assert (folder / name).is_file()

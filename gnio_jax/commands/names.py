@@ -32,7 +32,7 @@ NETWORKS = {
 }
 """Networks of --model.name, in the order of the help, and what each is."""
 DATASETS = ("blackbird", "comma2k19", "csv", "euroc", "idol", "indoor_location", "kitti")
-DATASETS += ("oxiod", "ridi", "ronin", "synthetic", "tlio", "tumvi", "tyrex")
+DATASETS += ("onavdata", "oxiod", "ridi", "ronin", "synthetic", "tlio", "tumvi", "tyrex")
 """Datasets of --dataset."""
 
 

@@ -41,7 +41,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
     "arguments, expected",
     [
         (["--dataset", "tlio"], "github.com/CathIAS/TLIO"),
-        (["--dataset", "oxoid"], "did you mean 'oxiod'? known datasets: blackbird, csv, euroc"),
+        (["--dataset", "oxoid"], "did you mean 'oxiod'? known datasets: blackbird, comma2k19"),
         (["--devices", "0"], "--devices: must be at least 1"),
         (["--model.name", "ctin", "--model.width", "90"], "model 'ctin': width must be even and a"),
         (["--data.stride-seconds", "0.3"], "field 'data.stride_seconds' must divide the window"),

@@ -330,8 +330,8 @@ def test_the_factors_of_the_noise_count_once():
     are trusted less than that without a factor."""
 
     def unsure(windows):
-        displacement, log_std, _ = predict(windows)
-        return Prediction(displacement, log_std + jnp.log(3.0))
+        prediction = predict(windows)
+        return Prediction(prediction.displacement, prediction.log_std + jnp.log(3.0))
 
     factors = {"measurement_scale": 2.25, "std_factor": (2.0, 2.0, 2.0)}
     less = dataclasses.replace(EKF, noise=EKF.noise._replace(**factors))

@@ -116,7 +116,7 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
         )
         next_arrays = _to_arrays(DeployedState(filtered, _append_samples(state.samples, arrays)))
         next_state = {NEXT + name.removeprefix(STATE): value for name, value in next_arrays.items()}
-        fields = (name for name in Pose._fields if name not in ("time", "failure"))
+        fields = (name for name in Pose._fields if name not in ("time", "failure", "quiet"))
         return next_state | {POSE + name: getattr(history, name)[0] for name in fields}
 
     def float64(*shape: int) -> jax.ShapeDtypeStruct:

@@ -32,6 +32,7 @@ from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import damaged, parsed_as
 from gnio_jax.data.readers.kitti import LARGEST_JUMP, project
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.types import Sequence
 
 RATE = 100.0
@@ -62,14 +63,15 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
         {
             path.parent
             for depth in ("", "*/", "*/*/", "*/*/*/")
-            for path in root.glob(f"{depth}n380-imu-nav.csv.zip")
+            for path in root.glob(f"{depth}*")
+            if path.name.lower() == "n380-imu-nav.csv.zip"
         }
     )
     return [
         RecordingSource(
             drive.name,
             functools.partial(read, drive),
-            tuple(drive / f"n380-{name}.csv.zip" for name in COLUMNS),
+            tuple(file_in(drive, f"n380-{name}.csv.zip") for name in COLUMNS),
             slow=True,
         )
         for drive in drives
@@ -78,7 +80,7 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
 
 def read(drive: Path) -> list[Sequence]:
     """The pieces of a drive. Raises `InputError` naming file and field."""
-    paths = {name: drive / f"n380-{name}.csv.zip" for name in COLUMNS}
+    paths = {name: file_in(drive, f"n380-{name}.csv.zip") for name in COLUMNS}
     tables = {name: read_zipped(path, COLUMNS[name]) for name, path in paths.items()}
     stamps, increments = tables.pop("imu-nav")
     time = functools.reduce(np.intersect1d, [of_pose for of_pose, _ in tables.values()])
