@@ -18,6 +18,7 @@ k mod (W + 1).
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -34,7 +35,7 @@ from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.network import network_window
 from gnio_jax.filtering.resampler import ACCEL, GYRO
 from gnio_jax.filtering.start import REST_SECONDS
-from gnio_jax.filtering.state import state_shapes
+from gnio_jax.filtering.state import invariant_errors, state_shapes
 from gnio_jax.filtering.tracker import advance_filter
 from gnio_jax.models import Network
 from gnio_jax.types import Array
@@ -81,7 +82,8 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
             remedy = "set it to null: the filter then takes the network's displacement"
             raise InputError(f"filter.measurements.{other.name}", problem, remedy)
     samples = jax.ShapeDtypeStruct((config.reach, 6), jnp.float64)
-    shape = DeployedState(state_shapes(config, noise, jnp.float64), samples)
+    inside = functools.partial(invariant_errors, config=config)
+    shape = DeployedState(jax.eval_shape(inside, state_shapes(config, noise, jnp.float64)), samples)
 
     def infer(arrays: Arrays) -> dict[str, Array]:
         prediction = network.apply(network.variables, arrays["window"])
@@ -159,7 +161,7 @@ def start_arrays(state: FilterState, ekf: Filter) -> dict[str, np.ndarray]:
 
 def _deploy_state(state: FilterState, ekf: Filter) -> DeployedState:
     """A deployed filter before its first sample."""
-    state = checked_state(state, ekf)
+    state = invariant_errors(checked_state(state, ekf), ekf.config)
     return DeployedState(state, jnp.zeros((ekf.config.reach, 6)))
 
 
