@@ -3,8 +3,9 @@ two biases per gate."""
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from gnio_jax.models.layers import linear
-from gnio_jax.models.recurrence import scan_time
+from gnio_jax.models.recurrence import gru_unit, lstm_unit, scan_time
 
 
 class Recurrence(nn.Module):
@@ -33,25 +34,9 @@ class Recurrence(nn.Module):
         kernel = self.param("recurrent_kernel", start, (self.units, gates), jnp.float32)
         bias = self.param("recurrent_bias", start, (gates,), jnp.float32)
 
-        def lstm(state: Any, inputs: Array) -> tuple[Any, Array]:
-            hidden, memory = state
-            values = jnp.split(inputs + hidden @ kernel + bias[None], 4, axis=-1)
-            entry, forget, exit_ = (jax.nn.sigmoid(values[i]) for i in (0, 1, 3))
-            memory = forget * memory + entry * jnp.tanh(values[2])
-            hidden = exit_ * jnp.tanh(memory)
-            return (hidden, memory), hidden
-
-        def gru(hidden: Any, inputs: Array) -> tuple[Any, Array]:
-            from_input, from_hidden = (
-                jnp.split(part, 3, axis=-1) for part in (inputs, hidden @ kernel + bias[None])
-            )
-            reset, keep = (jax.nn.sigmoid(from_input[i] + from_hidden[i]) for i in (0, 1))
-            candidate = jnp.tanh(from_input[2] + reset * from_hidden[2])
-            hidden = (1 - keep) * candidate + keep * hidden
-            return hidden, hidden
-
         zeros = jnp.zeros((x.shape[0], self.units), jnp.float32)
-        unit, state = (gru, zeros) if self.cell == "gru" else (lstm, (zeros, zeros))
+        step, state = (gru_unit, zeros) if self.cell == "gru" else (lstm_unit, (zeros, zeros))
+        unit = functools.partial(step, kernel=kernel, bias=bias)
         inputs = inputs[:, ::-1] if self.reverse else inputs
         _, outputs = scan_time(unit, state, inputs)
         last = outputs[:, -1]

@@ -11,13 +11,7 @@ from jaxtyping import Array, Float
 
 from gnio_jax.config.schema import Count, NonNegativeCount, Positive
 from gnio_jax.models.bins import BinHead
-from gnio_jax.models.heads import (
-    CalibratedUncertainty,
-    ConstantUncertainty,
-    GatedHead,
-    LinearHead,
-    UncertaintyHead,
-)
+from gnio_jax.models.heads import UNCERTAINTIES, GatedHead, LinearHead
 from gnio_jax.models.layers import checked_windows
 from gnio_jax.models.motion_bank import MotionBank
 from gnio_jax.models.resnet import ResNet18
@@ -76,11 +70,7 @@ class GNIO(nn.Module):
     def uncertainty_head(self) -> nn.Module:
         """A module named "uncertainty" that maps h (b, 8·width) and `train` to the logarithms of
         the standard deviations (b, 3), m."""
-        return {
-            "head": UncertaintyHead,
-            "calibrated": CalibratedUncertainty,
-            "constant": ConstantUncertainty,
-        }[self.uncertainty](name="uncertainty")
+        return UNCERTAINTIES[self.uncertainty](name="uncertainty")
 
     @nn.nowrap
     def _bank(self, name: str | None = None) -> MotionBank:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from gnio_jax.config.schema import Count
 from gnio_jax.models.layers import linear
 from gnio_jax.models.memory import NetworkWithMemory
-from gnio_jax.models.recurrence import causal_conv, scan_time
+from gnio_jax.models.recurrence import causal_conv, gru_unit, scan_time
 
 STEM = (9, 5), (5, 2)
 """Size and stride of each convolution of the stem; a step of the unit takes 10 samples, 0.1 s at
@@ -69,14 +69,6 @@ class GRUNetwork(NetworkWithMemory):
             "recurrent_bias", nn.initializers.zeros, (3 * self.features,), jnp.float32
         )
 
-        def unit(hidden: Array, inputs: Array) -> tuple[Array, Array]:
-            reset, update, new = jnp.split(inputs, 3, axis=-1)
-            products = hidden @ kernel + bias[None]
-            of_reset, of_update, of_new = jnp.split(products, 3, axis=-1)
-            candidate = jnp.tanh(new + jax.nn.sigmoid(reset + of_reset) * of_new)
-            share = jax.nn.sigmoid(update + of_update)
-            hidden = (1 - share) * candidate + share * hidden
-            return hidden, hidden
-
+        unit = functools.partial(gru_unit, kernel=kernel, bias=bias)
         hidden, features = scan_time(unit, state.hidden, inputs)
         return GRUState(samples, maps, hidden), features

@@ -91,6 +91,14 @@ class ConstantUncertainty(nn.Module):
         return jnp.broadcast_to(constant.value[None], (h.shape[0], 3))
 
 
+UNCERTAINTIES = {
+    "head": UncertaintyHead,
+    "calibrated": CalibratedUncertainty,
+    "constant": ConstantUncertainty,
+}
+"""Modules of the uncertainty, by the choices of the option `uncertainty`."""
+
+
 def to_axes(output: Float[Array, "b k"]) -> Float[Array, "b 3"]:
     """The displacement of a head with two or three outputs; with two, its vertical is 0."""
     return jnp.pad(output, ((0, 0), (0, 3 - output.shape[-1])))

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from gnio_jax.config.schema import Count
 from gnio_jax.models.airio import norm
-from gnio_jax.models.convolution import convolve, convolve_depthwise, convolve_forward
+from gnio_jax.models.convolution import convolve_depthwise
 from gnio_jax.models.deepils import maximum
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
-from gnio_jax.models.layers import FLOAT32, checked_windows, linear
+from gnio_jax.models.layers import FLOAT32, checked_windows, linear, unpadded_conv
 from gnio_jax.types import Prediction
 
 DEPTHS = (2, 2, 6, 2)
@@ -48,13 +48,13 @@ class IONext(nn.Module):
 
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 6"], train: bool = False) -> Prediction:
-        x = _conv(self.width, 4, 4, train, "stem")(checked_windows(windows))
+        x = unpadded_conv(self.width, 4, 4, train, "stem")(checked_windows(windows))
         x = norm("stem_norm", train)(x)
         for stage, depth in enumerate(DEPTHS):
             if stage:
                 x = norm(f"down{stage}_norm", train)(x)
                 x = jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0)), "edge")
-                x = _conv(self.width * 2**stage, 2, 2, train, f"down{stage}")(x)
+                x = unpadded_conv(self.width * 2**stage, 2, 2, train, f"down{stage}")(x)
             for number in range(depth):
                 x = DynamicBlock(name=f"stage{stage + 1}_block{number + 1}")(x, train)
         h = norm("last_norm", train)(x).mean(axis=1)
@@ -83,18 +83,6 @@ class DynamicBlock(nn.Module):
         pooled = jnp.concatenate([y.mean(axis=1), maximum(y, 1)], axis=-1)
         gate = nn.sigmoid(linear(channels, "gate")(pooled))
         return x + gate[:, None] * _depthwise(channels, GATE_SIZE, "gated")(y)
-
-
-def _conv(features: int, size: int, stride: int, train: bool, name: str) -> nn.Conv:
-    return nn.Conv(
-        features,
-        (size,),
-        (stride,),
-        [(0, 0)],
-        conv_general_dilated=convolve if train else convolve_forward,
-        name=name,
-        **FLOAT32,
-    )
 
 
 def _depthwise(channels: int, size: int, name: str) -> nn.Conv:

@@ -67,6 +67,13 @@ def conv(features: int, size: int, stride: int, train: bool, name: str, **option
     return nn.Conv(features, (size,), (stride,), [((size - 1) // 2, (size - 1) // 2)], **options)
 
 
+def unpadded_conv(features: int, size: int, stride: int, train: bool, name: str) -> nn.Conv:
+    """A convolution with bias and without padding."""
+    in_training = convolve if train else convolve_forward
+    options = {"conv_general_dilated": in_training, "name": name} | FLOAT32
+    return nn.Conv(features, (size,), (stride,), [(0, 0)], **options)
+
+
 def layer_norm(name: str) -> nn.LayerNorm:
     """Layer normalisation."""
     return nn.LayerNorm(epsilon=EPSILON, name=name, **FLOAT32)

@@ -35,13 +35,7 @@ from jaxtyping import Array, Float
 
 from gnio_jax import geometry
 from gnio_jax.config.schema import NonNegativeCount, Positive
-from gnio_jax.models.heads import (
-    CalibratedUncertainty,
-    ConstantUncertainty,
-    GatedHead,
-    LinearHead,
-    UncertaintyHead,
-)
+from gnio_jax.models.heads import UNCERTAINTIES, GatedHead, LinearHead
 from gnio_jax.models.layers import checked_windows
 from gnio_jax.models.motion_bank import MotionBank
 from gnio_jax.types import GRAVITY, Memory, Prediction
@@ -137,11 +131,7 @@ class NetworkWithMemory(nn.Module):
     @nn.nowrap
     def uncertainty_head(self) -> nn.Module:
         """As in GNIO: a module named "uncertainty"."""
-        return {
-            "head": UncertaintyHead,
-            "calibrated": CalibratedUncertainty,
-            "constant": ConstantUncertainty,
-        }[self.uncertainty](name="uncertainty")
+        return UNCERTAINTIES[self.uncertainty](name="uncertainty")
 
     @nn.nowrap
     def _bank(self, name: str | None = None) -> MotionBank:

@@ -8,11 +8,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import linen as nn
 from jaxtyping import Array, Float
 
-from gnio_jax.models.convolution import convolve, convolve_forward
-from gnio_jax.models.layers import FLOAT32
+from gnio_jax.models.layers import unpadded_conv
 
 
 def causal_conv(
@@ -28,16 +26,40 @@ def causal_conv(
     convolution with bias: the last input of each output is the newest one. t is a multiple of the
     stride. Call it within a module."""
     x = jnp.concatenate([past, x], axis=1)
-    conv = nn.Conv(
-        features,
-        (size,),
-        (stride,),
-        [(0, 0)],
-        conv_general_dilated=convolve if train else convolve_forward,
-        name=name,
-        **FLOAT32,
-    )
+    conv = unpadded_conv(features, size, stride, train, name)
     return x[:, x.shape[1] - past.shape[1] :], conv(x)
+
+
+def lstm_unit(
+    state: tuple[Float[Array, "b u"], Float[Array, "b u"]],
+    inputs: Float[Array, "b 4*u"],
+    kernel: Float[Array, "u 4*u"],
+    bias: Float[Array, "4*u"],
+) -> tuple[tuple[Array, Array], Float[Array, "b u"]]:
+    """A step of an LSTM (Hochreiter and Schmidhuber 1997, with PyTorch's order of the gates), from
+    its hidden state and its cell, and what the inputs add to the gates."""
+    hidden, cell = state
+    values = jnp.split(inputs + hidden @ kernel + bias[None], 4, axis=-1)
+    entry, forget, exit_ = (jax.nn.sigmoid(values[i]) for i in (0, 1, 3))
+    cell = forget * cell + entry * jnp.tanh(values[2])
+    hidden = exit_ * jnp.tanh(cell)
+    return (hidden, cell), hidden
+
+
+def gru_unit(
+    hidden: Float[Array, "b u"],
+    inputs: Float[Array, "b 3*u"],
+    kernel: Float[Array, "u 3*u"],
+    bias: Float[Array, "3*u"],
+) -> tuple[Float[Array, "b u"], Float[Array, "b u"]]:
+    """A step of a GRU (Cho et al. 2014, in PyTorch's form), from its hidden state and what the
+    inputs add to the gates."""
+    of_inputs = jnp.split(inputs, 3, axis=-1)
+    of_hidden = jnp.split(hidden @ kernel + bias[None], 3, axis=-1)
+    reset, share = (jax.nn.sigmoid(of_inputs[i] + of_hidden[i]) for i in (0, 1))
+    candidate = jnp.tanh(of_inputs[2] + reset * of_hidden[2])
+    hidden = (1 - share) * candidate + share * hidden
+    return hidden, hidden
 
 
 def scan_time(

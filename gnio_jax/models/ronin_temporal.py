@@ -1,6 +1,7 @@
 """RoNIN's two networks with memory: an LSTM of three layers, and a temporal convolutional network
 (Herath, Yan and Furukawa, "RoNIN: Robust Neural Inertial Navigation in the Wild", ICRA 2020; the
-TCN after Bai, Kolter and Koltun 2018). The sizes are those of their public code.
+TCN after Bai, Kolter and Koltun 2018). The LSTM's sizes are those of their public code. The TCN's
+give the published field of view of 253 samples; they were not compared with that code.
 
 Both see every sample. Published: the velocity at every sample along two axes, from [gyro, accel].
 Ours: the displacement over the last window at the end of every interval, from [accel, gyro], along
@@ -9,9 +10,9 @@ three axes unless two are asked for; a constant uncertainty; GNIO's bank and hea
 
 from __future__ import annotations
 
+import functools
 from typing import Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
@@ -20,7 +21,7 @@ from gnio_jax.config.schema import Count, Probability
 from gnio_jax.models.heads import LinearHead
 from gnio_jax.models.layers import linear
 from gnio_jax.models.memory import NetworkWithMemory
-from gnio_jax.models.recurrence import scan_time, taps
+from gnio_jax.models.recurrence import lstm_unit, scan_time, taps
 
 LSTM_LAYERS = 3
 MIXED = 24
@@ -90,19 +91,7 @@ class RoNINLSTM(RoNINTemporal):
                 f"recurrent_bias{layer + 1}", nn.initializers.zeros, shape[1:], jnp.float32
             )
 
-            def unit(
-                memory: tuple[Array, Array],
-                inputs: Array,
-                kernel: Array = kernel,
-                shift: Array = shift,
-            ) -> tuple[tuple[Array, Array], Array]:
-                h, c = memory
-                gates = jnp.split(inputs + h @ kernel + shift[None], 4, axis=-1)
-                entry, forget, exit_ = (jax.nn.sigmoid(gates[i]) for i in (0, 1, 3))
-                c = forget * c + entry * jnp.tanh(gates[2])
-                h = exit_ * jnp.tanh(c)
-                return (h, c), h
-
+            unit = functools.partial(lstm_unit, kernel=kernel, bias=shift)
             (h, c), x = scan_time(unit, (state.hidden[:, layer], state.cell[:, layer]), inputs)
             hidden.append(h)
             cell.append(c)
