@@ -21,6 +21,7 @@ from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.models.memory import NetworkWithMemory
 from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
+from gnio_jax.training.segments import join_segments
 from gnio_jax.training.task import BatchLosses, Row, Task, TrainState
 from gnio_jax.training.walk_segments import (
     WalkSegments,
@@ -28,7 +29,6 @@ from gnio_jax.training.walk_segments import (
     cut_walks,
     draw_walks,
     grid_of,
-    join_walks,
     walk_source,
 )
 from gnio_jax.training.walkway import unchanged
@@ -56,7 +56,7 @@ class SegmentTask(Task):
     unit = "segments"
     figures = ("loss", "mse", "nll", "horizon")
     skip_above = 1000.0
-    join = staticmethod(join_walks)
+    join = staticmethod(join_segments)
 
     @staticmethod
     def source_of(sequences: Iterable[Sequence], config: TrainConfig, training: bool) -> WalkSource:

@@ -7,7 +7,7 @@ The recordings are on the device once, end to end, and segments are cut inside t
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,9 @@ from gnio_jax.filtering import InitialStd
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, spans
 from gnio_jax.training.windows import low_pass_margin, random_low_pass
 from gnio_jax.types import Array, Sequence
+
+S = TypeVar("S", bound=Any)
+"""A source of segments: a tuple of arrays with the fields `earliest` and `latest`."""
 
 
 class SegmentSource(NamedTuple):
@@ -94,15 +97,31 @@ def segment_source(sequences: Iterable[Sequence], samples: int) -> SegmentSource
     return join_segments(parts)
 
 
-def join_segments(sources: list[SegmentSource]) -> SegmentSource:
-    """The recordings of all sources, one source after the other, as host arrays."""
-    parts: list[SegmentSource] = []
+def join_segments(sources: list[S]) -> S:
+    """The recordings of all sources of segments, one source after the other, as host arrays. The
+    first field of a source has a row for each sample."""
+    parts: list[S] = []
     rows = 0
     for source in sources:
         earliest, latest = source.earliest + np.int32(rows), source.latest + np.int32(rows)
         parts.append(source._replace(earliest=earliest, latest=latest))
-        rows += len(source.gyro)
-    return SegmentSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+        rows += len(source[0])
+    return jax.tree.map(lambda *fields: np.concatenate(fields), *parts)
+
+
+def segment_shares(
+    stretches: Int[np.ndarray, "n 2"], samples: int
+) -> tuple[Int[np.ndarray, "p"], Int[np.ndarray, "p"]]:
+    """Earliest and latest first row of each segment (`segment_source`) in stretches of rows, each
+    from its first row up to its end."""
+    shares = [np.zeros((2, 0), np.int64)]
+    for first, end in stretches:
+        count = (end - first - 1) // samples
+        if count >= 1:
+            bounds = first + (np.arange(count + 1) * (end - first - samples)) // count
+            shares.append(np.stack([bounds[:-1], bounds[1:] - 1]))
+    earliest, latest = np.concatenate(shares, axis=1).astype(np.int32)
+    return earliest, latest
 
 
 def _source_of(sequence: Sequence, samples: int) -> SegmentSource:
@@ -110,18 +129,8 @@ def _source_of(sequence: Sequence, samples: int) -> SegmentSource:
     trusted = sequence.valid & finite_rows(sequence.velocity)
     if sequence.imu_valid is not None:  # not from samples that are interpolated across a gap
         trusted = trusted & sequence.imu_valid
-    earliest: list[np.ndarray] = []
-    latest: list[np.ndarray] = []
-    for first, end in spans(trusted):
-        length = end - first
-        count = (length - 1) // samples
-        if count < 1:
-            continue
-        shares = first + (np.arange(count + 1) * (length - samples)) // count
-        earliest.append(shares[:-1])
-        latest.append(shares[1:] - 1)
+    earliest, latest = segment_shares(spans(trusted), samples)
     orientation = np.where(trusted[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
-    nothing = [np.zeros(0, np.int64)]
     waypoint = np.full((len(trusted), 2), np.nan)
     if sequence.waypoints is not None:
         step = sequence.time[1] - sequence.time[0]
@@ -135,8 +144,8 @@ def _source_of(sequence: Sequence, samples: int) -> SegmentSource:
         position=sequence.position,
         waypoint=waypoint,
         tapped=np.full(len(trusted), sequence.waypoints is not None),
-        earliest=np.concatenate(earliest or nothing).astype(np.int32),
-        latest=np.concatenate(latest or nothing).astype(np.int32),
+        earliest=earliest,
+        latest=latest,
     )
 
 

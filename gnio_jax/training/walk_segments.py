@@ -20,6 +20,7 @@ from gnio_jax import geometry
 from gnio_jax.config import AugmentConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, spans
+from gnio_jax.training.segments import join_segments, segment_shares
 from gnio_jax.training.walkway import Pace, SlowMotion, change_pace, draw_pace, slow_motion
 from gnio_jax.training.windows import low_pass_margin, random_low_pass
 from gnio_jax.types import GRAVITY, Array, Sequence
@@ -66,34 +67,18 @@ def walk_source(sequences: Iterable[Sequence], config: TrainConfig, training: bo
     if not parts:
         problem = f"no segment of {config.segments.seconds:g} s has a valid reference"
         raise InputError("data", f"{problem} in any sequence", "lower segments.seconds")
-    return join_walks(parts)
-
-
-def join_walks(sources: list[WalkSource]) -> WalkSource:
-    """The recordings of all sources, one source after the other, as host arrays."""
-    parts: list[WalkSource] = []
-    rows = 0
-    for source in sources:
-        earliest, latest = source.earliest + np.int32(rows), source.latest + np.int32(rows)
-        parts.append(source._replace(earliest=earliest, latest=latest))
-        rows += len(source.imu)
-    return jax.tree.map(lambda *fields: np.concatenate(fields), *parts)
+    return join_segments(parts)
 
 
 def _source_of(sequence: Sequence, samples: int, rate: float) -> WalkSource:
-    """One recording's segments, rows counted from 0: as many in a stretch as fit side by side, each
-    anywhere in its share (`segments.segment_source`)."""
+    """One recording's segments, rows counted from 0."""
     usable = sequence.valid & finite_rows(sequence.position)
     if sequence.imu_valid is not None:  # not from samples that are interpolated across a gap
         usable = usable & sequence.imu_valid
-    position, shares = np.zeros_like(sequence.position), [np.zeros((2, 0), np.int64)]
-    for first, end in spans(usable):
+    position, stretches = np.zeros_like(sequence.position), spans(usable)
+    for first, end in stretches:
         position[first:end] = sequence.position[first:end] - sequence.position[first]
-        count = (end - first - 1) // samples
-        if count >= 1:
-            bounds = first + (np.arange(count + 1) * (end - first - samples)) // count
-            shares.append(np.stack([bounds[:-1], bounds[1:] - 1]))
-    earliest, latest = np.concatenate(shares, axis=1).astype(np.int32)
+    earliest, latest = segment_shares(stretches, samples)
     orientation = np.where(usable[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
     rotation = matrix_from_quaternion(orientation)
     vectors = rotation @ np.stack([sequence.accel, sequence.gyro], axis=2)
