@@ -18,14 +18,17 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.errors import InputError
-from gnio_jax.filtering.magnetometer import readings_at
+from gnio_jax.filtering.readings import (
+    ONE_DEGREE,
+    finite_readings,
+    interval_ends,
+    scalars_at,
+)
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.types import Array
 
-THRESHOLD = 6.635
-"""99 % of χ² with one degree of freedom."""
 SCALE, EXPONENT = 288.15 / 0.0065, 287.053 * 0.0065 / 9.80665
 """T_0/L, m, and R L/g of the standard atmosphere (ISO 2533)."""
 PRESSURES = 3.0e4, 1.1e5
@@ -56,7 +59,7 @@ class Barometer(NamedTuple):
             jnp.where(sound, std**2, 1.0)[None, None],
             position=[[0.0, 0.0, 1.0]],
         )
-        return measure(state, linear, step, THRESHOLD, frame="world")
+        return measure(state, linear, step, ONE_DEGREE, frame="world")
 
 
 def barometer_on_intervals(
@@ -89,16 +92,10 @@ def barometer_on_intervals(
     if time.ndim != 1 or pressure.shape != time.shape:
         problem = f"time and pressure must be (f,), found {time.shape} and {pressure.shape}"
         raise InputError("barometer", problem, "pass one pressure for each stamp")
-    finite = np.isfinite(time) & np.isfinite(pressure)
-    time, pressure = time[finite], pressure[finite]
-    if not (np.diff(time) > 0).all():
-        raise InputError("barometer", "time: does not increase", "sort its rows by their stamps")
-    ends = start + config.clone_seconds * np.arange(1, intervals + 1)
-    at_ends = readings_at(ends, time, pressure[:, None])[:, 0]
+    time, pressure = finite_readings("barometer", time, pressure)
+    ends = interval_ends(intervals, config, start)
+    at_ends = scalars_at("barometer", ends, time, pressure, start)
     present = np.flatnonzero(np.isfinite(at_ends))
-    if not len(present):
-        problem = f"time: no two stamps are within the {ends[-1] - start:.4g} s of the IMU"
-        raise InputError("barometer", problem, "give it stamps on the clock of the IMU")
     middle = float(np.median(pressure))
     if not PRESSURES[0] <= middle <= PRESSURES[1]:
         factor = next((f for f in (100, 1e3, 1e5) if 8e4 <= f * middle <= 1.1e5), None)

@@ -23,14 +23,18 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.errors import InputError
+from gnio_jax.filtering.readings import (
+    ONE_DEGREE,
+    finite_readings,
+    interval_ends,
+    readings_at,
+)
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.geometry import matmul
 from gnio_jax.types import Array
 
-THRESHOLD = 6.635
-"""99 % of χ² with one degree of freedom."""
 STRENGTH_RATIO = 1.25
 """Largest ratio of the strength of a field to that of the beginning, and of its inverse."""
 LARGEST_DIP = np.radians(15.0)
@@ -43,8 +47,6 @@ FIELDS = 15.0, 150.0
 phone's own field may be as large."""
 IRON_STD, FIELD_STD = 30.0, 2.0
 """Standard deviations of a component of the phone's own field and of a reading, µT."""
-LONGEST_STEP = 0.5
-"""Time between readings beyond which none is interpolated, s."""
 
 
 class Magnetometer(NamedTuple):
@@ -88,7 +90,7 @@ class Magnetometer(NamedTuple):
             jnp.where(present, std**2, 1.0)[None, None],
             rotation=turn[None],
         )
-        return measure(state, linear, step, THRESHOLD)
+        return measure(state, linear, step, ONE_DEGREE)
 
 
 def magnetometer_on_intervals(
@@ -124,11 +126,8 @@ def magnetometer_on_intervals(
         shapes = f"found {time.shape}, {field.shape} and {rotation.shape}"
         problem = "time, field and rotation must be (f,), (f, 3) and (K, 3, 3)"
         raise InputError("magnetometer", f"{problem}, {shapes}", "pass one row for each stamp")
-    finite = np.isfinite(time) & np.isfinite(field).all(axis=1)
-    time, field = time[finite], field[finite]
-    if not (np.diff(time) > 0).all():
-        raise InputError("magnetometer", "time: does not increase", "sort its rows by their stamps")
-    ends = start + config.clone_seconds * np.arange(1, len(rotation) + 1)
+    time, field = finite_readings("magnetometer", time, field)
+    ends = interval_ends(len(rotation), config, start)
     at_ends = readings_at(ends, time, field)
     present = np.isfinite(at_ends[:, 0])
     first = present & (ends <= start + first_seconds)
@@ -155,16 +154,3 @@ def magnetometer_on_intervals(
         np.arctan2(-world[2], np.hypot(world[0], world[1])) * intervals,
         std * intervals,
     )
-
-
-def readings_at(
-    ends: Float[np.ndarray, "k"], time: Float[np.ndarray, "f"], values: Float[np.ndarray, "f w"]
-) -> Float[np.ndarray, "k w"]:
-    """Readings between two stamps by lines; NaN outside of them, and where the stamps on both sides
-    are more than `LONGEST_STEP` apart."""
-    if len(time) < 2:
-        return np.full((len(ends), values.shape[1]), np.nan)
-    after = np.clip(np.searchsorted(time, ends), 1, len(time) - 1)
-    near = (time[after] - time[after - 1] <= LONGEST_STEP) & (time[0] <= ends) & (ends <= time[-1])
-    lines = np.stack([np.interp(ends, time, column) for column in values.T], axis=1)
-    return np.where(near[:, None], lines, np.nan)

@@ -15,16 +15,19 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.errors import InputError
-from gnio_jax.filtering.magnetometer import readings_at
 from gnio_jax.filtering.nonholonomic import NonHolonomic, car_axes, velocity_of_point
+from gnio_jax.filtering.readings import (
+    ONE_DEGREE,
+    finite_readings,
+    interval_ends,
+    scalars_at,
+)
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.geometry import hat, matmul
 from gnio_jax.types import Array
 
-THRESHOLD = 6.635
-"""99 % of χ² with one degree of freedom."""
 FASTEST_CAR = 100.0
 """m/s."""
 
@@ -59,7 +62,7 @@ class WheelSpeed(NamedTuple):
             rotation=matmul(of_velocity, hat(state.velocity)),
             gyro_bias=matmul(ahead, hat(lever)),
         )
-        return measure(state, linear, step, THRESHOLD)
+        return measure(state, linear, step, ONE_DEGREE)
 
 
 def speeds_on_intervals(
@@ -90,15 +93,9 @@ def speeds_on_intervals(
     if time.ndim != 1 or speed.shape != time.shape:
         problem = f"time and speed must be (f,), found {time.shape} and {speed.shape}"
         raise InputError("wheel speed", problem, "pass one speed for each stamp")
-    finite = np.isfinite(time) & np.isfinite(speed)
-    time, speed = time[finite], speed[finite]
-    if not (np.diff(time) > 0).all():
-        raise InputError("wheel speed", "time: does not increase", "sort its rows by their stamps")
-    ends = start + config.clone_seconds * np.arange(1, intervals + 1)
-    at_ends = readings_at(ends, time, speed[:, None])[:, 0]
-    if not np.isfinite(at_ends).any():
-        problem = f"time: no two stamps are within the {ends[-1] - start:.4g} s of the IMU"
-        raise InputError("wheel speed", problem, "give it stamps on the clock of the IMU")
+    time, speed = finite_readings("wheel speed", time, speed)
+    ends = interval_ends(intervals, config, start)
+    at_ends = scalars_at("wheel speed", ends, time, speed, start)
     if not (fastest := np.abs(speed).max()) <= FASTEST_CAR:
         problem = f"speed: {fastest:.4g} m/s is beyond a car"
         raise InputError("wheel speed", problem, "divide km/h by 3.6")
