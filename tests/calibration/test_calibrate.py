@@ -492,6 +492,25 @@ def test_the_consider_fit_has_the_arc_of_the_whole_yaw():
     assert fitting.fit_considered(additive, 1.0, FilterSettings()).after > 2
 
 
+def test_the_considered_covariance_of_positions_is_that_of_the_whole_state():
+    rng = np.random.default_rng(6)
+    root, rows = rng.standard_normal((5, 15, 15)), rng.standard_normal((5, 15, 6))
+    covariance, axis = root @ root.transpose(0, 2, 1), rng.standard_normal((5, 3))
+    std = filtering.ConsideredStd(0.3, 0.2, 0.5, 0.1, 0.4)
+    added = filtering.considered_covariance(rows, std, axis)
+    config = filtering.FilterConfig(0.02, 5, 10)
+    whole = filtering.with_considered(covariance, added, config)[:, 6:9, 6:9]
+    positions = fitting.PositionErrors(
+        np.zeros((5, 3)),
+        covariance[:, 6:9, 6:9],
+        rows[:, 6:9],
+        covariance[:, 6:9, 2],
+        rows[:, 2],
+        axis,
+    )
+    np.testing.assert_allclose(fitting._add_considered(positions, std), whole, rtol=1e-12)
+
+
 def test_the_prior_counts_as_many_independent_errors_as_there_are():
     """An error without effect on the positions keeps the start of the search. If few positions
     show the error, the result lies between the start and their value, by Bayes' rule."""
@@ -539,6 +558,10 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     positions = fitting.compare_positions(walks, truth, DATA, options)
     assert len(positions.error) == np.isfinite(truth).all(2).sum()
     assert nees(positions) == pytest.approx(1, abs=0.5)
+    assert positions.yaw_sensitivity.any() and positions.with_yaw.any()
+    additive = dataclasses.replace(options, error="additive")  # whose covariances have no arc
+    plain = fitting.compare_positions(walks, truth, DATA, additive)
+    assert not plain.yaw_sensitivity.any() and not plain.with_yaw.any()
     off = fitting.compare_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
     assert nees(off) > 3 * nees(positions)
 

@@ -171,6 +171,41 @@ def test_consider_covariance_widens_the_covariance_and_moves_nothing(walks):
         np.testing.assert_allclose(considered.states.std[0, 9:12], at_start, rtol=1e-12)
 
 
+def test_the_covariance_has_the_arc_of_a_considered_yaw(walks):
+    """The linear part is proportional to the variance of the bias. What twice the standard
+    deviation has beyond four times as much is 9 l lᵀ, where l is the covariance of the position
+    with the yaw, turned by a quarter: ¾ ((c + 4 l)² − c² − 4 (c + l)² + 4 c²), for any c of the
+    filter itself."""
+    recordings = ready(walks[:1], gyro_bias="reference")
+    alike = network(0.0, -2.0, log_std_gain=0.0, constant=(0.9, 0.2, 0.02))
+
+    def run(recordings, options=OPTIONS):
+        return tight(recordings, alike, options=options)[0]
+
+    size = 0.02
+    plain, one, two = (
+        run(recordings, changed(OPTIONS, considered={"gyro_bias": bias})).filtered.covariance
+        for bias in (0.0, size, 2 * size)
+    )
+    with_yaw = 0.0
+    for axis in np.eye(3):
+        ahead, behind = (
+            run([with_gyro_bias(recordings[0], off)]).trajectory
+            for off in (1e-5 * axis, -1e-5 * axis)
+        )
+        moved = (ahead.position - behind.position) / 2e-5
+        first, second = (
+            Rotation.from_quat(path.orientation, scalar_first=True) for path in (ahead, behind)
+        )
+        turned = (first * second.inv()).as_rotvec()[:, 2] / 2e-5
+        with_yaw = with_yaw + size**2 * turned[:, None] * moved
+    lever = np.stack([with_yaw[:, 1], -with_yaw[:, 0], 0 * with_yaw[:, 0]], axis=1)
+    expected = 9 * lever[:, :, None] * lever[:, None]
+    assert expected[-1].max() > 1e-3
+    excess = two - plain - 4 * (one - plain)
+    np.testing.assert_allclose(excess, expected, rtol=2e-2, atol=1e-3 * expected.max())
+
+
 def with_gyro_bias(recording, off):
     start = recording.start
     return recording._replace(start=start._replace(gyro_bias=start.gyro_bias + off))
