@@ -378,10 +378,11 @@ def error_of(correction: Correction) -> tuple[Float[Array, "n"], Float[Array, "c
     """The error e of core and clones by which a correction moves the mean."""
     # A reduction is used on purpose: its result is kept, but a sum that is written out would be
     # computed again for every entry that the correction of the mean reads.
-    whitened = correction.residual[:, None]
-    return jnp.sum(whitened * correction.core, axis=0), jnp.sum(
-        whitened * correction.clones, axis=0
+    core, clones = (
+        jnp.sum(correction.residual[:, None] * rows, axis=0)
+        for rows in (correction.core, correction.clones)
     )
+    return core, clones
 
 
 def moved_mean(state: FilterState, correction: Correction, step: Step) -> FilterState:

@@ -54,7 +54,7 @@ START_STD = {"tilt": 0.1, "yaw": 0.2, "velocity": 1.0, "position": 10.0, "gyro_b
 """Standard deviations of the aligned start: rad, rad, m/s, m, rad/s. With a yaw of 0.5 rad the
 filter, which gains no yaw from displacements, swings about the path until fixes show it, and
 smoothing is linearised there: on simulated walks with 5 to 13 taps displacements over a second err
-by 0.10 to 0.22 m instead of 0.08 to 0.13 m. Every smoothing starts at the yaw of the one before, so
+by 0.09 to 0.17 m instead of 0.08 to 0.12 m. Every smoothing starts at the yaw of the one before, so
 this prior holds the yaw back less and less."""
 CORRELATION = CorrelatedError(share=0.95, seconds=5.0)
 """Temporal correlation of the displacements' errors: a network overestimates or underestimates a

@@ -9,24 +9,13 @@ import pytest
 
 from gnio_jax.apps import publish as publishing
 from gnio_jax.apps.publish import describe_data, describe_error, publish
-from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.evaluation import report
 from gnio_jax.evaluation.metrics import Measures
 from gnio_jax.networks import find, read_network
 from gnio_jax.networks.folder import read_card, read_text
 from tests.support import tiny_run
-from tests.support.filter_settings import changed
 from tests.support.reports import write_report
 
-CONFIG = TrainConfig(
-    dataset="synthetic",
-    data_root="/home/somebody/recordings",
-    init_from="runs/earlier",
-    seed=7,
-    data=DataConfig(rate=50.0, poses_by="/home/somebody/runs/first"),
-    model=ModelConfig(name="tiny"),
-    filter=changed(noise={"std_factor": (1.7, 1.0, 1.0)}, considered={"scale": 0.02}),
-)
 SETTINGS = {"dataset": "synthetic", "split": "test", "estimator": "ekf", "alignment": "origin"}
 SETTINGS |= {"recordings": dict.fromkeys("abcd", 60.0), "filter": {}}
 SETTINGS["definitions"] = report.DEFINITIONS
@@ -48,7 +37,7 @@ SAID = ("simulated walks", "CC0", ("Running | jumping.",))
 def run(tmp_path_factory):
     """A run of the smallest network, with the figures of one evaluation."""
     with tiny_run.known():
-        folder = tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIG)
+        folder = tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", tiny_run.CONFIGURED)
         evaluation = folder / "eval" / "synthetic_test_ekf"
         evaluation.mkdir(parents=True)
         groups = {"a": "ann", "b": "bob", "c": "ann", "d": "bob"}

@@ -15,22 +15,13 @@ import pytest
 import yaml
 
 from gnio_jax import networks
-from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig
 from gnio_jax.errors import InputError
 from gnio_jax.networks import Card, folder, read_network, write_network
 from gnio_jax.networks.folder import CARD, CONFIG, WEIGHTS
 from tests.support import tiny_run
 from tests.support.filter_settings import changed
 
-CONFIGURED = TrainConfig(
-    dataset="synthetic",
-    data_root="/home/somebody/recordings",
-    init_from="runs/earlier",
-    seed=7,
-    data=DataConfig(rate=50.0, poses_by="/home/somebody/runs/first"),
-    model=ModelConfig(name="tiny"),
-    filter=changed(noise={"std_factor": (1.7, 1.0, 1.0)}, considered={"scale": 0.02}),
-)
 FACTS = Card("walk", "tiny", "simulated walks", "CC0", 1, 0, "", "a test", {})
 
 
@@ -38,7 +29,7 @@ FACTS = Card("walk", "tiny", "simulated walks", "CC0", 1, 0, "", "a test", {})
 def run(tmp_path_factory):
     """A run of the smallest network."""
     with tiny_run.known():
-        yield tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIGURED)
+        yield tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", tiny_run.CONFIGURED)
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +78,8 @@ def with_file(package, name, content):
 def test_a_published_network_is_the_run_without_its_folders(run, published, name):
     network, copy = read_network(run), read_network(published / name)
     nowhere = {"data_root": None, "init_from": None, "data": DataConfig(rate=50.0)}
-    assert network.config == CONFIGURED and network.card is None
-    assert copy.config == dataclasses.replace(CONFIGURED, **nowhere)
+    assert network.config == tiny_run.CONFIGURED and network.card is None
+    assert copy.config == dataclasses.replace(tiny_run.CONFIGURED, **nowhere)
     jax.tree.map(np.testing.assert_array_equal, copy.variables, network.variables)
     assert copy.model == network.model and (copy.epoch, copy.step) == (1, 0)
     assert (network.name, copy.name) == ("walk", "walk") and copy.card.license == "CC0"
@@ -126,7 +117,7 @@ def test_a_run_has_its_position_and_the_filter_that_was_trained(run, tmp_path):
     trained = changed(noise={"gyro_density": 0.5, "correlation": None}, start={"velocity": 0.3})
     folder.write_weights(tmp_path, network.variables, 4, 52, trained)
     found = read_network(tmp_path)
-    assert found.config == dataclasses.replace(CONFIGURED, filter=trained)
+    assert found.config == dataclasses.replace(tiny_run.CONFIGURED, filter=trained)
     assert (found.epoch, found.step) == (4, 52)
     jax.tree.map(np.testing.assert_array_equal, found.variables, network.variables)
     assert folder.read_settings(tmp_path).config == found.config

@@ -16,8 +16,20 @@ from gnio_jax.models import registry
 from gnio_jax.networks import read_network
 from gnio_jax.training import checkpoint, loop, windows
 from tests.support import drawn_run
+from tests.support.filter_settings import changed
 from tests.support.numpy_layers import batch_norm, float64, linear
 from tests.support.tiny_network import Tiny
+
+CONFIGURED = TrainConfig(
+    dataset="synthetic",
+    data_root="/home/somebody/recordings",
+    init_from="runs/earlier",
+    seed=7,
+    data=DataConfig(rate=50.0, poses_by="/home/somebody/runs/first"),
+    model=ModelConfig(name="tiny"),
+    filter=changed(noise={"std_factor": (1.7, 1.0, 1.0)}, considered={"scale": 0.02}),
+)
+"""Settings that a published network must not pass on, beside those that it must."""
 
 
 @contextlib.contextmanager
