@@ -5,7 +5,7 @@ Units are SI (s, rad, m), quaternions are wxyz, the world is z-up with gravity (
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -114,6 +114,19 @@ class Windows(NamedTuple):
     predicts a velocity for every sample."""
 
 
+Quantity = Literal["displacement", "velocity"]
+"""What a filter can measure of a network: the displacement over its window, or its velocity."""
+
+
+class Velocity(NamedTuple):
+    """The velocity that a network predicts for the end of its window, in metres per window."""
+
+    value: Float[Array, "*b 3"]
+    """In the body."""
+    log_std: Float[Array, "*b 3"]
+    """Logarithm of its standard deviation, per axis of the body."""
+
+
 class Prediction(NamedTuple):
     """The prediction of a network for a window."""
 
@@ -127,6 +140,18 @@ class Prediction(NamedTuple):
     axes: Float[Array, "*b 2"] | None = None
     """Cosine and sine of the angle about z by which the axes of `log_std` are turned; None: they
     are those of `displacement`. With turned axes the covariance is full in the plane."""
+    velocity: Velocity | None = None
+    """The velocity in the body, if the network predicts one."""
+
+    def measured(self, quantity: Quantity) -> Prediction:
+        """The prediction with the measured quantity in the place of its displacement. Raises
+        `ValueError` for a velocity that the network does not predict."""
+        if quantity == "displacement":
+            return self
+        if self.velocity is None:
+            raise ValueError("filter.measures: is velocity, which this network does not predict")
+        value, log_std = self.velocity
+        return self._replace(displacement=value, log_std=log_std, axes=None)
 
     def covariance(self, least: float, dtype: Any) -> Float[jax.Array, "*b 3 3"]:
         """Covariance of `displacement`, m²: A diag(exp 2u) Aᵀ with the axes A, u raised to

@@ -102,7 +102,8 @@ def calibrate(
     start_of_fit(uncalibrated, paths)  # finds mistakes before reading data
     recordings, estimates = predict(split, networks, config, uncalibrated, progress, workers)
     try:
-        factors = fit_std_factors(estimates, [recording.displacement for recording in recordings])
+        truths = [recording.truth(uncalibrated.measures) for recording in recordings]
+        factors = fit_std_factors(estimates, truths)
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
     x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as written to the settings

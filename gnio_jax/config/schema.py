@@ -474,6 +474,9 @@ class ConsideredStd(NamedTuple):
 class FilterOptions:
     """The options of the filter, which are fixed when it is compiled. The defaults are TLIO's."""
 
+    measures: Literal["displacement", "velocity"] = "displacement"
+    """What the filter measures of the network: the displacement over its window, or for a network
+    that predicts one (airio) its velocity in the body at the window's end, in metres per window."""
     mahalanobis_fail_scale: NonNegative = 0.0
     """0 skips a rejected measurement; above 0 it is applied with its covariance multiplied by
     this."""
@@ -634,8 +637,8 @@ class TrainConfig:
         """Check the sections together. Several datasets must differ, be in their usual folders and
         have a weight each, or none. Four headings are averaged only if training shows windows of
         every heading. Training through the filter needs weights to start from, and segments of
-        whole strides that are longer than a window and its context. A network that predicts every
-        sample takes no context."""
+        whole strides that are longer than a window and its context. What the network itself asks
+        for is checked with it (`models.from_experiment`)."""
         names, weights = self.datasets, self.data.weights
         for name in ("data_root", "workdir", "init_from"):
             if "\0" in (getattr(self, name) or ""):
@@ -649,13 +652,6 @@ class TrainConfig:
         if weights and len(weights) != len(names):
             problem = f"has {len(weights)} values for {len(names)} datasets"
             location.child("data.weights").refuse(problem, "give one for each, or none")
-        if self.data.context and self.model.name in ("ctin", "airio"):
-            remedy = "it predicts every sample it sees: set it to 0"
-            location.child("data.context_seconds").refuse(f"is not for {self.model.name}", remedy)
-        in_body = self.model.name == "airio" or self.model.corrector != "none"
-        if in_body and self.data.window_rotation != "body_axes":
-            problem = "must be body_axes for airio and for a corrector, which see the body"
-            location.child("data.window_rotation").refuse(problem)
         if self.model.equivariance == "four_headings" and not self.augment.yaw:
             problem = "is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"

@@ -155,7 +155,8 @@ def perfect(ekf: Filter) -> Filter:
     network."""
     noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), measurement_scale=1.0, correlation=None)
     considered = ekf.considered and ekf.considered._replace(scale=0.0, heading=0.0, slope=0.0)
-    return dataclasses.replace(ekf, noise=noise, considered=considered)
+    config = dataclasses.replace(ekf.config, measures="displacement")
+    return dataclasses.replace(ekf, config=config, noise=noise, considered=considered)
 
 
 def in_one_frame(
@@ -248,9 +249,11 @@ def _run(
         state = inputs.start.state(ekf)
         if apply is None:
             assert inputs.displacements is not None
-            frame, displacement = "given", inputs.displacements.value
+            frame = "body" if ekf.config.measures == "velocity" else "given"
+            displacement = inputs.displacements.value
             covariance = inputs.displacements.covariance
-            history = run_filter(ekf, state, *signals, displacement, covariance, valid)[1]
+            rows = displacement, covariance, valid, frame
+            history = run_filter(ekf, state, *signals, *rows)[1]
         else:
             frame = ekf.config.displacement_frame
             predict = Network(apply, variables).predict(keep)
@@ -264,7 +267,8 @@ def _run(
                 rows = displacement, covariance, valid, frame
                 return run_filter(ekf, state, *signals, *rows)[1]
 
-            derivatives = sensitivity(repeat_run, state, displacement)
+            rotation = history.rotation if ekf.config.measures == "velocity" else None
+            derivatives = sensitivity(repeat_run, state, displacement, rotation)
             axis = jnp.tile(inputs.start.raw_axis[None], (len(derivatives), 1))
             added = considered_covariance(derivatives, ekf.considered, axis)
             covariances = with_considered(covariances, added, ekf.config)

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from gnio_jax import config as configuration
-from gnio_jax import data
+from gnio_jax import data, models
 from gnio_jax.config import EvaluateConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimate import (
@@ -132,8 +132,11 @@ def evaluate(
 
     network = Network.of(trained.model, trained.variables)
     if _infers(config):
-        least_std = math.exp(ekf.config.log_std_min) if config.estimator == "ekf" else 0.0
-        source = infer(network, recordings, windows, stage("inferring"), least_std=least_std)
+        options: dict[str, Any] = {}
+        if config.estimator == "ekf":
+            options["least_std"] = math.exp(ekf.config.log_std_min)
+            options["measures"] = ekf.config.measures
+        source = infer(network, recordings, windows, stage("inferring"), **options)
     elif config.estimator == "imu_only":
         source = [no_displacements(recording) for recording in recordings]
     else:
@@ -199,6 +202,7 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
     `InputError` for an unknown dataset, missing data and impossible settings."""
     changed = dataclasses.replace(run, filter=config.filter or run.filter)
     changed = configuration.validate(configuration.assign(changed, config.set), "command line")
+    models.check_experiment(models.from_config(changed.model), changed, "command line")
     dataset, root = config.dataset or run.datasets[0], None
     if config.dataset is None and len(run.datasets) > 1:
         remedy = f"give --dataset, e.g. {dataset}"

@@ -32,7 +32,7 @@ from gnio_jax.numerics import (
     rotations,
     yaw_rotation,
 )
-from gnio_jax.types import Array, Sequence, Waypoints
+from gnio_jax.types import Array, Quantity, Sequence, Waypoints
 from gnio_jax.windows import true_displacement, window_starts
 
 REFERENCE_BIAS_SECONDS = 10.0
@@ -107,6 +107,9 @@ class PreparedRecording(NamedTuple):
     displacement: Float[np.ndarray, "m 3"]
     """Displacement of the reference over each window, with a stride between windows, m, expressed
     in the yaw frame of the window's start; NaN where the reference cannot be trusted."""
+    velocity: Float[np.ndarray, "m 3"]
+    """Velocity of the reference at the end of each window, in metres per window, expressed in the
+    body; NaN where the reference cannot be trusted."""
     notes: tuple[str, ...]
     """Notes for a reader of the result."""
     waypoints: Waypoints | None = None
@@ -116,6 +119,10 @@ class PreparedRecording(NamedTuple):
     def strides(self) -> int:
         """K."""
         return len(self.time) - 1
+
+    def truth(self, measures: Quantity) -> Float[np.ndarray, "m 3"]:
+        """The true value for each window of what a filter measures of its network."""
+        return self.displacement if measures == "displacement" else self.velocity
 
 
 def prepare(
@@ -180,6 +187,7 @@ def prepare(
             level = ekf.raw_gyro_bias
         start = Start(rotation, velocity, position, bias, std, level, raw)
         trusted, mask = whole.valid[:, None], whole.imu_valid
+        first = window_starts(len(whole.time), windows.window, windows.stride)
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
         placement = str(sequence.attributes.get("placement", "unknown"))
@@ -198,14 +206,25 @@ def prepare(
                 displacement=true_displacement(
                     poses[1],
                     poses[0],
-                    window_starts(len(whole.time), windows.window, windows.stride),
+                    first,
                     windows.window,
                 ),
+                velocity=windows.window_seconds * _velocity_in_body(whole, first + windows.window),
                 notes=tuple(filter(None, (reference_note, bias_note, start_note))),
                 waypoints=whole.waypoints,
             )
         )
     return recordings, left_out
+
+
+def _velocity_in_body(sequence: Sequence, rows: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m 3"]:
+    """The velocity of the reference at these rows, m/s, expressed in the body; NaN where the
+    reference cannot be trusted."""
+    valid = sequence.valid[rows, None]
+    velocity, orientation = (
+        np.where(valid, part[rows], np.nan) for part in (sequence.velocity, sequence.orientation)
+    )
+    return np.einsum("mji,mj->mi", matrix_from_quaternion(orientation), velocity)
 
 
 def _check(

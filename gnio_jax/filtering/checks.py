@@ -24,7 +24,7 @@ from gnio_jax.config.schema import Bound
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.fix import THRESHOLDS, Fix, improper_covariances
-from gnio_jax.filtering.settings import FilterConfig, YawFrame
+from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
 from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_error
 from gnio_jax.numerics import finite_rows
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
@@ -119,9 +119,9 @@ def check_covariance(name: str, value: jax.Array, kinds: Int[np.ndarray, " n"]) 
 
 
 def check_frame(frame: Any) -> None:
-    """Refuse a name that is no `YawFrame`."""
-    if frame not in get_args(YawFrame):
-        names = " or ".join(map(repr, get_args(YawFrame)))
+    """Refuse a name that is no `DisplacementFrame`."""
+    if frame not in get_args(DisplacementFrame):
+        names = " or ".join(map(repr, get_args(DisplacementFrame)))
         raise ValueError(f"frame: must be {names}, found {frame!r}")
 
 

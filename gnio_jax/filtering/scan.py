@@ -39,7 +39,7 @@ from gnio_jax.filtering.propagation import (
     integrate,
     propagate,
 )
-from gnio_jax.filtering.settings import YawFrame
+from gnio_jax.filtering.settings import DisplacementFrame
 from gnio_jax.filtering.state import (
     FilterState,
     core_covariance,
@@ -61,7 +61,7 @@ def run_filter(
     displacement: Any,
     covariance: Any,
     imu_valid: Any = None,
-    frame: YawFrame = "given",
+    frame: DisplacementFrame = "given",
     measurements: tuple[Measurement, ...] = (),
 ) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals of n IMU samples with given displacements (paper §III-G).
@@ -82,7 +82,8 @@ def run_filter(
             None: the stream is complete.
         frame: The attitude that defines this yaw frame. "given" is another one than the filter's.
             "own" is the filter's, as for the displacements of `FilterHistory.given`, which repeat a
-            run of `run_odometry` without its network.
+            run of `run_odometry` without its network. "body": the rows are velocities in the body
+            at clone k, in metres per window.
         measurements: Measurements with a row for each interval, the leading axis K of their arrays.
             They are taken in their order, after the displacement and after those of `ekf`
             (`update.Measurement`).
@@ -103,7 +104,7 @@ def run_filter(
 
 @functools.partial(jax.jit, static_argnames="frame")
 def _run_filter(
-    inputs: FilterInputs, displacement: Array, covariance: Array, frame: YawFrame
+    inputs: FilterInputs, displacement: Array, covariance: Array, frame: DisplacementFrame
 ) -> tuple[FilterState, FilterHistory]:
     rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)
     return _run(take_row, inputs, rows)
@@ -295,7 +296,7 @@ def clone_step(
     outcomes: dict[str, Outcome] = {}
     corrections: tuple[Correction, ...] = ()
     for measurement in (displacement, *ekf.measurements, *measurements):
-        step = Step(imu, slot, oldest, config, noise, outcomes, diagnostics)
+        step = Step(imu, slot, oldest, config, noise, outcomes)
         update = jax.checkpoint(
             lambda measurement, state, step=step: measurement.update(state, step),
             policy=_keep,

@@ -48,7 +48,7 @@ from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.history import StepRecord
 from gnio_jax.filtering.propagation import Transition, put
 from gnio_jax.filtering.scan import StepTrace, clone_steps, take_row
-from gnio_jax.filtering.settings import FilterConfig, YawFrame
+from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
 from gnio_jax.filtering.state import (
     CLONE,
     CORE,
@@ -86,7 +86,7 @@ def smooth(
     displacement: Any,
     covariance: Any,
     imu_valid: Any = None,
-    frame: YawFrame = "given",
+    frame: DisplacementFrame = "given",
     measurements: tuple[Measurement, ...] = (),
 ) -> SmoothedHistory:
     """Filter K clone intervals as `run_filter` does, then smooth: each row is the estimate given
@@ -142,7 +142,7 @@ class _ForwardStep(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="frame")
 def _smooth(
-    inputs: FilterInputs, displacement: Array, covariance: Array, frame: YawFrame
+    inputs: FilterInputs, displacement: Array, covariance: Array, frame: DisplacementFrame
 ) -> SmoothedHistory:
     config = inputs.ekf.config
     rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)

@@ -2,8 +2,7 @@
 IEEE RA-L 2025), and the encoder that it shares with AirIMU.
 
 The network sees the samples in the body's frame, with gravity, and the attitude as an input of its
-own. It predicts the velocity in the body, which the filter may measure
-(`filtering.velocity.BodyVelocity`).
+own. It predicts the velocity in the body, which the filter may measure (`filter.measures`).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from gnio_jax.config.schema import Count, Probability
 from gnio_jax.models.bidirectional import Bidirectional
 from gnio_jax.models.convolution import convolve, convolve_forward
 from gnio_jax.models.layers import EPSILON, FLOAT32, MOMENTUM, linear
-from gnio_jax.types import Prediction
+from gnio_jax.types import Prediction, Velocity
 
 STRIDE = 9
 """Samples from one output to the next: two convolutions of stride 3."""
@@ -47,6 +46,8 @@ class AirIO(nn.Module):
     width: Count = 64
     dropout: Probability = 0.5
     channels = 12
+    takes_context = False
+    quantities = ("displacement", "velocity")
 
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 12"], train: bool = False) -> Prediction:
@@ -72,7 +73,8 @@ class AirIO(nn.Module):
         displacement = jnp.einsum("bnij,bnj->bi", to_window, velocity) / len(rows)
         variance = jnp.einsum("bnij,bnj->bi", to_window**2, jnp.exp(2 * log_std)) / len(rows)
         diagnostics = {"body_velocity": velocity, "body_velocity_log_std": log_std}
-        return Prediction(displacement, 0.5 * jnp.log(variance), diagnostics)
+        last = Velocity(velocity[:, -1], log_std[:, -1])
+        return Prediction(displacement, 0.5 * jnp.log(variance), diagnostics, velocity=last)
 
 
 class StridedEncoder(nn.Module):

@@ -134,7 +134,7 @@ def read_network(path: Path) -> TrainedNetwork:
     damaged, and for arrays that are not finite or do not fit the settings.
     """
     settings, weights = _read_files(path)
-    model = models.from_config(settings.config.model)
+    model = models.from_experiment(settings.config, str(path / CONFIG))
     shapes = models.variable_shapes(model, settings.config.data.seen)
     template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
     variables = from_bytes(weights, template, path / WEIGHTS)

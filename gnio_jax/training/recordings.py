@@ -51,7 +51,7 @@ def set_up(
     are too short, a batch that is larger than the split, and one that the devices cannot share
     evenly. `workers` processes read recordings that are slow to read, and make smoothed poses.
     """
-    model = models.from_config(config.model)  # finds mistakes in its options before reading data
+    model = models.from_experiment(config)  # finds mistakes in its options before reading data
     size, devices = config.optim.batch_size, parallel.count()
     if size % devices:
         problem = f"is {size}, which {devices} devices cannot share evenly"

@@ -27,7 +27,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.errors import InputError
 from gnio_jax.filtering import Filter, FilterState, Pose, level_state
 from gnio_jax.filtering.checks import checked_state
 from gnio_jax.filtering.displacement import scaled_displacement
@@ -73,20 +72,16 @@ class DeployedState(NamedTuple):
 
 
 def programs(network: Network, ekf: Filter) -> list[Program]:
-    """The four programs of a network and its filter. JAX's x64 must be on. Raises `InputError` for
-    a filter that measures something else of the network than its displacement."""
+    """The four programs of a network and its filter. JAX's x64 must be on. The output
+    `displacement` of the network is what the filter measures (`FilterConfig.measures`)."""
     config, noise = ekf.config, ekf.noise
-    for other in ekf.measurements:
-        if getattr(other, "needs", ()):
-            problem = "is not measured by an exported filter, which takes displacements"
-            remedy = "set it to null: the filter then takes the network's displacement"
-            raise InputError(f"filter.measurements.{other.name}", problem, remedy)
     samples = jax.ShapeDtypeStruct((config.reach, 6), jnp.float64)
     inside = functools.partial(invariant_errors, config=config)
     shape = DeployedState(jax.eval_shape(inside, state_shapes(config, noise, jnp.float64)), samples)
 
     def infer(arrays: Arrays) -> dict[str, Array]:
         prediction = network.apply(network.variables, arrays["window"])
+        prediction = prediction.measured(config.measures)
         outputs = {"displacement": prediction.displacement, "log_std": prediction.log_std}
         return outputs if prediction.axes is None else {**outputs, "axes": prediction.axes}
 
