@@ -33,7 +33,7 @@ from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
 from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.models import Network
-from gnio_jax.networks import TrainedNetwork
+from gnio_jax.networks import TrainedNetwork, load_corrector
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.types import Sequence
 
@@ -125,6 +125,7 @@ def estimate_recording(
         init="static",
         gyro_bias="rest",
         from_first=True,
+        corrector=load_corrector(config.filter, config.data.rate, trained),
     )
     if not ready:
         raise InputError(sequence.name, left_out[sequence.name], "record for longer")

@@ -293,7 +293,8 @@ def _make_run(
     options = walk.imu_valid, ekf.config.displacement_frame
 
     def run(state: FilterState, displacement: Array) -> FilterHistory:
-        return run_filter(ekf, state, walk.gyro, walk.accel, displacement, covariance, *options)[1]
+        rows = displacement, covariance, *options
+        return run_filter(ekf, state, walk.gyro, walk.accel, *rows, variance=walk.variance)[1]
 
     return run, jnp.asarray(value)
 

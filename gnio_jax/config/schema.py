@@ -535,6 +535,10 @@ class FilterSettings(FilterOptions):
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
     for weights trained that way."""
+    corrector: str | None = None
+    """Network with model.corrector (the folder of a run, a package or a name), whose corrector
+    comes before network and filter: both get corrected samples, and the filter takes the variances
+    that it predicts in the place of the densities in `noise` (AirIMU)."""
     raw_gyro_bias: NonNegative | None = None
     """Standard deviation of the first gyro bias for phones that subtract no bias, rad/s (ours):
     recordings with `imu_compensated: no`. By default it is that of `start`. Evaluation and tracking
@@ -692,6 +696,9 @@ class TrainConfig:
         if self.filter.mahalanobis_fail_scale > 0:
             problem = "makes no sense beside the soft gate of training through the filter"
             location.child("filter.mahalanobis_fail_scale").refuse(problem, "set it to 0")
+        if self.filter.corrector is not None:
+            problem = "is not for training through the filter, which has no variances of samples"
+            location.child("filter.corrector").refuse(problem, "train first, and set it after that")
         input_seconds = self.data.context_seconds + self.data.window_seconds
         if through.piece_seconds < input_seconds + 2 * self.data.stride_seconds:
             problem = f"must be longer than the {input_seconds:g} s that the network sees"

@@ -196,6 +196,8 @@ class BatchInputs(NamedTuple):
     """(b, K·n); None: every sample was measured."""
     displacements: Displacements | None
     """(b, K, 3); None where the network is in the filter."""
+    variance: Array | None = None
+    """(b, K·n, 6) variances of [accel, gyro] by a corrector; None: there is none."""
 
 
 def _batches(strides: list[int], batch_size: int) -> list[Batch]:
@@ -229,12 +231,21 @@ def filter_inputs(
             covariance = filled_up(np.where(finite, covariance, np.eye(3)), strides)
             rows.append(Displacements(filled_up(value, strides, np.nan), covariance))
         stacked = _stack(rows)
+    variance = None
+    if all(recording.variance is not None for recording in recordings):
+        variance = np.stack([_padded(recording.variance, samples) for recording in recordings])
     return BatchInputs(
         _stack([recording.start for recording in recordings]),
         *padded_signals(((recording.gyro, recording.accel) for recording in recordings), samples),
         padded_masks((recording.imu_valid for recording in recordings), samples),
         stacked,
+        variance,
     )
+
+
+def _padded(rows: Float[np.ndarray, "t 6"], count: int) -> Float[np.ndarray, "n 6"]:
+    """The first `count` rows, with the last one repeated behind them."""
+    return np.pad(rows[:count], ((0, max(count - len(rows), 0)), (0, 0)), "edge")
 
 
 @functools.partial(jax.jit, static_argnames="apply")
@@ -253,11 +264,12 @@ def _run(
             displacement = inputs.displacements.value
             covariance = inputs.displacements.covariance
             rows = displacement, covariance, valid, frame
-            history = run_filter(ekf, state, *signals, *rows)[1]
+            history = run_filter(ekf, state, *signals, *rows, variance=inputs.variance)[1]
         else:
             frame = ekf.config.displacement_frame
             predict = Network(apply, variables).predict(keep)
-            history = run_odometry(predict, ekf, state, *signals, valid)[1]
+            arguments = *signals, valid
+            history = run_odometry(predict, ekf, state, *arguments, variance=inputs.variance)[1]
         covariances = history.covariance
         assert covariances is not None
         if ekf.considered is not None:
@@ -265,7 +277,7 @@ def _run(
 
             def repeat_run(state: FilterState, displacement: Array) -> FilterHistory:
                 rows = displacement, covariance, valid, frame
-                return run_filter(ekf, state, *signals, *rows)[1]
+                return run_filter(ekf, state, *signals, *rows, variance=inputs.variance)[1]
 
             rotation = history.rotation if ekf.config.measures == "velocity" else None
             derivatives = sensitivity(repeat_run, state, displacement, rotation)

@@ -39,7 +39,7 @@ from gnio_jax.evaluation.report import DEFINITIONS, Report
 from gnio_jax.evaluation.trajectory import Alignment, Undefined, pair, read_tum
 from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
-from gnio_jax.networks import TrainedNetwork, find_network, newest_run, read_network
+from gnio_jax.networks import TrainedNetwork, find_network, load_corrector, newest_run, read_network
 from gnio_jax.networks.folder import evaluations_folder, training_recordings
 from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
@@ -124,6 +124,7 @@ def evaluate(
         init=config.init,
         gyro_bias=config.gyro_bias,
         orientation=config.orientation if _infers(config) else None,
+        corrector=load_corrector(config.filter, windows.rate, trained),
     )
     if not recordings:
         name, reason = next(iter(left_out.items()))
@@ -264,6 +265,7 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
             if (value := chosen.get(name)) != trained.get(name):
                 numbers = value if isinstance(value, tuple) else (value,)
                 text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
+                text = text.replace("/", "-")  # the folder of a corrector
                 parts.append(f"{name}-{text}")
     return "_".join(map(str, parts))
 

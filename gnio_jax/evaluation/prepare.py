@@ -24,6 +24,7 @@ from gnio_jax.filtering import (
     make_filter,
 )
 from gnio_jax.filtering.start import rest_at_start
+from gnio_jax.models.airimu import Corrector
 from gnio_jax.numerics import (
     cumulative_rotation,
     finite_rows,
@@ -114,6 +115,8 @@ class PreparedRecording(NamedTuple):
     """Notes for a reader of the result."""
     waypoints: Waypoints | None = None
     """The reference of a sequence without poses."""
+    variance: Float[np.ndarray, "t 6"] | None = None
+    """Variances of [accel, gyro] by a corrector, (m/s²)² and (rad/s)²; None: there is none."""
 
     @property
     def strides(self) -> int:
@@ -134,6 +137,7 @@ def prepare(
     gyro_bias: BiasSource = "zero",
     orientation: Orientation | None = None,
     from_first: bool = False,
+    corrector: Corrector | None = None,
 ) -> tuple[list[PreparedRecording], dict[str, str]]:
     """Recordings to estimate, and the names of the sequences that are left out with the reason.
 
@@ -154,6 +158,7 @@ def prepare(
             "reference".
         orientation: The source of `PreparedRecording.attitude`; None: there is none.
         from_first: Whether recordings begin at their first sample, whatever the reference.
+        corrector: It corrects the samples of a recording before everything else.
 
     Raises:
         InputError: A sequence lacks what these choices need.
@@ -162,12 +167,18 @@ def prepare(
     recordings, left_out = [], {}
     for sequence in sequences:
         sequence = data.resample(sequence, windows.rate)
+        variance = None
+        if corrector is not None:
+            accel, gyro, variance = corrector.correct(sequence.accel, sequence.gyro)
+            sequence = sequence._replace(accel=accel, gyro=gyro)
         posed = finite_rows(sequence.position) & finite_rows(sequence.orientation)
         sequence = sequence._replace(valid=sequence.valid & posed)
         _check(sequence, init, gyro_bias, orientation)
         first = 0 if from_first else int(np.argmax(sequence.valid))
         strides = (len(sequence.time) - 1 - first) // windows.stride
         whole = _cut(sequence, slice(first, first + strides * windows.stride + 1))
+        if variance is not None:
+            variance = variance[first : first + strides * windows.stride]
         measured = whole.measured_rows
         if strides <= windows.seen // windows.stride or len(measured) < windows.seen:
             seconds = len(_cut(sequence, slice(first, None)).measured_rows) / windows.rate
@@ -187,7 +198,7 @@ def prepare(
             level = ekf.raw_gyro_bias
         start = Start(rotation, velocity, position, bias, std, level, raw)
         trusted, mask = whole.valid[:, None], whole.imu_valid
-        first = window_starts(len(whole.time), windows.window, windows.stride)
+        starts = window_starts(len(whole.time), windows.window, windows.stride)
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
         placement = str(sequence.attributes.get("placement", "unknown"))
@@ -206,12 +217,13 @@ def prepare(
                 displacement=true_displacement(
                     poses[1],
                     poses[0],
-                    first,
+                    starts,
                     windows.window,
                 ),
-                velocity=windows.window_seconds * _velocity_in_body(whole, first + windows.window),
+                velocity=windows.window_seconds * _velocity_in_body(whole, starts + windows.window),
                 notes=tuple(filter(None, (reference_note, bias_note, start_note))),
                 waypoints=whole.waypoints,
+                variance=variance,
             )
         )
     return recordings, left_out

@@ -41,6 +41,9 @@ class Imu(NamedTuple):
     """m/s²"""
     gap: Gap | None
     """None where the stream is complete."""
+    variance: Float[Array, "*n 6"] | None = None
+    """Variances of the errors of [accel, gyro] in the place of the filter's densities, (m/s²)² and
+    (rad/s)², of corrected samples; None: the densities hold."""
 
 
 def no_gap(n: int, dtype: np.dtype) -> Gap:

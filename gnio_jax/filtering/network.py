@@ -180,7 +180,7 @@ def network_measurement(
         oldest: Array | int,
     ) -> tuple[Displacement, dict[str, Array]]:
         def infer() -> Prediction:
-            gyro, accel, gap = latest()
+            gyro, accel, gap, _ = latest()
             prediction = predict_one(network_window(state, oldest, gyro, accel, config))
             whole = gap is None or jnp.all(gap.used > 0)
             displacement = jnp.where(whole, prediction.displacement, jnp.nan)

@@ -88,6 +88,7 @@ def smooth(
     imu_valid: Any = None,
     frame: DisplacementFrame = "given",
     measurements: tuple[Measurement, ...] = (),
+    variance: Any = None,
 ) -> SmoothedHistory:
     """Filter K clone intervals as `run_filter` does, then smooth: each row is the estimate given
     all measurements of the K intervals.
@@ -117,12 +118,13 @@ def smooth(
             complete.
         frame: The attitude that defines the frame of the displacements, "given" or "own".
         measurements: Measurements with a row for each interval.
+        variance: (K·n, 6) variances of the samples, as in `run_filter`.
 
     Raises:
         ValueError: As `run_filter`.
     """
     check_frame(frame)
-    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
+    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements, variance)
     return _smooth(inputs, *checked_displacements(displacement, covariance, inputs), frame)
 
 

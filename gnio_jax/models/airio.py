@@ -86,18 +86,26 @@ class StridedEncoder(nn.Module):
     within: bool = False
 
     @nn.compact
-    def __call__(self, x: Float[Array, "b n c"], train: bool) -> Float[Array, "b m d"]:
+    def __call__(
+        self, x: Float[Array, "b n c"], train: bool, output: Int[Array, ""] | None = None
+    ) -> Float[Array, "b m d"]:
+        """With the number of an `output`, x has only the 25 samples on which it depends, and the
+        result is this output alone."""
+        padding = (0, 0) if output is not None else (3, 3)
         for layer, features in (("1", max(self.width // 2, 1)), ("2", self.width)):
             x = nn.Conv(
                 features,
                 (7,),
                 (3,),
-                [(3, 3)],
+                [padding],
                 conv_general_dilated=convolve if train else convolve_forward,
                 name=f"filter{layer}",
                 **FLOAT32,
             )(x)
             x = nn.gelu(norm(f"norm{layer}", train)(x), approximate=False)
+            if output is not None and layer == "1":  # the second convolution's padding at the start
+                rows = STRIDE // 3 * output - 3 + jnp.arange(x.shape[1])
+                x = jnp.where((rows >= 0)[None, :, None], x, 0.0)
             if self.within:
                 x = nn.Dropout(self.dropout, deterministic=not train)(x)
         return x

@@ -90,6 +90,9 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     if network.has_memory:
         problem = f"'{run.config.model.name}' has a memory, which the exported filter cannot carry"
         raise InputError(which, problem, "export a network on windows")
+    if run.config.filter.corrector is not None:
+        problem = "has a corrector before its filter, which is not exported"
+        raise InputError(which, problem, "set filter.corrector to null")
     ekf = make_filter(run.config.data, run.config.filter)
     with replacing_folder(out) as folder, ExitStack() as at_end:
         at_end.callback(logging.disable, logging.root.manager.disable)
