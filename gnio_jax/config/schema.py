@@ -270,7 +270,8 @@ class ModelConfig:
     all prototypes receive the same attention."""
     head: Literal["gated", "linear", "bins"] | None = None
     """Displacement as scale × gate, or a plain linear layer (gnio: gated, networks with memory:
-    linear), or a distribution over bins with its own uncertainty (gnio, trunk; VeloBins)."""
+    linear), or a distribution over bins with its own uncertainty (gnio, trunk, networks with
+    memory; VeloBins)."""
     reach: Positive | None = None
     """Largest displacement of the bins, m (3). Take 1.1 times the largest of the training
     windows."""
@@ -677,7 +678,7 @@ class TrainConfig:
         if data.context_seconds or data.window_rotation != "per_sample":
             problem = "are for networks whose windows have no context and rotate every sample"
             location.child("segments").refuse(problem)
-        if self.loss.name != "weighted_sum":
+        if self.loss.name not in ("weighted_sum", "bins"):
             location.child("segments").refuse(f"have no loss '{self.loss.name}'")
 
     def _check_through_filter(self, location: Location) -> None:
