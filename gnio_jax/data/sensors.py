@@ -36,7 +36,7 @@ class SensorKind(NamedTuple):
     """Units in which the sensor is also written, and their size."""
 
 
-SENSORS = {
+SENSOR_KINDS = {
     MAGNETOMETER: SensorKind(
         ("x", "y", "z"),
         "µT",
@@ -64,13 +64,13 @@ up."""
 def check_readings(
     sensor: str, readings: Readings, clock: Float[np.ndarray, " n"], source: object
 ) -> None:
-    """Raise `InputError` if the readings of a sensor are not what `SENSORS` says, or none of them is
-    on the clock (s) of the IMU."""
+    """Raise `InputError` if the readings of a sensor are not what `SENSOR_KINDS` says, or none of
+    them is on the clock (s) of the IMU."""
     time, values, std = readings
     field = f"field '{sensor}'"
-    kind = SENSORS.get(sensor)
+    kind = SENSOR_KINDS.get(sensor)
     if kind is None:
-        raise InputError(source, f"{field} is no known sensor", f"known: {', '.join(SENSORS)}")
+        raise InputError(source, f"{field} is no known sensor", f"known: {', '.join(SENSOR_KINDS)}")
     shape = (len(time), len(kind.columns))
     if time.ndim != 1 or not len(time) or values.shape != shape or std.shape != shape:
         shapes = f"time {time.shape}, values {values.shape} and std {std.shape}"
@@ -99,7 +99,7 @@ def check_readings(
 
 def check_unit(sensor: str, values: Float[np.ndarray, "f w"], source: object) -> None:
     """Raise `InputError` if readings have a size that shows another unit."""
-    kind = SENSORS[sensor]
+    kind = SENSOR_KINDS[sensor]
     least, most = kind.usual
     size = usual_size(sensor, values)
     if not least <= size <= most:
@@ -112,7 +112,7 @@ def check_unit(sensor: str, values: Float[np.ndarray, "f w"], source: object) ->
 
 def usual_size(sensor: str, values: Float[np.ndarray, "f w"]) -> float:
     """Median of the norm of the columns that a reading must have."""
-    required = values[:, : SENSORS[sensor].required]
+    required = values[:, : SENSOR_KINDS[sensor].required]
     return float(np.median(np.linalg.norm(required, axis=1)))
 
 
