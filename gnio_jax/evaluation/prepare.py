@@ -24,6 +24,7 @@ from gnio_jax.filtering import (
     make_filter,
 )
 from gnio_jax.filtering.start import rest_at_start
+from gnio_jax.filtering.update import Measurement
 from gnio_jax.numerics import (
     cumulative_rotation,
     finite_rows,
@@ -111,6 +112,9 @@ class PreparedRecording(NamedTuple):
     """Notes for a reader of the result."""
     waypoints: Waypoints | None = None
     """The reference of a sequence without poses."""
+    measurements: tuple[Measurement, ...] = ()
+    """Measurements of other sensors with a row for each stride, in addition to those of the filter.
+    Recordings that are estimated together have the same ones."""
 
     @property
     def strides(self) -> int:
