@@ -23,6 +23,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -339,10 +340,11 @@ def _align(
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Rotation and shift of a path to the fixes, the standard deviation of the angle, and the
     median distance. The weights are Cauchy's, at the scale of the fix or of the median distance."""
+    align = jax.jit(geometry.planar_alignment)
     information = 1 / (std**2 * crowd)
     weight = information
     for _ in range(20):
-        turn, shift = map(np.asarray, geometry.planar_alignment(path, fixes, weight))
+        turn, shift = jax.device_get(align(path, fixes, weight))
         distance = np.linalg.norm(path @ turn.T + shift - fixes, axis=1)
         scale = np.maximum(std, np.median(distance))
         weight = information / (1 + (distance / scale) ** 2)

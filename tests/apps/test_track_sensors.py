@@ -71,8 +71,8 @@ def share_of(result, sensor):
 
 
 def test_field_pressure_and_fixes_mend_heading_height_and_place(runs, tmp_path):
-    """Fixes that the filter does not get are nearer to its path than those of the receiver are to
-    the truth."""
+    """At fixes that the filter does not get, its path is about as good as a fix of the receiver,
+    whose errors (4 m an axis) last for half a minute."""
     walk = phone_walk.walk()
     gnss = walk.readings["gnss"]
     used = np.arange(len(gnss.time)) % 40 < 30  # ten seconds are left out now and then
@@ -83,7 +83,8 @@ def test_field_pressure_and_fixes_mend_heading_height_and_place(runs, tmp_path):
     result = tracked(runs, tmp_path, sequence, formats=("gpx", "geojson"))
     error, height = error_of(result)
     left_out = np.searchsorted(result.estimate.trajectory.time, gnss.time[~used])
-    assert np.sqrt((error[left_out] ** 2).mean()) < 5.0
+    assert np.sqrt((error[left_out] ** 2).mean()) < 1.2 * 4.0 * np.sqrt(2)
+    assert error.max() < bare.max() / 5
     assert np.abs(height).max() < 2.0
     shares = {use.sensor: use.accepted for use in result.summary.sensors}
     assert sorted(shares) == ["barometer", "gnss", "magnetometer"] and min(shares.values()) > 0.9
@@ -109,7 +110,7 @@ def test_the_magnetometer_alone_holds_the_heading_of_a_raw_gyro(runs, tmp_path):
     assert error.max() < 20  # of 312 m: the network's five per cent
     assert result.summary.origin is None
     text = result.summary.sensors[0].text
-    assert "turned the heading at the end by" in text and "the gyro's bias is 0.6" in text
+    assert "turned the heading at the end by" in text and "the gyro's bias is 0.58 °/s" in text
 
 
 @pytest.mark.parametrize("fault", ["jump", "far", "field"])
