@@ -201,8 +201,10 @@ def _phyphox_columns(files: list[LogFile]) -> Iterator[_OtherTable]:
             yield _OtherTable(BAROMETER, file, time, "s", {"pressure": pressures[0]}, "hPa")
         elif len(degrees) >= 2:
             names = ("altitude", *ACCURACY)
-            place = dict(zip(("latitude", "longitude"), degrees, strict=False))
-            yield _OtherTable(GNSS, file, time, "s", place | dict(zip(names, metres, strict=False)))
+            columns = dict(zip(("latitude", "longitude"), degrees, strict=False))
+            yield _OtherTable(
+                GNSS, file, time, "s", columns | dict(zip(names, metres, strict=False))
+            )
 
 
 def _is_time(label: str) -> bool:
