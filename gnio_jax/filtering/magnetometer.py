@@ -130,7 +130,20 @@ def magnetometer_on_intervals(
     first_seconds: float = 30.0,
 ) -> Magnetometer:
     """Readings of a magnetometer as a row for each clone interval, as `fit_field` makes them if the
-    gyro's bias is known."""
+    gyro's bias is known.
+
+    Args:
+        time: (f,) increasing stamps, s, on the clock of `start`.
+        field: (f, 3) readings in the body, µT. Those that are not finite are none.
+        rotation: (K, 3, 3) attitudes at the ends of the intervals, of a run without a magnetometer.
+        config: The settings of the filter, for the length of an interval.
+        start: Stamp of the first IMU sample, s.
+        std: Standard deviation σ of the direction, rad, with its correlation in time.
+        first_seconds: Length of the beginning, s, in which the gyro has not yet drifted.
+
+    Raises:
+        InputError: As `fit_field` raises it.
+    """
     return fit_field(time, field, rotation, config, start, std, first_seconds).rows
 
 

@@ -185,8 +185,7 @@ def _converted(
     time = parsing.seconds(stamps, first, second) + shift
     order = np.unique(time, return_index=True)[1]
     if raw.sensor == GNSS:  # loggers that run faster than the receiver repeat its last fix
-        place = values[order]
-        moved = (place[1:, :2] != place[:-1, :2]).any(axis=1)
+        moved = (np.diff(values[order, :2], axis=0) != 0).any(axis=1)
         order = order[np.concatenate([[True], moved])]
     if repeats := len(time) - len(order):
         remarks.append(f"{repeats} rows of {raw.sensor} repeat the one before and are left out")
