@@ -53,6 +53,18 @@ class Waypoints(NamedTuple):
         return ""
 
 
+class Readings(NamedTuple):
+    """Readings of a sensor beside the IMU, which has stamps of its own. `data.sensors` has the
+    names of the sensors, the columns of their values, and the units."""
+
+    time: Float[np.ndarray, "f"]
+    """Increasing stamps on the clock of the sequence, s."""
+    values: Float[np.ndarray, "f w"]
+    """One reading in each row. A column that a reading does not have is NaN."""
+    std: Float[np.ndarray, "f w"]
+    """Standard deviations as the sensor states them; NaN where it states none."""
+
+
 class Sequence(NamedTuple):
     """One recording: IMU and reference on one uniform clock. Host arrays in float64.
 
@@ -82,6 +94,8 @@ class Sequence(NamedTuple):
     waypoints: Waypoints | None = None
     """Known positions at a few moments. A recording with no other reference is valid nowhere, and
     functions that need poses refuse it."""
+    readings: dict[str, Readings] = {}
+    """The readings of other sensors by the name of the sensor (`data.sensors`)."""
     attributes: dict[str, Any] = {}
     """The origin: dataset, session, group, subject, device, placement, truth, licence, ...
     (str, float or bool)."""

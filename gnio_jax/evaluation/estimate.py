@@ -39,6 +39,7 @@ from gnio_jax.filtering import (
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION, explain_failure
 from gnio_jax.filtering.state import gyro_bias_covariance
+from gnio_jax.filtering.update import Measurement, Outcome
 from gnio_jax.models import Network
 from gnio_jax.numerics import (
     filled_up,
@@ -94,6 +95,9 @@ class SequenceEstimate(NamedTuple):
     """Notes for a reader of the result."""
     waypoints: Waypoints | None = None
     """The reference of a sequence without poses, in a frame of their own."""
+    accepted: dict[str, Float[np.ndarray, "n"]] = {}
+    """For each of `PreparedRecording.measurements` by name: 1 where it was used, 0 where it was
+    refused, NaN where there was none."""
 
 
 def estimate(
@@ -198,6 +202,8 @@ class BatchInputs(NamedTuple):
     """(b, K, 3); None where the network is in the filter."""
     variance: Array | None = None
     """(b, K·n, 6) variances of [accel, gyro] by a corrector; None: there is none."""
+    measurements: tuple[Measurement, ...] = ()
+    """Those of the recordings, (b, K, ...)."""
 
 
 def _batches(strides: list[int], batch_size: int) -> list[Batch]:
@@ -234,12 +240,17 @@ def filter_inputs(
     variance = None
     if all(recording.variance is not None for recording in recordings):
         variance = np.stack([_padded(recording.variance, samples) for recording in recordings])
+    measurements = (
+        jax.tree.map(lambda part: filled_up(part, strides, np.nan), recording.measurements)
+        for recording in recordings
+    )
     return BatchInputs(
         _stack([recording.start for recording in recordings]),
         *padded_signals(((recording.gyro, recording.accel) for recording in recordings), samples),
         padded_masks((recording.imu_valid for recording in recordings), samples),
         stacked,
         variance,
+        _stack([*measurements]),
     )
 
 
@@ -257,6 +268,10 @@ def _run(
 
     def run(inputs: BatchInputs) -> FilterHistory:
         signals, valid = (inputs.gyro, inputs.accel), inputs.imu_valid
+        others: dict[str, Any] = {
+            "measurements": inputs.measurements,
+            "variance": inputs.variance,
+        }
         state = inputs.start.state(ekf)
         if apply is None:
             assert inputs.displacements is not None
@@ -264,12 +279,11 @@ def _run(
             displacement = inputs.displacements.value
             covariance = inputs.displacements.covariance
             rows = displacement, covariance, valid, frame
-            history = run_filter(ekf, state, *signals, *rows, variance=inputs.variance)[1]
+            history = run_filter(ekf, state, *signals, *rows, **others)[1]
         else:
             frame = ekf.config.displacement_frame
             predict = Network(apply, variables).predict(keep)
-            arguments = *signals, valid
-            history = run_odometry(predict, ekf, state, *arguments, variance=inputs.variance)[1]
+            history = run_odometry(predict, ekf, state, *signals, valid, **others)[1]
         covariances = history.covariance
         assert covariances is not None
         if ekf.considered is not None:
@@ -277,7 +291,7 @@ def _run(
 
             def repeat_run(state: FilterState, displacement: Array) -> FilterHistory:
                 rows = displacement, covariance, valid, frame
-                return run_filter(ekf, state, *signals, *rows, variance=inputs.variance)[1]
+                return run_filter(ekf, state, *signals, *rows, **others)[1]
 
             rotation = history.rotation if ekf.config.measures == "velocity" else None
             derivatives = sensitivity(repeat_run, state, displacement, rotation)
@@ -335,7 +349,16 @@ def _convert_history(
         ),
         notes=notes,
         waypoints=recording.waypoints,
+        accepted={
+            measurement.name: _prepend(np.nan, _accepted(history.outcomes[measurement.name]))
+            for measurement in recording.measurements
+        },
     )
+
+
+def _accepted(outcome: Outcome) -> Float[np.ndarray, "k"]:
+    """1 where a measurement was used, 0 where it was refused, NaN where there was none."""
+    return np.where(outcome.present, np.asarray(outcome.accepted, float), np.nan)
 
 
 def _prepend(first: Any, rows: Any) -> np.ndarray:

@@ -24,6 +24,7 @@ from gnio_jax.filtering import (
     make_filter,
 )
 from gnio_jax.filtering.start import rest_at_start
+from gnio_jax.filtering.update import Measurement
 from gnio_jax.models.airimu import Corrector
 from gnio_jax.numerics import (
     cumulative_rotation,
@@ -117,6 +118,9 @@ class PreparedRecording(NamedTuple):
     """The reference of a sequence without poses."""
     variance: Float[np.ndarray, "t 6"] | None = None
     """Variances of [accel, gyro] by a corrector, (m/s²)² and (rad/s)²; None: there is none."""
+    measurements: tuple[Measurement, ...] = ()
+    """Measurements of other sensors with a row for each stride, in addition to those of the filter.
+    Recordings that are estimated together have the same ones."""
 
     @property
     def strides(self) -> int:
