@@ -230,6 +230,13 @@ class AugmentConfig:
     """Half-widths of a window's uniform scale errors of gyro and accelerometer (ours)."""
     rest_share: Annotated[Probability, FILE_ONLY] = 0.0
     """Share of the windows that are replaced by windows of a phone at rest (ours)."""
+    mirror_share: Annotated[Share, FILE_ONLY] = 0.0
+    """Share of the windows or segments that are mirrored, so that the left hand carries what the
+    right one carried (ours)."""
+    rocking_share: Annotated[Share, FILE_ONLY] = 0.0
+    """Share of the windows or segments in which the phone rocks otherwise in the hand: its rate of
+    turn about horizontal axes is turned about the vertical by any angle and scaled by a factor from
+    0 to 1.25 (ours)."""
     walkway_share: Annotated[Share, FILE_ONLY] = 0.0
     """Share of the segments that are walked on a moving walkway: the same gait at another speed
     (`training.walkway`; ours)."""
@@ -238,12 +245,21 @@ class AugmentConfig:
     alternating_gain: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
     """Smallest and largest factor of the fast part of position and acceleration, for segments: of
     the gait without the mean motion (ours)."""
+    vertical_gain: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
+    """Smallest and largest further factor of the vertical fast part: how much of the body's bounce
+    reaches the phone (ours)."""
     time_stretch: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
     """Smallest and largest factor of the pace at which a segment is played (ours)."""
 
     def check(self, location: Location) -> None:
         """Check that no range has its ends in the wrong order."""
-        for name in ("low_pass_hertz", "walkway", "alternating_gain", "time_stretch"):
+        for name in (
+            "low_pass_hertz",
+            "walkway",
+            "alternating_gain",
+            "vertical_gain",
+            "time_stretch",
+        ):
             low, high = getattr(self, name)
             if low > high:
                 location.child(name).refuse(
