@@ -16,6 +16,8 @@ from gnio_jax.evaluation.trajectory import read_tum
 from tests.support import tlio_files
 from tests.support.networks import SMALL
 
+NETWORKS = set(models.names())
+"""Those of the package, read before any test registers another one."""
 EXAMPLE = Path(__file__).parents[2] / "examples" / "walk.csv"
 OTHERS = {
     "gnio": (),
@@ -51,7 +53,7 @@ def smallest(network):
 
 def test_every_network_has_a_row_here():
     networks = {NAMED.get(name, name) for name in RECIPES} | OTHERS.keys()
-    assert networks == set(models.names())
+    assert networks == NETWORKS
 
 
 @pytest.mark.slow
