@@ -34,6 +34,7 @@ from gnio_jax.filtering import (
 )
 from gnio_jax.filtering.history import POSITION, YAW
 from gnio_jax.filtering.settings import (
+    DisplacementFrame,
     free_parameters,
     with_free_parameters,
     with_written_parameters,
@@ -247,7 +248,7 @@ def innovation_objective(
 
     def of_walk(settings: FilterSettings, walk: BatchInputs) -> Array:
         ekf = innovation_filter(windows, settings)
-        run, displacement = _make_run(walk, ekf)
+        run, displacement = _make_run(walk, ekf, ekf.config.displacement_frame)
         history = run(_wide_start(walk, settings).state(ekf), displacement)
         # The padding of the walk comes after its last displacement, where the filter may diverge.
         present = jnp.isfinite(displacement).all(axis=1)
@@ -283,16 +284,15 @@ def _wide_start(walk: BatchInputs, settings: FilterSettings) -> Start:
 
 
 def _make_run(
-    walk: BatchInputs, ekf: Filter
+    walk: BatchInputs, ekf: Filter, frame: DisplacementFrame
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], Array]:
-    """The function that runs the filter over one walk, given a start and displacements, and the
-    displacements of the walk."""
+    """The function that runs the filter over one walk, given a start and displacements in `frame`,
+    and the displacements of the walk."""
     assert walk.displacements is not None
     value, covariance, _ = walk.displacements
-    options = walk.imu_valid, ekf.config.displacement_frame
 
     def run(state: FilterState, displacement: Array) -> FilterHistory:
-        rows = displacement, covariance, *options
+        rows = displacement, covariance, walk.imu_valid, frame
         return run_filter(ekf, state, walk.gyro, walk.accel, *rows, variance=walk.variance)[1]
 
     return run, jnp.asarray(value)
@@ -431,7 +431,7 @@ def _run_walks(
         ekf = make_filter(windows, settings)
         start = apply_start_settings(walk.start, settings)
         state = start.state(ekf)
-        run, displacement = _make_run(walk, ekf)
+        run, displacement = _make_run(walk, ekf, ekf.config.derivative_frame)
         history = run(state, displacement)
         rotation = history.rotation if ekf.config.measures == "velocity" else None
         derivatives = sensitivity(run, state, displacement, rotation)

@@ -277,7 +277,7 @@ def _run(
             rows = displacement, covariance, valid, frame
             history = run_filter(ekf, state, *signals, *rows, **others)[1]
         else:
-            frame = ekf.config.displacement_frame
+            frame = ekf.config.derivative_frame
             predict = Network(apply, variables).predict(keep)
             history = run_odometry(predict, ekf, state, *signals, valid, **others)[1]
         covariances = history.covariance

@@ -118,8 +118,10 @@ def sensitivity(
 
     For a run of `run_odometry` the displacements are those of its history, and if they are
     velocities in the body, `rotation` is body → world of each row (`disturb`). The network is not
-    called again, and the small effect of other biases on its windows is neglected. `run` must not
-    cut its gradient (`FilterConfig.truncate_every`), because S is the derivative of the whole run.
+    called again, and the small effect of other biases on its windows is neglected. But its
+    displacements turn with the yaw frame of the filter, which a tilt turns too if the x axis is
+    steep. So `run` must take them in the frame `FilterConfig.derivative_frame`. `run` must not cut
+    its gradient (`FilterConfig.truncate_every`), because S is the derivative of the whole run.
     """
 
     def run_disturbed(c: Float[Array, "6"]) -> tuple[Mean, Array]:
@@ -181,7 +183,11 @@ def step_with_tangents(
             in_body = measured.frame == "body"
             rotation = jax.lax.stop_gradient(state.rotation)[None] if in_body else None
             displacement = disturb(measured.displacement[None], c, rotation)[0]
-            return dataclasses.replace(measured, displacement=displacement), diagnostics
+            frame = "turning" if measured.frame == "own" else measured.frame
+            return (
+                dataclasses.replace(measured, displacement=displacement, frame=frame),
+                diagnostics,
+            )
 
         whole = jax.tree.map(
             lambda part, leaf: leaf if part is None else part,

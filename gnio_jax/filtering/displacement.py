@@ -133,7 +133,8 @@ def linearise_displacement(
     R̂_i = exp(−δθ) R_i, and the network answers in that frame. If it is equivariant to yaw and a
     small tilt changes nothing, d = R_γ(R̂_i)ᵀ exp(−δθ_z e_z) (p_j − p_i): an error of the frame
     turns d and the prediction by the same angle, and only δθ_z remains in r. The yaw is not
-    differentiated, so there is no gimbal lock.
+    differentiated, so there is no gimbal lock. The frame "turning" is this one, and the derivative
+    of its R_γ is that by δθ_z alone.
 
     In the body d is the velocity times the length T of the window (AirIO): r = d − T Rᵀ v for the
     present attitude R and velocity v, H[v] = T Rᵀ, and H[θ] = T Rᵀ hat(v).
@@ -172,10 +173,15 @@ def _predict_displacement(
 ) -> tuple[Float[Array, "3"], dict[str, Array], Bool[Array, ""]]:
     """R_γ(R_i)ᵀ (p_j − p_i), its derivatives, and whether they are defined."""
     rotation = state.clone_rotation[oldest]
-    to_yaw_frame = geometry.yaw_rotation(rotation).T
+    yaw_frame = geometry.yaw_rotation(rotation)
+    if frame == "turning":
+        fixed = jax.lax.stop_gradient(rotation)
+        turn = geometry.twist_direction(geometry.matmul(rotation, fixed.T))
+        yaw_frame = geometry.heading_rotation(*turn) @ jax.lax.stop_gradient(yaw_frame)
+    to_yaw_frame = yaw_frame.T
     moved = to_yaw_frame @ since_oldest(state, oldest)
     zero, one = jnp.zeros_like(moved[0]), jnp.ones_like(moved[0])
-    if frame == "own":
+    if frame in ("own", "turning"):
         defined, yaw_row = jnp.bool_(True), jnp.stack([zero, zero, one])
     else:
         cosine_squared = rotation[0, 0] ** 2 + rotation[1, 0] ** 2

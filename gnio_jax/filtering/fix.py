@@ -39,6 +39,9 @@ class Fix(NamedTuple):
     """A horizontal (m = 2) or a three-dimensional position (m = 3), or a row for each of K clone
     intervals. It is an entry of `measurements` of `run_filter`, `run_odometry` and `smooth`.
 
+    Fixes without any displacement show a yaw that is uncertain by more than 0.2 rad less well than
+    the covariance says (docs/filter.md).
+
     Outside `jit` these three refuse a fix with impossible numbers, naming the field. Inside `jit`,
     where values are not known, such a fix counts as missing.
     """

@@ -36,10 +36,15 @@ jax.tree_util.register_pytree_with_keys(
     lambda names, values: Entries(dict(zip(names, values, strict=True))),
 )
 
-DisplacementFrame = Literal["own", "given", "body"]
-"""The frame in which a displacement is expressed: the yaw frame of the filter's own attitude of the
-oldest clone, with which the network's window was cut; that of another attitude; or the body at the
-newest clone, for the velocity there in metres per window."""
+DisplacementFrame = Literal["own", "turning", "given", "body"]
+"""The frame in which a displacement is expressed.
+
+own: the yaw frame of the filter's own attitude of the oldest clone, with which the network's window
+was cut. turning: the same frame, whose derivatives are those with the network in the loop. The
+displacement turns with the frame, so only the turn of the clone about z has an effect, and the
+frame has a derivative where the x axis is vertical (`consider.sensitivity`). given: the yaw frame
+of another attitude. body: the body at the newest clone, for the velocity there in metres per
+window."""
 
 
 @no_type_check  # The tests' run-time checker would refuse what __post_init__ converts or names.
@@ -144,6 +149,11 @@ class FilterConfig(FilterOptions):
         if self.measures == "velocity":
             return "body"
         return "given" if self.window_rotation == "tlio" else "own"
+
+    @property
+    def derivative_frame(self) -> DisplacementFrame:
+        """Frame of what the network measures in a run without it that is differentiated."""
+        return "turning" if self.displacement_frame == "own" else self.displacement_frame
 
     @property
     def invariant(self) -> bool:

@@ -116,7 +116,7 @@ def smooth(
         covariance: (K, 3, 3) m², as in `run_filter`.
         imu_valid: (K·n,) booleans, False where an IMU sample is missing; None: the stream is
             complete.
-        frame: The attitude that defines the frame of the displacements, "given" or "own".
+        frame: The attitude that defines the frame of the displacements, as in `run_filter`.
         measurements: Measurements with a row for each interval.
         variance: (K·n, 6) variances of the samples, as in `run_filter`.
 

@@ -84,7 +84,8 @@ class WaypointPoses(NamedTuple):
     the start. It is valid from the first waypoint to the last, and has no waypoints."""
     smoothed: SmoothedHistory
     """Poses and velocities at the end of every clone interval that the walk fills, with
-    covariances."""
+    covariances. They do not contain an error of the network's heading that lasts for the whole
+    walk."""
     weight: Float[np.ndarray, "f"]
     """Weight of each waypoint: above 1 on the path, towards 0 far from it."""
 

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import filtering
+from gnio_jax import filtering, geometry
 from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.consider import disturb
+from gnio_jax.filtering.displacement import Displacement, linearise_displacement
+from gnio_jax.filtering.update import Step
 from gnio_jax.types import Prediction
 from tests.support.checks import checked_at_first
 from tests.support.compiling import optimised
@@ -40,25 +42,27 @@ def drawn():
 
 
 def run_and_sensitivity(c, more, rotation, velocity, position, gyro, accel, displacement, std):
-    """A filter that is disturbed by `c` and then by `more`: its history, sensitivity, and what is
-    considered of it."""
+    """A filter that is disturbed by `c` and then by `more`: its history, the sensitivity where the
+    displacements do not turn with its yaw frame, and the consider covariance where they do."""
     bias = c[:3] + more[:3]
     start = filtering.initial_state(
         filtering.Filter(CONFIG, start=START), rotation, velocity, position, bias
     )
     given = disturb(disturb(displacement, c), more), jax.vmap(jnp.diag)(std**2)
 
-    def repeated(start, displacement, covariance):
-        ekf = filtering.Filter(CONFIG, NOISE)
-        return filtering.run_filter(ekf, start, gyro, accel, displacement, covariance, frame="own")[
-            1
-        ]
+    def repeated(start, displacement, covariance, frame):
+        signals = start, gyro, accel, displacement, covariance
+        return filtering.run_filter(filtering.Filter(CONFIG, NOISE), *signals, frame=frame)[1]
 
-    history = repeated(start, *given)
+    history = repeated(start, *given, "own")
     displacement, covariance = history.given(NOISE)
-    again = functools.partial(repeated, covariance=covariance)
-    found = filtering.sensitivity(again, start, displacement)
-    return history, found, filtering.considered_covariance(found, STD)
+    fixed, turning = (
+        filtering.sensitivity(
+            functools.partial(repeated, covariance=covariance, frame=frame), start, displacement
+        )
+        for frame in ("own", "turning")
+    )
+    return history, fixed, filtering.considered_covariance(turning, STD)
 
 
 PROGRAM = jax.jit(jax.vmap(run_and_sensitivity))
@@ -106,6 +110,92 @@ def test_the_sensitivity_is_the_change_of_the_filter():
         np.testing.assert_allclose(
             found[0, :, :, entry] / (size + 1e-6), wanted / (size + 1e-6), atol=1e-5
         )
+
+
+RELABELLED = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""From the axes of the body to others, of which x was z: it is nearly vertical."""
+
+
+def mean_force(windows):
+    """A network that turns with the frame of its window: a tenth of the mean specific force."""
+    force = 0.1 * windows[:, :, :3].mean(axis=1) * jnp.array([[1.0, 1.0, 0.0]], jnp.float32)
+    return Prediction(force, jnp.full_like(force, jnp.log(0.1)))
+
+
+def test_the_sensitivity_does_not_depend_on_which_axis_of_the_phone_is_vertical():
+    """A phone that lies on its side has its x axis near the vertical, where the yaw of this axis
+    turns with every small tilt. Window, displacement and covariance turn with it."""
+    runs, _ = walks()
+    noise = NOISE._replace(std_factor=(1.0, 1.0, 1.0))
+    ekf = filtering.Filter(CONFIG, noise, START)
+
+    @functools.partial(jax.jit, static_argnames="frame")
+    def run(rotation, gyro, accel, frame):
+        state = filtering.initial_state(ekf, rotation, runs.velocity0[0], runs.position0[0])
+        _, history = filtering.run_odometry(mean_force, ekf, state, gyro, accel)
+        displacement, covariance = history.given(noise)
+
+        def repeat_run(state, displacement):
+            rows = displacement, covariance
+            return filtering.run_filter(ekf, state, gyro, accel, *rows, frame=frame)[1]
+
+        return history, filtering.sensitivity(repeat_run, state, displacement)
+
+    labels = np.eye(3), RELABELLED
+    imu = [
+        (runs.rotation0[0] @ to_other.T, runs.gyro[0] @ to_other.T, runs.accel[0] @ to_other.T)
+        for to_other in labels
+    ]
+    (history, rows), (other, other_rows) = (
+        jax.device_get(run(*signals, CONFIG.derivative_frame)) for signals in imu
+    )
+    assert np.abs(other.rotation[:, 2, 0]).max() > 0.99
+    np.testing.assert_allclose(other.rotation, history.rotation @ RELABELLED.T, atol=1e-5)
+    np.testing.assert_allclose(other.position, history.position, atol=1e-4)
+    in_other_axes = np.einsum("kdc,bc->kdb", rows[:, :9, :3], RELABELLED)
+    for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
+        for expected, actual in (
+            (in_other_axes[:, part], other_rows[:, part, :3]),
+            (rows[:, part, 3:], other_rows[:, part, 3:]),
+        ):
+            scale = np.abs(expected).max()
+            np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-3)
+    fixed = np.asarray(run(*imu[1], "own")[1])  # a displacement that does not turn
+    assert np.abs(fixed - other_rows)[:, :3].max() > 0.03 * np.abs(other_rows[:, :3]).max()
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, np.pi / 2 - 1e-9, 1.2])
+def test_a_displacement_that_turns_with_its_frame_has_a_derivative_at_any_pitch(pitch):
+    """By the rotation of the oldest clone: only its turn about z changes the residual."""
+    moved = np.array([0.7, -0.4, 0.2])
+    config = dataclasses.replace(CONFIG, error="additive")
+    step = Step(None, CLONES, 0, config, NOISE)
+    exact = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    rotation = exact if pitch == np.pi / 2 else Rotation.from_euler("y", pitch).as_matrix()
+    rotation = Rotation.from_euler("z", 0.3).as_matrix() @ rotation
+    measured = Displacement(np.zeros(3), np.eye(3), np.bool_(True), "turning")
+
+    def residual(turn):
+        state = walking_state(geometry.exp(turn) @ rotation, moved)
+        linear, _ = linearise_displacement(measured, state, step)
+        return linear.residual, linear.jacobian["oldest_rotation"]
+
+    derivative, of_jacobian = jax.jacfwd(residual)(np.zeros(3))
+    first, jacobian = residual(np.zeros(3))
+    expected = np.zeros((3, 3))
+    expected[:, 2] = np.cross([0.0, 0.0, 1.0], -np.asarray(first))
+    np.testing.assert_allclose(derivative, expected, atol=1e-12)
+    np.testing.assert_allclose(derivative, -np.asarray(jacobian), atol=1e-12)
+    assert np.isfinite(of_jacobian).all() and not np.asarray(of_jacobian)[..., :2].any()
+
+
+def walking_state(rotation, moved):
+    """A state whose oldest clone has this rotation, and that has moved since then."""
+    nothing = np.zeros(3)
+    ekf = filtering.Filter(CONFIG)
+    state = filtering.initial_state(ekf, np.eye(3), nothing, nothing)
+    rotations = jnp.asarray(state.clone_rotation).at[0].set(rotation)
+    return state._replace(clone_rotation=rotations, offset=jnp.asarray(moved))
 
 
 def test_displacements_are_disturbed_as_they_are_said_to_be():
