@@ -87,7 +87,9 @@ class FilterTask(Task):
     def order(self, key: PRNGKeyArray, epoch: int, source: SegmentSource) -> Int[jax.Array, "p"]:
         """First rows of the segments."""
         key = jax.random.fold_in(key, epoch)
-        which = self.select_visits(key, jnp.arange(self.count(source)))
+        # `random_starts` splits `key`, whose parts are those of the indices 0 and 1.
+        visit_key = jax.random.fold_in(key, 2)
+        which = self.select_visits(visit_key, jnp.arange(self.count(source)))
         earliest, latest = jnp.asarray(source.earliest)[which], jnp.asarray(source.latest)[which]
         return random_starts(key, source._replace(earliest=earliest, latest=latest))
 

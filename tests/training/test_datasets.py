@@ -127,6 +127,27 @@ def test_segments_are_visited_by_weight_too_each_in_its_share():
     np.testing.assert_array_equal(source.position[600:], walks[1].position)
 
 
+def test_datasets_and_places_are_drawn_with_keys_of_their_own(monkeypatch):
+    """A key that two drawings share would draw the same bits twice."""
+    keys = []
+    for name in ("permutation", "randint"):
+        drawing = getattr(jax.random, name)
+
+        def recorded(key, *arguments, drawing=drawing):
+            keys.append(bytes(np.asarray(jax.random.key_data(key))))
+            return drawing(key, *arguments)
+
+        monkeypatch.setattr(jax.random, name, recorded)
+    walks = [data.resample(data.load(name, split="train")[0], 50.0) for name in BOTH]
+    parts = [segments.segment_source([walk], 100) for walk in walks]
+    counts = tuple(len(part.earliest) for part in parts)
+    config = TrainConfig(dataset=BOTH, data=DataConfig(weights=(0.5, 1.5)))
+    source = segments.join_segments(parts)
+    FilterTask(Tiny(), config, 1, counts).order(jax.random.key(0), 0, source)
+    assert len(keys) == 4  # of two datasets, the places and their order
+    assert len(set(keys)) == len(keys)
+
+
 def test_the_mean_is_over_the_datasets_that_have_a_figure(run):
     """Only walks with waypoints have an error at them."""
 
