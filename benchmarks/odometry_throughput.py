@@ -51,7 +51,7 @@ def measure(
     )
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
     model = models.create(network)
-    variables = models.initialise(model, jax.random.key(0), config.seen)
+    variables = models.initialise(model, jax.random.key(0), config.input_samples)
     apply, frozen = models.Inference(model), models.inference_variables(model, variables)
 
     def with_network(frozen, gyro, accel):

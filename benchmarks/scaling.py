@@ -61,11 +61,11 @@ def configuration(width: int, batch: int) -> TrainConfig:
 
 def prepare(config: TrainConfig, model: nn.Module):
     """A function that takes a state through STEPS steps, the state, and its program."""
-    samples = config.data.seen
-    source = parallel.everywhere(jax.device_get(recordings(samples, config.optim.batch_size)))
+    samples = config.data.input_samples
+    source = parallel.copy_to_devices(jax.device_get(recordings(samples, config.optim.batch_size)))
     task = WindowTask(model, config, 1000)
     state = task.initial_state(jax.random.key(0), None)
-    order = parallel.everywhere(np.arange(source.start.shape[0], dtype=np.int32))
+    order = parallel.copy_to_devices(np.arange(source.start.shape[0], dtype=np.int32))
     arguments = (source, order, jnp.int32(0), jnp.int32(STEPS), jnp.float32(1), jax.random.key(1))
     return (
         lambda state: train_steps(state, *arguments, task=task),
@@ -169,7 +169,7 @@ def row(gpus: int, windows: int, flops: float, sums: list[int], cluster: Cluster
 
 def flops_per_window(config: TrainConfig, network: nn.Module) -> float:
     """Operations of the gradient, as XLA counts those of the program for one device."""
-    imu = jnp.zeros((config.optim.batch_size, config.data.seen, 6), jnp.float32)
+    imu = jnp.zeros((config.optim.batch_size, config.data.input_samples, 6), jnp.float32)
     variables = jax.eval_shape(network.init, jax.random.key(0), imu[:1])
 
     def loss(params, state):

@@ -55,7 +55,7 @@ def ours(config: TrainConfig):
 
     The whole step runs STEPS steps in one dispatch, as the training loop does.
     """
-    size, samples = config.optim.batch_size, config.data.seen
+    size, samples = config.optim.batch_size, config.data.input_samples
     source, model = recordings(samples, size), models.from_config(config.model)
     task = WindowTask(model, config, STEPS_PER_EPOCH)
     holder = [task.initial_state(jax.random.key(0), None)]

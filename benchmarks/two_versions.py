@@ -91,7 +91,8 @@ gyro, accel, *_ = jax.device_put(walk(10.0, config))
 state = begin(config, np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3))
 noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, DT)
 model = models.create("gnio")
-frozen = models.inference_variables(model, models.initialise(model, jax.random.key(0), config.seen))
+samples = getattr(config, "input_samples", None) or config.seen  # its earlier name
+frozen = models.inference_variables(model, models.initialise(model, jax.random.key(0), samples))
 apply = models.Inference(model)
 
 def odometry(frozen, gyro, accel):

@@ -41,7 +41,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         handle, name = tempfile.mkstemp(path.suffix, f".{path.stem}{PART}", path.parent)
         return name, handle
 
-    temporary, handle = _locked(create)
+    temporary, handle = _create_locked(create)
     try:
         yield temporary
         os.fsync(handle)  # some file systems report an error only here
@@ -68,7 +68,7 @@ def _target(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _locked(create: Callable[[], tuple[str, int]]) -> tuple[Path, int]:
+def _create_locked(create: Callable[[], tuple[str, int]]) -> tuple[Path, int]:
     """A new temporary file or folder with its open handle. Its lock shows other processes that it
     is being written; the system removes it when this process ends, in whatever way."""
     while True:
@@ -236,7 +236,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         name = tempfile.mkdtemp(prefix=f".{path.name}{PART}", dir=parent)
         return name, os.open(name, os.O_RDONLY)
 
-    temporary, handle = _locked(create)
+    temporary, handle = _create_locked(create)
     try:
         new, old = temporary / "new", temporary / _OLD
         new.mkdir()

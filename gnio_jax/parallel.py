@@ -153,7 +153,7 @@ def describe() -> str:
     return f"{number}{platform}" + (f" in {processes} processes" if processes > 1 else "")
 
 
-def everywhere(tree: Tree) -> Tree:
+def copy_to_devices(tree: Tree) -> Tree:
     """Copy host arrays to each of the devices.
 
     Every process must give the same arrays. They must not be written to afterwards: on a CPU the
@@ -161,14 +161,14 @@ def everywhere(tree: Tree) -> Tree:
     """
     mesh = jax.sharding.get_mesh()
 
-    def place(leaf: Any) -> jax.Array:
+    def place_leaf(leaf: Any) -> jax.Array:
         if mesh.empty:
             return fresh_copy(leaf)
         host = np.asarray(leaf)
         sharding = NamedSharding(mesh, PartitionSpec())
         return jax.make_array_from_process_local_data(sharding, host, host.shape)
 
-    return jax.tree.map(place, tree)
+    return jax.tree.map(place_leaf, tree)
 
 
 def fresh_copy(leaf: Any) -> jax.Array:

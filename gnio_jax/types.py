@@ -157,7 +157,7 @@ class Prediction(NamedTuple):
     velocity: Velocity | None = None
     """The velocity in the body, if the network predicts one."""
 
-    def measured(self, quantity: Quantity) -> Prediction:
+    def with_quantity(self, quantity: Quantity) -> Prediction:
         """The prediction with the measured quantity in the place of its displacement. Raises
         `ValueError` for a velocity that the network does not predict."""
         if quantity == "displacement":
@@ -192,7 +192,7 @@ class Prediction(NamedTuple):
         plane = jnp.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
         return jnp.concatenate([plane, error[..., 2:]], axis=-1)
 
-    def normalised(
+    def normalise(
         self, error: Float[jax.Array, "*b d"], least: float | None
     ) -> tuple[Float[jax.Array, "*b d"], Float[jax.Array, "*b d"]]:
         """(e/σ)² of errors of the first d axes, m, along the axes of `log_std`, and log σ, with the

@@ -57,6 +57,10 @@ REFUSED |= set("these those wanted taken laid made left rest apart since late".s
 """Words that do not say what a variable holds."""
 
 
+VAGUE = set("look expect tell told ask late few way listed opened where".split())
+"""Names that do not say what a function does."""
+
+
 class Import(NamedTuple):
     """An import of the package, anywhere in a module."""
 
@@ -149,6 +153,26 @@ def test_a_variable_is_a_noun():
             if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
                 name = node.id
             assert name not in REFUSED, f"gnio_jax/{module}: a variable is called '{name}'"
+
+
+NOUNS = {"speed", "feed"}
+"""Nouns that end as participles do."""
+
+
+def test_a_function_does_not_have_the_name_of_a_participle():
+    """`open_bag` and not `opened`, `with_measured_rate` and not `measured`."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        module = path.relative_to(PACKAGE).as_posix()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
+            if decorators & {"property", "functools.cached_property"}:  # a quantity
+                continue
+            name = node.name.strip("_")
+            participle = name.endswith("ed") and "_" not in name and name not in NOUNS
+            refused = participle or name in REFUSED | VAGUE
+            assert not refused, f"gnio_jax/{module}: a function is called '{node.name}'"
 
 
 def test_a_function_has_at_most_95_lines():

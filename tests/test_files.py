@@ -178,7 +178,7 @@ def test_a_file_that_is_taken_for_a_leftover_is_made_again(tmp_path):
             path.touch()
         return str(path), handle
 
-    path, handle = files._locked(create)
+    path, handle = files._create_locked(create)
     os.close(handle)
     assert path == made[2] and len(made) == 3
 

@@ -174,7 +174,7 @@ def trained(config):
     """Losses and gradient norms of each of five steps, figures of validation, parameters."""
     task, (source, held_out, _) = set_up(WindowTask, config, Silence())
     key, drawn = jax.random.key(0), drawn_state(task.model, config, task.steps_per_epoch)
-    state, order, found = parallel.everywhere(drawn), task.order(key, 0, source), []
+    state, order, found = parallel.copy_to_devices(drawn), task.order(key, 0, source), []
     for first in range(5):
         numbers = jnp.int32(first), jnp.int32(1), jnp.float32(1)
         state, progress = task.take_steps(state, source, order, *numbers, key)
@@ -203,7 +203,7 @@ def test_each_device_has_the_state_and_its_part_of_the_batch(small, on_two):
         assert leaf.sharding.is_fully_replicated and len(leaf.devices()) == 2
     with parallel.sharing(2):
         task, (source, *_) = set_up(WindowTask, small, Silence())
-        which = parallel.everywhere(np.arange(16, dtype=np.int32))
+        which = parallel.copy_to_devices(np.arange(16, dtype=np.int32))
         key = jax.random.key(0)
         draw = jax.jit(lambda: task.draw(key, source, which))
         windows, _ = draw()
@@ -286,7 +286,7 @@ def test_with_one_device_nothing_is_placed_nor_constrained():
         with parallel.sharing(limit):
             assert parallel.count() == 1 and parallel.describe() == "cpu"
             assert parallel.split(rows) is rows and parallel.replicate(rows) is rows
-            assert parallel.everywhere(np.arange(6)).sharding == rows.sharding
+            assert parallel.copy_to_devices(np.arange(6)).sharding == rows.sharding
     with parallel.sharing(2):
         assert parallel.count() == 2 and parallel.describe() == "2 × cpu"
-        assert parallel.everywhere(np.arange(6)).sharding.spec == PartitionSpec()
+        assert parallel.copy_to_devices(np.arange(6)).sharding.spec == PartitionSpec()

@@ -61,7 +61,9 @@ class ComparedRow(NamedTuple):
     @property
     def way(self) -> str:
         """The way its trajectories are estimated."""
-        return " and ".join(dict.fromkeys(tabulate.way(report.settings) for report in self.reports))
+        return " and ".join(
+            dict.fromkeys(tabulate.describe_estimator(report.settings) for report in self.reports)
+        )
 
     def recordings(self, metric: str | None = None) -> set[str]:
         """Recordings that all seeds have, and for which the metric, if given, has a value."""

@@ -165,7 +165,7 @@ def _write_figures(
     folder: Path, result: SequenceEstimate, summary: Summary, formats: tuple[str, ...]
 ) -> None:
     """Write the summary and the trajectories, with the stamps of the recording's own clock."""
-    plain = summary._asdict() | {"errors": report.finite(summary.errors)}
+    plain = summary._asdict() | {"errors": report.finite_values(summary.errors)}
     plain["sensors"] = [use._asdict() for use in summary.sensors]
     plain["origin"] = summary.origin and summary.origin._asdict()
     absent = [name for name in ("sensors", "origin") if not plain[name]]

@@ -108,7 +108,7 @@ def live(request: LiveOptions, _call: options.Call) -> None:
                 raise InputError("--rest-seconds", problem) from None
         result, nature = session.Followed(), source.nature
         show_state(result, run)
-        arrivals = _prepared(source, tracker, result, run, request)
+        arrivals = _prepare_source(source, tracker, result, run, request)
         viewer = running.enter_context(rerun.streaming(request.rerun)) if request.rerun else None
         last_shown = -math.inf
 
@@ -176,7 +176,7 @@ def _open(request: LiveOptions, running: contextlib.ExitStack) -> tuple[Any, Cal
     return source, show
 
 
-def _prepared(source: Any, tracker: Any, result: Any, run: Any, request: LiveOptions) -> Any:
+def _prepare_source(source: Any, tracker: Any, result: Any, run: Any, request: LiveOptions) -> Any:
     """The arrivals of a source on one clock, in order and checked. Says what is known about it, and
     that it is ready."""
     from gnio_jax.apps.live import checks, tracking
@@ -194,7 +194,7 @@ def _prepared(source: Any, tracker: Any, result: Any, run: Any, request: LiveOpt
         say("  the filter of this network does not hold the position while the device rests")
 
     def begin(imu_rate: float) -> None:
-        tracker.expect(imu_rate, tracking.longest_interval(run, imu_rate))
+        tracker.set_rate(imu_rate, tracking.longest_interval(run, imu_rate))
         result.bridged = longest_bridge(imu_rate)
 
     def begin_measured(imu_rate: float) -> None:
@@ -209,7 +209,7 @@ def _prepared(source: Any, tracker: Any, result: Any, run: Any, request: LiveOpt
     say(f"ready: hold still now, for {request.rest_seconds:g} s")
     if source.is_live:
         arrivals = tracking.since_ready(arrivals, time.monotonic(), ekf)
-    return checks.measured(arrivals, source.nature, begin_measured)
+    return checks.with_measured_rate(arrivals, source.nature, begin_measured)
 
 
 def _no_path(result: Any, name: str, rest_seconds: float) -> InputError:

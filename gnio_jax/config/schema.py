@@ -165,7 +165,7 @@ class DataConfig:
         return round(self.context_seconds * self.rate)
 
     @property
-    def seen(self) -> int:
+    def input_samples(self) -> int:
         """Samples that the network sees: the context and the window."""
         return self.context + self.window
 

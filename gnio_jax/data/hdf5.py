@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from gnio_jax.data.parsing.tables import hdf5_field, hdf5_node, parsed_as, shortened
+from gnio_jax.data.parsing.tables import hdf5_field, hdf5_node, parsing_as, shorten
 from gnio_jax.data.validation import validate
 from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
@@ -63,7 +63,7 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
     path = Path(path)
     if not path.exists():
         raise InputError(path, "no such file")
-    with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
+    with parsing_as(path, "HDF5"), h5py.File(path, "r") as file:
         stored = _read_group(file, path)
     return _stored_sequence(stored, path)
 
@@ -103,7 +103,7 @@ def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
         try:
             attributes[key] = value
         except (ValueError, TypeError):
-            problem = f"attribute '{key}' is {shortened(ascii(value))}"
+            problem = f"attribute '{key}' is {shorten(ascii(value))}"
             raise InputError(path, problem, remedy) from None
 
 
@@ -163,7 +163,7 @@ def _plain(key: str, value: object, path: Path) -> str | bool | int | float:
     """An attribute as a text, number or boolean. Raises `InputError` for anything else, and for one
     of `_NUMBERS` that is no number."""
     plain = value.item() if isinstance(value, np.generic) else value
-    problem = f"attribute '{key}' is {shortened(ascii(plain))}"
+    problem = f"attribute '{key}' is {shorten(ascii(plain))}"
     if not isinstance(plain, str | bool | int | float):
         raise InputError(path, f"{problem}, no text or number", "convert the recording again")
     least = _NUMBERS.get(key)
@@ -252,7 +252,7 @@ def write_reading(entry: Path, reading: Reading) -> None:
 def read_reading(entry: Path) -> Reading | None:
     """A reading from the cache; None if there is no intact one."""
     try:
-        with parsed_as(entry, "HDF5"), h5py.File(entry, "r") as file:
+        with parsing_as(entry, "HDF5"), h5py.File(entry, "r") as file:
             groups = [_read_group(file[number], entry) for number in sorted(file)]
             notes, refusals = (
                 tuple(json.loads(file.attrs[name])) for name in ("notes", "refusals")

@@ -126,7 +126,7 @@ def sensor_named(name: str) -> str | None:
     return sensors[0] if len(sensors) == 1 else None
 
 
-def resolved(labels: Iterable[str], alone: str | None = None) -> dict[str, str]:
+def resolve_labels(labels: Iterable[str], alone: str | None = None) -> dict[str, str]:
     """Our name → label of the columns whose names are known. `alone` is the sensor of a table of
     one."""
     plain = {str(label): plain_name(str(label)) for label in labels}
@@ -156,7 +156,7 @@ def resolved(labels: Iterable[str], alone: str | None = None) -> dict[str, str]:
     return names
 
 
-def probable(name: str, labels: Iterable[str]) -> str:
+def guess_label(name: str, labels: Iterable[str]) -> str:
     """The label of a column that may be ours, in the shell's quotes if it needs them, or
     "COLUMN"."""
     sensor, _, axis = name.partition("_")

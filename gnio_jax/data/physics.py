@@ -246,7 +246,7 @@ def repeats(
     return (same, True) if is_slower else (hung, False)
 
 
-def resting(imu: ImuSamples, hung: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def find_rest(imu: ImuSamples, hung: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """Which of the `hung` rows of a gyro read 0 while the accelerometer rests: some gyros suppress
     small rates."""
     still = hung & (imu.gyro == 0.0).all(axis=1)
@@ -255,7 +255,7 @@ def resting(imu: ImuSamples, hung: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "
     return still
 
 
-def implausible(sequence: Sequence) -> tuple[str, ...]:
+def find_implausible(sequence: Sequence) -> tuple[str, ...]:
     """Reasons why the sensors of a recording on a uniform clock cannot be believed, one sentence
     each."""
     valid = np.ones(len(sequence.time), bool) if sequence.imu_valid is None else sequence.imu_valid
@@ -263,7 +263,7 @@ def implausible(sequence: Sequence) -> tuple[str, ...]:
     reasons = [] if imu.gyro.any() else ["the gyro reads 0 throughout"]
     for name, values in (("gyro", imu.gyro), ("accel", imu.accel)):
         rows = repeats(imu.time, values)[0]
-        share = (rows & ~resting(imu, rows & (name == "gyro"))).mean()
+        share = (rows & ~find_rest(imu, rows & (name == "gyro"))).mean()
         if share > MOST_REPEATED:
             reasons.append(f"{name} repeats its values in {share:.0%} of the samples")
     try:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset
-from gnio_jax.data.physics import implausible
+from gnio_jax.data.physics import find_implausible
 from gnio_jax.numerics import (
     convolve,
     integrate_gyro,
@@ -123,7 +123,7 @@ def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
     )
     if dataset.needs_reference or sequence.valid.any():
         return check
-    return check._replace(failures=implausible(sequence))
+    return check._replace(failures=find_implausible(sequence))
 
 
 def _with_reference(

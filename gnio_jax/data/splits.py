@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnio_jax.data.parsing.tables import shortened
+from gnio_jax.data.parsing.tables import shorten
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_in
 from gnio_jax.types import Sequence
@@ -108,7 +108,7 @@ def read_list(
             recordings[entry] = find(entry)
         except OSError:  # for example, the name is too long
             recordings[entry] = None
-    absent = [shortened(entry) for entry, recording in recordings.items() if recording is None]
+    absent = [shorten(entry) for entry, recording in recordings.items() if recording is None]
     if len(absent) == len(recordings):
         raise InputError(path, f"none of its {len(recordings)} sequences is below {root}", layout)
     if absent:

@@ -283,7 +283,7 @@ def _run(
         covariances = history.covariance
         assert covariances is not None
         if ekf.considered is not None:
-            displacement, covariance = history.given(ekf.noise)
+            displacement, covariance = history.unscaled_displacements(ekf.noise)
 
             def repeat_run(state: FilterState, displacement: Array) -> FilterHistory:
                 rows = displacement, covariance, valid, frame
@@ -346,13 +346,13 @@ def _convert_history(
         notes=notes,
         waypoints=recording.waypoints,
         accepted={
-            measurement.name: _prepend(np.nan, _accepted(history.outcomes[measurement.name]))
+            measurement.name: _prepend(np.nan, _acceptance(history.outcomes[measurement.name]))
             for measurement in recording.measurements
         },
     )
 
 
-def _accepted(outcome: Outcome) -> Float[np.ndarray, "k"]:
+def _acceptance(outcome: Outcome) -> Float[np.ndarray, "k"]:
     """1 where a measurement was used, 0 where it was refused, NaN where there was none."""
     return np.where(outcome.present, np.asarray(outcome.accepted, float), np.nan)
 

@@ -172,8 +172,12 @@ def read_others(folder: Path, settings: Mapping[str, Any]) -> dict[str, tuple[Re
         try:
             report = read(path)
             if path != folder and all(report.settings.get(x) == settings.get(x) for x in SHARED):
-                way = tabulate.way(report.settings)
-                name = path.name if way in {tabulate.way(settings), *evaluations} else way
+                way = tabulate.describe_estimator(report.settings)
+                name = (
+                    path.name
+                    if way in {tabulate.describe_estimator(settings), *evaluations}
+                    else way
+                )
                 evaluations[name] = report, read_views(path, report)
         except (InputError, OSError):
             continue

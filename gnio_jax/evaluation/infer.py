@@ -86,7 +86,7 @@ def infer(
     parts, starts, turns = [], [], []
     for recording in recordings:
         assert recording.attitude is not None
-        start = window_starts(len(recording.gyro) + 1, windows.seen, windows.stride)
+        start = window_starts(len(recording.gyro) + 1, windows.input_samples, windows.stride)
         imu, turn = align_recording(
             recording.accel,
             recording.gyro - recording.start.gyro_bias,
@@ -104,7 +104,11 @@ def infer(
         # The last batch is filled up with the last window, so that all batches use one program.
         batch = np.minimum(np.arange(begin, begin + size), total - 1)
         arguments = network.variables, samples, start[batch], turn[batch]
-        fixed = {"apply": network.apply, "length": windows.seen, "diagnostics": diagnostics}
+        fixed = {
+            "apply": network.apply,
+            "length": windows.input_samples,
+            "diagnostics": diagnostics,
+        }
         fixed["measures"] = measures
         predictions.append(jax.device_get(_predict(*arguments, **fixed)))
         progress(min(1.0, (begin + size) / total))
@@ -136,7 +140,7 @@ def _predict(
     measures: Quantity,
 ) -> Prediction:
     prediction = apply(variables, cut_windows(samples, start, turn, length))
-    return keep(prediction.measured(measures), diagnostics)
+    return keep(prediction.with_quantity(measures), diagnostics)
 
 
 def keep(prediction: Prediction, names: tuple[str, ...] = DIAGNOSTICS) -> Prediction:
@@ -151,8 +155,8 @@ def _displacements_of(
     """The predictions for the windows of one recording."""
     value = np.asarray(prediction.displacement)
     if recording.imu_valid is not None:
-        start = window_starts(len(recording.gyro) + 1, windows.seen, windows.stride)
-        whole = without_any(~recording.imu_valid, start, windows.seen)
+        start = window_starts(len(recording.gyro) + 1, windows.input_samples, windows.stride)
+        whole = without_any(~recording.imu_valid, start, windows.input_samples)
         value = np.where(whole[:, None], value, np.nan)
     with np.errstate(divide="ignore"):
         least = np.log(least_std)

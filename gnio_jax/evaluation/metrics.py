@@ -263,14 +263,14 @@ def _length(corners: Positions) -> float:
 
 def yaw_rmse(estimate: Quaternions, reference: Quaternions) -> float:
     """Root mean square of the yaw error (`relative_yaw`), degrees (TLIO)."""
-    error = relative_yaw(estimate, reference)[_oriented(reference)]
+    error = relative_yaw(estimate, reference)[_rows_with_attitude(reference)]
     return float(np.degrees(np.sqrt(np.mean(error**2))))
 
 
 def yaw_drift(estimate: Quaternions, reference: Quaternions, step: float) -> float:
     """Absolute change of the unwrapped yaw error (`relative_yaw`) from the first to the last
     trusted row, degrees per hour (TLIO)."""
-    rows = _oriented(reference)
+    rows = _rows_with_attitude(reference)
     error = np.unwrap(relative_yaw(estimate, reference)[rows])
     hours = (rows[-1] - rows[0]) * step / 3600
     if hours < LEAST_SECONDS / 3600:
@@ -278,7 +278,7 @@ def yaw_drift(estimate: Quaternions, reference: Quaternions, step: float) -> flo
     return float(abs(np.degrees(error[-1] - error[0])) / hours)
 
 
-def _oriented(reference: Quaternions) -> Int[np.ndarray, "m"]:
+def _rows_with_attitude(reference: Quaternions) -> Int[np.ndarray, "m"]:
     rows = np.flatnonzero(finite_rows(reference))
     if not len(rows):
         raise Undefined("no trusted reference")

@@ -97,7 +97,7 @@ def describe_report(
         means = {metric: of_metric.mean for metric, of_metric in report.summary(row).items()}
         rows[row.replace("_", " ")] = means
     return PageRun(
-        name or tabulate.way(report.settings),
+        name or tabulate.describe_estimator(report.settings),
         {fact: text for fact, text in facts.items() if text},
         views,
         {sequence: measures.values for sequence, measures in report.scores.items()},

@@ -184,7 +184,10 @@ def prepare(
         if variance is not None:
             variance = variance[first : first + strides * windows.stride]
         measured = whole.measured_rows
-        if strides <= windows.seen // windows.stride or len(measured) < windows.seen:
+        if (
+            strides <= windows.input_samples // windows.stride
+            or len(measured) < windows.input_samples
+        ):
             seconds = len(_cut(sequence, slice(first, None)).measured_rows) / windows.rate
             problem = f"{seconds:.2f} s measured from its first trusted sample on"
             left_out[sequence.name] = f"{problem}, too short for a window and a stride"

@@ -77,7 +77,7 @@ def _plain_sequences(report: Report) -> dict[str, dict[str, Any]]:
 def _plain_scores(scores: Scores) -> dict[str, dict[str, Any]]:
     return {
         name: {
-            **finite(measures.values),
+            **finite_values(measures.values),
             "infinite": [metric for metric, value in measures.values.items() if value == math.inf],
             "reasons": measures.reasons,
             "diverged": measures.diverged,
@@ -91,12 +91,14 @@ def _plain_summaries(summaries: Mapping[str, MetricSummary]) -> dict[str, dict[s
     names = {"mean": "mean", "median": "median", "interval": "interval", "n": "sequences"}
     names |= {"groups": "groups", "diverged": "diverged"}
     return {
-        key: finite({metric: getattr(summary, field) for metric, summary in summaries.items()})
+        key: finite_values(
+            {metric: getattr(summary, field) for metric, summary in summaries.items()}
+        )
         for key, field in names.items()
     }
 
 
-def finite(values: Mapping[str, Any]) -> dict[str, Any]:
+def finite_values(values: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics for JSON, which has no infinity."""
     return {name: None if value == math.inf else value for name, value in values.items()}
 

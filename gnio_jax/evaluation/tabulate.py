@@ -231,7 +231,7 @@ def few_groups(summaries: Iterable[MetricSummary]) -> str:
 # --- how the figures were made
 
 
-def way(settings: Mapping[str, Any]) -> str:
+def describe_estimator(settings: Mapping[str, Any]) -> str:
     """The way trajectories were estimated: the estimator, and every choice other than the
     default."""
     loose = settings.get("coupling") == "loose"
@@ -336,7 +336,8 @@ def render(report: Report) -> Group:
     if "waypoint_rms" in summary:
         screen = MIXED_SCREEN if "ate" in summary else WAYPOINT_SCREEN
     shown = [name for name in screen if name in summary]
-    title = f"{report.settings['dataset']} {report.settings['split']}: {way(report.settings)}"
+    settings = report.settings
+    title = f"{settings['dataset']} {settings['split']}: {describe_estimator(settings)}"
     grid = Table(title=title, title_style="bold", title_justify="left", box=box.SIMPLE_HEAD)
     grid.add_column("sequence", overflow="fold")  # a name is never cut
     for name in shown:

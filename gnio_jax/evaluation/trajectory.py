@@ -225,6 +225,6 @@ def _read_columns(path: Path, names: str) -> Table:
     if table.width() != len(columns):
         problem = f"has {table.width()} columns, not {len(columns)}"
         raise InputError(path, problem, f"they are {names}")
-    table = table.renamed(columns)
+    table = table.rename(columns)
     check_increasing(table.take("t"), path, table.row)
     return table

@@ -118,8 +118,8 @@ def sensitivity(
 
     For a run of `run_odometry` the displacements are those of its history, and if they are
     velocities in the body, `rotation` is body → world of each row (`disturb`). The network is not
-    called again, and the small effect of other biases on its windows is neglected. But its
-    displacements turn with the yaw frame of the filter, which a tilt turns too if the x axis is
+    called again, and the effect of other biases on its windows is neglected (docs/filter.md). But
+    its displacements turn with the yaw frame of the filter, which a tilt turns too if the x axis is
     steep. So `run` must take them in the frame `FilterConfig.derivative_frame`. `run` must not cut
     its gradient (`FilterConfig.truncate_every`), because S is the derivative of the whole run.
     """

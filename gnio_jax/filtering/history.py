@@ -81,7 +81,9 @@ class FilterHistory(NamedTuple):
         """Standard deviations of the measurement after scaling, m; NaN where none."""
         return jnp.sqrt(jnp.diagonal(self.measurement_covariance, axis1=1, axis2=2))
 
-    def given(self, noise: NoiseModel) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
+    def unscaled_displacements(
+        self, noise: NoiseModel
+    ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
         """Displacements (K, 3), m, and their covariances (K, 3, 3), m², before the scaling of
         `noise`, which must be that of the run. With them `run_filter` repeats a run of
         `run_odometry` without its network, with `frame` = `FilterConfig.displacement_frame`."""

@@ -262,16 +262,16 @@ class _FieldProblem(NamedTuple):
         """The solutions that are nearly as good as the best one, which comes first, from several
         biases; None: from all vertical ones that are likely."""
         if not self.bias_std:
-            return [self._from(np.zeros(3))]
+            return [self._solve_from(np.zeros(3))]
         if biases is None:
             up = self.up
             step = 0.5 * np.pi / max(float(np.ptp(self.drift @ up)), 1.0)
             count = int(np.ceil(3 * self.bias_std / step))
             biases = [k * step * up for k in range(-count, count + 1)]
-        solutions = sorted(map(self._from, biases), key=lambda solution: solution.cost)
+        solutions = sorted(map(self._solve_from, biases), key=lambda solution: solution.cost)
         return [one for one in solutions if one.cost < solutions[0].cost + LIKELY_COST]
 
-    def _first(self, bias: Float[np.ndarray, "3"]) -> Float[np.ndarray, "9"]:
+    def _start_from(self, bias: Float[np.ndarray, "3"]) -> Float[np.ndarray, "9"]:
         """b, h and β by linear least squares for a bias that is known."""
         turned = rotation_z(self.drift @ bias).swapaxes(1, 2) @ self.rotation
         back = np.swapaxes(turned, 1, 2).reshape(-1, 3)
@@ -326,11 +326,11 @@ class _FieldProblem(NamedTuple):
             parts.append(of_bias)
         return np.concatenate(parts)
 
-    def _from(self, bias: Float[np.ndarray, "3"]) -> _Solution:
+    def _solve_from(self, bias: Float[np.ndarray, "3"]) -> _Solution:
         """The solution that begins at a bias."""
         from scipy.optimize import least_squares
 
-        start = self._first(bias)[: 9 if self.bias_std else 6]
+        start = self._start_from(bias)[: 9 if self.bias_std else 6]
         fit = least_squares(self._residual, start, self._jacobian, method="lm", max_nfev=40)
         x = np.concatenate([fit.x, np.zeros(9 - len(fit.x))])
         misfit = float(np.sqrt((self._errors(x) ** 2).sum(axis=1).mean()))

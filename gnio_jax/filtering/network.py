@@ -159,12 +159,12 @@ def network_measurement(
     """
 
     config = ekf.config
-    shape = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
+    shape = jax.ShapeDtypeStruct((1, config.input_samples, config.channels), jnp.float32)
 
     def predict_one(window: Float[Array, "1 n c"]) -> Prediction:
         prediction = predict(window)
         _check(prediction)
-        prediction = prediction.measured(config.measures)
+        prediction = prediction.with_quantity(config.measures)
         return jax.tree.map(lambda leaf: _make_floating(leaf[0]), prediction)
 
     shapes = jax.eval_shape(predict_one, shape)
@@ -226,7 +226,7 @@ def network_window(
 
     gyro and accel are the last `config.reach` raw samples.
     """
-    gyro, accel = gyro[: config.seen], accel[: config.seen]
+    gyro, accel = gyro[: config.input_samples], accel[: config.input_samples]
     rotation, biases = state.clone_rotation[oldest], (state.gyro_bias, state.accel_bias)
     window = cut_window(
         rotation, gyro, accel, *biases, config.cut, config.dt, config.context_samples

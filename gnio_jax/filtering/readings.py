@@ -42,6 +42,10 @@ def scalars_at(
     recording."""
     at_ends = readings_at(ends, time, values[:, None], longest)[:, 0]
     if not np.isfinite(at_ends).any():
+        inside = np.flatnonzero((time >= start) & (time <= ends[-1]))
+        if len(inside) > 1:
+            problem = f"time: its stamps are more than {longest:g} s apart"
+            raise InputError(sensor, problem, "record it more often, or leave it out")
         problem = f"time: no two stamps are within the {ends[-1] - start:.4g} s of the IMU"
         raise InputError(sensor, problem, "give it stamps on the clock of the IMU")
     return at_ends

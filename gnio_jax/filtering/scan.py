@@ -82,9 +82,9 @@ def run_filter(
             bridged (`filtering/gaps.py`), and if there is a mask also those that are not finite.
             None: the stream is complete.
         frame: The attitude that defines this yaw frame. "given" is another one than the filter's.
-            "own" is the filter's, as for the displacements of `FilterHistory.given`, which repeat a
-            run of `run_odometry` without its network. "turning" is the same with the derivatives
-            that a network in the loop has (`FilterConfig.derivative_frame`). "body": the rows are
+            "own" is the filter's, as for `FilterHistory.unscaled_displacements`, which repeat a run
+            of `run_odometry` without its network. "turning" is the same with the derivatives that a
+            network in the loop has (`FilterConfig.derivative_frame`). "body": the rows are
             velocities in the body at clone k, in metres per window.
         measurements: Measurements with a row for each interval, the leading axis K of their arrays.
             They are taken in their order, after the displacement and after those of `ekf`

@@ -104,7 +104,7 @@ class FilterConfig(FilterOptions):
         return self.samples_per_clone * self.clones_per_window
 
     @property
-    def seen(self) -> int:
+    def input_samples(self) -> int:
         """IMU samples C + N that the network sees: the context and the window."""
         return self.context_samples + self.window
 
@@ -138,7 +138,7 @@ class FilterConfig(FilterOptions):
     @property
     def reach(self) -> int:
         """IMU samples, the newest included, that a measurement depends on."""
-        return self.seen + self.cut.lead
+        return self.input_samples + self.cut.lead
 
     @property
     def displacement_frame(self) -> DisplacementFrame:

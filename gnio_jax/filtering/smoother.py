@@ -94,9 +94,13 @@ def smooth(
     all measurements of the K intervals.
 
     The updates of `run_filter` are smoothed exactly as they were made. A run of `run_odometry` that
-    returned `history` is smoothed without its network by `smooth(ekf, state, gyro, accel,
-    *history.given(ekf.noise), frame=ekf.config.displacement_frame)`. `state` is the prior, and
-    earlier measurements are not smoothed. It works under `jax.jit`, `jax.vmap` and `jax.grad`.
+    returned `history` is smoothed without its network by
+
+        smooth(ekf, state, gyro, accel, *history.unscaled_displacements(ekf.noise),
+               frame=ekf.config.displacement_frame)
+
+    `state` is the prior, and earlier measurements are not smoothed. It works under `jax.jit`,
+    `jax.vmap` and `jax.grad`.
 
     Smoothing trusts the IMU as far as `ekf.noise` says. Where the IMU is sampled too slowly for the
     motion, as on a swinging leg at 100 Hz, its integration errs by more than that, and the smoothed

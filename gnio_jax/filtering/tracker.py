@@ -183,7 +183,7 @@ class Tracker:
         if state is None:
             self._core = None
 
-    def expect(self, imu_rate: float, hole: float | None = None) -> None:
+    def set_rate(self, imu_rate: float, hole: float | None = None) -> None:
         """Change `imu_rate` and `hole` before the first sample. Nothing is compiled again."""
         self._stream = self._open_stream(hole, imu_rate)
 

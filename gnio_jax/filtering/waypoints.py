@@ -136,7 +136,7 @@ def waypoint_poses(
     level = _level_start(sequence, ekf)
     _, history = _odometry(predict, ekf, level, *walk[:2], walk.imu_valid)
     _, _, position = poses_of(history)
-    turn, origin, weight, speed_error = _aligned(at_taps(position), taps, place_std, config)
+    turn, origin, weight, speed_error = _align(at_taps(position), taps, place_std, config)
     yaw = np.arctan2(turn[1, 0], turn[0, 0])
     displacement, covariance = _displacements(history, speed_error, walk.count, config)
     if not finite_rows(displacement).any():
@@ -259,7 +259,7 @@ def _start_std(sequence: Sequence, ekf: Filter, level: FilterState) -> InitialSt
 # ------------------------------------------------------------------------------------------------
 
 
-def _aligned(
+def _align(
     path: Float[np.ndarray, "f 2"], taps: Waypoints, least: float, config: FilterConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """The rotation and shift that align a path with the waypoints, the weights of the waypoints,
@@ -374,7 +374,7 @@ def _between_clones(
     """
     n, dt, seconds = config.samples_per_clone, config.dt, config.clone_seconds
 
-    def integrated(rotation: Array, velocity: Array, position: Array, gyro: Array, accel: Array):
+    def integrate(rotation: Array, velocity: Array, position: Array, gyro: Array, accel: Array):
         """At the n stamps of an interval, and at its end."""
         rotations = geometry.integrate_turns(rotation, gyro * dt)
         force = jnp.einsum("ijn,nj->ni", rotations[:, :, :-1], accel)
@@ -387,7 +387,7 @@ def _between_clones(
     def interval(
         before: tuple[Array, Array, Array], end: Mean, imu: tuple[Array, Array], whole: Array
     ) -> tuple[Array, Array, Array]:
-        rotation, velocity, position = integrated(*before, *imu)
+        rotation, velocity, position = integrate(*before, *imu)
         turn = end.rotation @ rotation[-1].T
         skew = turn - turn.T
         angle = 0.5 * jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
@@ -404,9 +404,9 @@ def _between_clones(
     # The first interval is integrated backwards from its end.
     first, first_imu = jax.tree.map(lambda rows: rows[0], (ends, imu))
     zero = jnp.zeros(3)
-    turns, _, _ = integrated(jnp.eye(3), zero, zero, *first_imu)
+    turns, _, _ = integrate(jnp.eye(3), zero, zero, *first_imu)
     rotation = first.rotation @ turns[-1].T
-    _, gains, moves = integrated(rotation, zero, zero, *first_imu)
+    _, gains, moves = integrate(rotation, zero, zero, *first_imu)
     velocity = first.velocity - gains[-1]
     start = rotation, velocity, first.position - velocity * seconds - moves[-1]
     before = tuple(

@@ -30,7 +30,7 @@ def convolve(
 ) -> Float[Array, "b m d"]:
     """A 1-D convolution written as one matrix product of the k shifted inputs with the kernel."""
     size, channels, features = kernel.shape
-    shifted = jnp.concatenate(_shifted(x, size, window_strides[0], padding[0]), axis=-1)
+    shifted = jnp.concatenate(_shift(x, size, window_strides[0], padding[0]), axis=-1)
     columns = shifted.reshape(-1, size * channels)
     product = columns @ kernel.reshape(size * channels, features)
     return product.reshape(-1, shifted.shape[1], features)
@@ -69,7 +69,7 @@ def convolve_depthwise(
     **_: object,
 ) -> Float[Array, "b m c"]:
     """A convolution of every channel by itself, as a sum of k shifted products."""
-    inputs = _shifted(x, kernel.shape[0], window_strides[0], padding[0])
+    inputs = _shift(x, kernel.shape[0], window_strides[0], padding[0])
     terms = [part * kernel[None, i] for i, part in enumerate(inputs)]
     return sum(terms[1:], terms[0])
 
@@ -92,10 +92,10 @@ def convolve_groups(
 
 def neighbours(x: Float[Array, "b n c"], span: int) -> Float[Array, "b n s c"]:
     """The `span` samples around every sample, with zeros beyond the ends."""
-    return jnp.stack(_shifted(x, span, 1, (span // 2, span // 2)), axis=2)
+    return jnp.stack(_shift(x, span, 1, (span // 2, span // 2)), axis=2)
 
 
-def _shifted(
+def _shift(
     x: Float[Array, "b n c"], size: int, stride: int, padding: tuple[int, int]
 ) -> list[Float[Array, "b m c"]]:
     """The inputs, padded by zeros, that each of the `size` samples of a kernel multiplies."""

@@ -139,7 +139,7 @@ def read_network(path: Path) -> TrainedNetwork:
     """
     settings, weights = _read_files(path)
     model = models.from_experiment(settings.config, str(path / CONFIG))
-    shapes = models.variable_shapes(model, settings.config.data.seen)
+    shapes = models.variable_shapes(model, settings.config.data.input_samples)
     template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
     if settings.config.filter.corrector is not None and has_corrector(weights):
         samples = Corrector.before + 1 + Corrector.after

@@ -55,7 +55,7 @@ def training_seconds(config: TrainConfig) -> float:
     with jax.enable_x64(False), parallel.sharing(None):
         task, data = set_up(loop.choose_task(config), config, Silence())
         keys = jax.random.split(jax.random.key(config.seed), 3)
-        state = parallel.everywhere(task.initial_state(keys[0], None))
+        state = parallel.copy_to_devices(task.initial_state(keys[0], None))
         order, factor = task.order(keys[1], 0, data.source), jnp.float32(1.0)
         steps = min(STEPS, task.steps_per_epoch)
         duration = 0.0

@@ -103,7 +103,7 @@ def save_best(workdir: Path, config: TrainConfig, state: TrainState, position: R
 
 
 def restore(workdir: Path, template: TrainState) -> tuple[TrainState, RunPosition]:
-    """The latest state, in the structure of `template`, placed by `parallel.everywhere`.
+    """The latest state, in the structure of `template`, placed by `parallel.copy_to_devices`.
 
     Raises `InputError` if it does not fit.
     """
@@ -112,7 +112,7 @@ def restore(workdir: Path, template: TrainState) -> tuple[TrainState, RunPositio
     position, items = _read_items(workdir, templates)
     state = TrainState(jnp.int32(position.step), items["variables"], items["optimizer"])
     chex.assert_trees_all_equal_shapes_and_dtypes(state, template)
-    return parallel.everywhere(state), position
+    return parallel.copy_to_devices(state), position
 
 
 def load_latest(workdir: Path) -> TrainedNetwork:
@@ -125,7 +125,7 @@ def load_latest(workdir: Path) -> TrainedNetwork:
     file = workdir / "config.yaml"
     config = configuration.validate(configuration.load(file), str(file))
     model = models.from_experiment(config, str(file))
-    template = {"batch_stats": {}, **models.variable_shapes(model, config.data.seen)}
+    template = {"batch_stats": {}, **models.variable_shapes(model, config.data.input_samples)}
     if numbers := filter_numbers(config):
         template["filter"] = numbers
     position, items = _read_items(workdir, {"variables": template})

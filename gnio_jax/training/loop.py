@@ -174,7 +174,7 @@ def _train(
     with_statistics = partial(task.with_statistics, source=source, key=statistics_key)
     # Copies, because steps take the memory of their state, and the next seed also starts from
     # `start`.
-    state = parallel.everywhere(task.initial_state(init_key, start and start.variables))
+    state = parallel.copy_to_devices(task.initial_state(init_key, start and start.variables))
     position = RunPosition()
     with run_folder.open_run(config, data, state.variables, resume) as workdir:
         for line in task.description(state, workdir):

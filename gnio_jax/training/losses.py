@@ -160,7 +160,7 @@ def gaussian_nll(
     gradient of one window with a tiny σ is unbounded, and Adam's second moment remembers it for a
     thousand steps.
     """
-    normalised, log_std = prediction.normalised(error, config.log_std_floor)
+    normalised, log_std = prediction.normalise(error, config.log_std_floor)
     if config.outlier_sigmas is not None:
         bound = config.outlier_sigmas**2
         beyond = bound * (1 + jnp.log(jnp.maximum(normalised, bound) / bound))

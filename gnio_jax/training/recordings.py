@@ -74,7 +74,7 @@ def set_up(
             if training:
                 sources.append(source)
             else:
-                held_out[name] = parallel.everywhere(source)
+                held_out[name] = parallel.copy_to_devices(source)
             splits[split] |= {label + sequence: count for sequence, count in samples.items()}
             hours = sum(samples.values()) / config.data.rate / 3600
             contents = f"{hours:.2f} h, {task.count(source):,} {task.unit}"
@@ -95,7 +95,7 @@ def set_up(
     if epoch < size:
         problem = f"is {size}, but there are only {epoch} {task.unit}"
         raise InputError("optim.batch_size", problem, "lower it")
-    training_data = TrainingData(parallel.everywhere(task.join(sources)), held_out, splits)
+    training_data = TrainingData(parallel.copy_to_devices(task.join(sources)), held_out, splits)
     portable = dataclasses.replace(configuration.without_paths(config), seed=0)
     return task(model, portable, epoch // size, parts), training_data
 

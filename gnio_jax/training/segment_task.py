@@ -31,7 +31,7 @@ from gnio_jax.training.walk_segments import (
     grid_of,
     walk_source,
 )
-from gnio_jax.training.walkway import unchanged
+from gnio_jax.training.walkway import unchanged_pace
 from gnio_jax.training.window_task import (
     Validation,
     calibrate_uncertainty,
@@ -273,7 +273,7 @@ def validate(
 
     def one_batch(batch: tuple[jax.Array, jax.Array, jax.Array]) -> list[SegmentValidation]:
         rows, weight, shares = batch
-        pace, results = unchanged(size), []
+        pace, results = unchanged_pace(size), []
         segments = cut_walks(source, rows, pace, grid)
         speed = jnp.mean(segments.moved, axis=1) * grid.rate / (grid.window * grid.stride)
         results.append(measure(state, segments, stage, weight, task))

@@ -182,7 +182,10 @@ class Task(ABC):
     def initial_state(self, key: PRNGKeyArray, start: Any | None) -> TrainState:
         """The state at step 0: with drawn parameters, or with the variables `start` of a run. The
         filter's numbers are always those of the settings, even if training starts from a run."""
-        variables = {"batch_stats": {}, **models.initialise(self.model, key, self.config.data.seen)}
+        variables = {
+            "batch_stats": {},
+            **models.initialise(self.model, key, self.config.data.input_samples),
+        }
         if start is not None:
             variables = overlay(variables, start)
         if numbers := optimizer.filter_numbers(self.config):

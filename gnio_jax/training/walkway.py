@@ -82,7 +82,7 @@ class Pace(NamedTuple):
     """τ: speed at which the walk is played."""
 
 
-def unchanged(count: int) -> Pace:
+def unchanged_pace(count: int) -> Pace:
     """The pace of `count` segments as they were walked."""
     return Pace(*jnp.ones((4, count), jnp.float32))
 

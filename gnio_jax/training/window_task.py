@@ -95,7 +95,7 @@ class WindowTask(Task):
         data, changes = self.config.data, self.config.augment
         margin = low_pass_margin(changes, data.rate)
         which = shift_windows(shift_key, source, parallel.split(which), changes.shift_samples)
-        windows = gather(source, parallel.split(which), data.seen, margin)
+        windows = gather(source, parallel.split(which), data.input_samples, margin)
         windows = low_pass(jax.random.fold_in(key, 3), windows, changes, data.rate)
         return parallel.split(augment(augment_key, windows, changes)), dropout_key
 
@@ -275,11 +275,13 @@ def validate(
         return Validation(
             losses(prediction, windows, config.loss, stage, axes, 1 / config.data.rate),
             prediction.along_axes(error)[0] ** 2,
-            prediction.normalised(error, None)[0][0],
+            prediction.normalise(error, None)[0][0],
         )
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
-        windows = parallel.split(gather(source, parallel.split(which_weight[0]), config.data.seen))
+        windows = parallel.split(
+            gather(source, parallel.split(which_weight[0]), config.data.input_samples)
+        )
         figures = jax.vmap(one_window)(model.apply(state.variables, windows.imu), windows)
         return jax.tree.map(lambda x: jnp.tensordot(which_weight[1], x, 1), figures)
 
@@ -303,7 +305,7 @@ def calibrate_uncertainty(
         for axes in (validation.axis_mse, validation.axis_normalised)
     )
 
-    def fitted(path: tuple, leaf: jax.Array) -> jax.Array:
+    def fit_leaf(path: tuple, leaf: jax.Array) -> jax.Array:
         match path[-1].key:
             case "log_std":
                 return 0.5 * jnp.log(jnp.maximum(mse, 1e-8))
@@ -312,5 +314,5 @@ def calibrate_uncertainty(
             case _:
                 return leaf
 
-    statistics = jax.tree_util.tree_map_with_path(fitted, state.variables["batch_stats"])
+    statistics = jax.tree_util.tree_map_with_path(fit_leaf, state.variables["batch_stats"])
     return state._replace(variables=state.variables | {"batch_stats": statistics})

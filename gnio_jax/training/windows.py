@@ -109,11 +109,11 @@ def _recording_windows(
 ) -> WindowSource:
     """One recording's windows `spacing` samples apart, of which an epoch visits those at `stride`;
     rows and numbers count from 0."""
-    start = window_starts(len(sequence.time), config.seen, spacing)
-    start = start[without_any(~sequence.valid, start, config.seen + 1)]
+    start = window_starts(len(sequence.time), config.input_samples, spacing)
+    start = start[without_any(~sequence.valid, start, config.input_samples + 1)]
     usable = sequence.valid
     if sequence.imu_valid is not None:
-        start = start[without_any(~sequence.imu_valid, start, config.seen)]
+        start = start[without_any(~sequence.imu_valid, start, config.input_samples)]
         usable = usable & sequence.imu_valid
     # Stretches without an invalid sample begin and end where this changes.
     changes = np.flatnonzero(np.diff(usable, prepend=False, append=False)).reshape(-1, 2)

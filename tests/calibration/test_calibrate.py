@@ -109,6 +109,29 @@ def test_the_calibrated_run_differs_only_in_its_filter_and_average(
     assert change["before"] != change["after"] and "diverged" not in output
 
 
+def test_the_displacements_of_a_fit_have_the_networks_own_uncertainty(monkeypatch, tmp_path):
+    """Whatever an earlier fit has written to the run."""
+    noise = {"std_factor": (2.0, 3.0, 4.0), "measurement_scale": 5.0, "gyro_density": 2e-4}
+    fitted = dataclasses.replace(
+        TRAINED, filter=changed(noise=noise, considered={"scale": 0.1, "heading": 0.2})
+    )
+
+    class Finished(Exception):
+        pass
+
+    def predict(split, networks, config, settings, *_):
+        raise Finished(settings)
+
+    monkeypatch.setattr(calibrating, "predict", predict)
+    with tiny_run.known(), pytest.raises(Finished) as caught:
+        folder = tiny_run.save(tmp_path / "run", fitted)
+        calibration.calibrate(CalibrateConfig(str(folder), out=str(tmp_path / "out")))
+    (settings,) = caught.value.args
+    assert settings.noise.std_factor == (1.0, 1.0, 1.0)
+    assert settings.noise.measurement_scale == 1.0 and settings.noise.gyro_density == 2e-4
+    assert settings.considered == filtering.ConsideredStd()
+
+
 def test_a_network_is_averaged_over_four_headings(run):
     loaded = load(run)
     averaged = predictions.average_over_headings(loaded, "the run")

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from gnio_jax.data.parsing.tables import parsed_as, read_hdf5_fields, read_npz, read_text
+from gnio_jax.data.parsing.tables import parsing_as, read_hdf5_fields, read_npz, read_text
 from gnio_jax.data.parsing.text import layout_of
 from gnio_jax.errors import InputError
 
@@ -142,5 +142,5 @@ def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path):
         (MemoryError, InputError, "does not fit into memory as npz"),
         (EOFError, InputError, "may be cut short"),
     ):
-        with pytest.raises(told, match=words), parsed_as(path, "npz"):
+        with pytest.raises(told, match=words), parsing_as(path, "npz"):
             raise error("ours")

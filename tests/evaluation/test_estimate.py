@@ -131,9 +131,9 @@ def test_the_filter_of_true_displacements_ignores_the_calibration(walks):
 
 def test_consider_covariance_widens_the_covariance_and_moves_nothing(walks):
     """The derivative of positions by the gyro bias is that of runs whose gyro differs a little and
-    whose network ignores its windows. The bias of a raw gyro is larger along the vertical at the
-    start."""
-    recordings = ready(walks[:2], gyro_bias="reference")
+    whose network ignores its windows. It turns with its yaw frame, because the x axis is level. The
+    bias of a raw gyro is larger along the vertical at the start."""
+    recordings = [with_level_axis(one) for one in ready(walks[:2], gyro_bias="reference")]
     raw = recordings[1].start._replace(raw_gyro=True)
     recordings = [recordings[0], recordings[1]._replace(start=raw)]
     alike = network(0.0, -2.0, log_std_gain=0.0, constant=(0.9, 0.2, 0.02))
@@ -230,6 +230,19 @@ def test_variances_of_a_corrector_take_the_place_of_the_densities(walks, run):
     for estimate, other, without in zip(estimates, expected, plain, strict=True):
         same(estimate, other, 1e-5)
         assert np.nanmax(np.abs(estimate.states.std - without.states.std)) > 0.01
+
+
+def with_level_axis(recording):
+    """The recording with the IMU of a phone that moves along (0.9, 0.2, 0.02) m/s in its yaw frame
+    and does not roll."""
+    time = np.arange(len(recording.gyro) + 1) / RATE
+    yaw = 0.2 * np.sin(0.5 * time)
+    turns = Rotation.from_euler("ZX", np.stack([yaw, 0.5 + 0 * time], axis=1))
+    velocity = Rotation.from_euler("z", yaw[:, None]).apply([0.9, 0.2, 0.02])
+    force = np.diff(velocity, axis=0) * RATE + [0.0, 0.0, 9.81]
+    gyro = (turns[:-1].inv() * turns[1:]).as_rotvec() * RATE + recording.start.gyro_bias
+    start = recording.start._replace(rotation=turns[0].as_matrix(), velocity=velocity[0])
+    return recording._replace(gyro=gyro, accel=turns[:-1].inv().apply(force), start=start)
 
 
 def with_gyro_bias(recording, off):

@@ -16,14 +16,16 @@ def test_windows_are_cut_with_the_attitude_of_the_recording(walks, reading, cont
     for walk, displacements, recording in zip(walks[:2], predicted, recordings, strict=True):
         turns = rotations(walk.orientation).as_matrix()
         assert displacements.value.shape == displacements.std.shape == (recording.strides, 3)
-        first = config.seen // config.stride - 1  # the stride in which the first window ends
+        first = (
+            config.input_samples // config.stride - 1
+        )  # the stride in which the first window ends
         assert (
             np.isnan(displacements.value[:first]).all()
             and np.isfinite(displacements.value[first:]).all()
         )
         for row in range(first, recording.strides, 17):
             end = (row + 1) * config.stride
-            start, rows = end - config.window, range(end - config.seen, end)
+            start, rows = end - config.window, range(end - config.input_samples, end)
             at = [j if reading == "per_sample" else start for j in rows]
             means = [
                 unyaw(turns[start]) @ np.einsum("tij,tj->ti", turns[at], signal[rows]).mean(0)
@@ -62,7 +64,7 @@ def test_a_window_across_a_gap_of_the_imu_has_no_displacement(walks):
     holed, whole = infer(NETWORK, recordings, config)
     for row, (value, expected) in enumerate(zip(holed.value, whole.value, strict=True)):
         end = (row + 1) * config.stride
-        if end >= config.seen and measured[end - config.seen : end].all():
+        if end >= config.input_samples and measured[end - config.input_samples : end].all():
             np.testing.assert_array_equal(value, expected)
         else:
             assert np.isnan(value).all()

@@ -90,7 +90,7 @@ def test_its_rows_repeat_the_run_without_the_network():
     """As loose coupling, calibration and consider covariance do."""
     ekf, *start = setting()
     _, history = filtering.run_odometry(predict, ekf, *start)
-    rows = history.given(ekf.noise)
+    rows = history.unscaled_displacements(ekf.noise)
     _, repeated = filtering.run_filter(ekf, *start, *rows, frame="body")
     np.testing.assert_allclose(repeated.velocity, history.velocity, atol=1e-9)
     np.testing.assert_allclose(repeated.nis[3:], history.nis[3:], rtol=1e-6)
@@ -112,7 +112,7 @@ def test_the_tracker_measures_it_too():
     def repeat(start, rows):
         return filtering.run_filter(ekf, start, gyro, accel, rows, covariance, frame="body")[1]
 
-    displacement, covariance = history.given(ekf.noise)
+    displacement, covariance = history.unscaled_displacements(ekf.noise)
     rows = filtering.sensitivity(repeat, state, displacement, history.rotation)
     added = filtering.considered_covariance(rows, considered)
     whole = filtering.with_considered(history.covariance, added, ekf.config)

@@ -219,6 +219,9 @@ def test_the_cause_of_what_is_not_healthy_is_told():
     assert re.fullmatch(too_fast, cause(limited, accel=pushed))
     behind = rf"{too_fast}, behind a hole of 0\.5 s in the IMU's samples"
     assert re.fullmatch(behind, cause(limited, accel=pushed, imu_valid=valid))
+    held = np.ones(SAMPLES, bool)
+    held[60] = False  # the filter holds a sample, which is no hole that it coasts through
+    assert re.fullmatch(too_fast, cause(limited, accel=pushed, imu_valid=held))
     bad = start()._replace(healthy=jnp.bool_(False))
     assert cause(CONFIG, state=bad) == "an earlier estimate was impossible"
     mean, variances = start().mean, np.full(15, 1e-3)

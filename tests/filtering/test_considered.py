@@ -55,7 +55,7 @@ def run_and_sensitivity(c, more, rotation, velocity, position, gyro, accel, disp
         return filtering.run_filter(filtering.Filter(CONFIG, NOISE), *signals, frame=frame)[1]
 
     history = repeated(start, *given, "own")
-    displacement, covariance = history.given(NOISE)
+    displacement, covariance = history.unscaled_displacements(NOISE)
     fixed, turning = (
         filtering.sensitivity(
             functools.partial(repeated, covariance=covariance, frame=frame), start, displacement
@@ -133,7 +133,7 @@ def test_the_sensitivity_does_not_depend_on_which_axis_of_the_phone_is_vertical(
     def run(rotation, gyro, accel, frame):
         state = filtering.initial_state(ekf, rotation, runs.velocity0[0], runs.position0[0])
         _, history = filtering.run_odometry(mean_force, ekf, state, gyro, accel)
-        displacement, covariance = history.given(noise)
+        displacement, covariance = history.unscaled_displacements(noise)
 
         def repeat_run(state, displacement):
             rows = displacement, covariance

@@ -94,10 +94,15 @@ class Averaging:
         return window[2], np.tile(added, (3, 1)), np.tile(variance, (3, 1))
 
 
-def test_a_tracker_with_a_corrector_is_the_filter_over_corrected_samples():
+@pytest.mark.parametrize("missing", [[], [30, 31]])
+def test_a_tracker_with_a_corrector_is_the_filter_over_corrected_samples(missing):
+    """For the corrector a missing sample is the one before it."""
     ekf = dataclasses.replace(filtering.Filter(CONFIG))
     gyro, accel = samples(14)
     corrector, rows = Averaging(), np.hstack([accel, gyro])
+    valid = ~np.isin(np.arange(len(rows)), missing)
+    rows[~valid] = rows[29]
+    gyro[~valid], accel[~valid] = np.nan, np.nan
     padded = np.concatenate([np.zeros((2, 6)), rows])
     memory, corrected, variance = corrector.begin(), rows.copy(), np.zeros_like(rows)
     for first in range(0, len(rows) - 4, 3):
@@ -112,7 +117,7 @@ def test_a_tracker_with_a_corrector_is_the_filter_over_corrected_samples():
     assert len(poses) == count // N
     signals = corrected[:count, 3:], corrected[:count, :3]
     _, history = filtering.run_odometry(
-        predict, ekf, begin(ekf), *signals, variance=variance[:count]
+        predict, ekf, begin(ekf), *signals, valid[:count], variance=variance[:count]
     )
     for row, pose in enumerate(poses):
         assert pose.time == pytest.approx(DT * N * (row + 1))

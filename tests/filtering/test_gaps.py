@@ -80,6 +80,14 @@ def test_holes_are_filled_with_the_last_sample(missing_before):
     jax.tree.map(np.testing.assert_array_equal, end, after)
 
 
+def test_a_sample_is_held_for_as_many_samples_as_the_setting_says():
+    """0.3 s are three samples of 0.1 s, although 0.3 / 0.1 is a little below 3."""
+    config = filtering.FilterConfig(0.1, N, CLONES, bridge_seconds=0.3)
+    ones, valid = np.ones((5, 3)), np.array([True, False, False, False, False])
+    imu, _, _ = bridge(ones, ones, valid, start().imu, config)
+    np.testing.assert_array_equal(imu.gap.used, [1, 1, 1, 1, 0])
+
+
 def test_nothing_held_before_the_first_sample():
     ones, valid = np.ones((4, 3)), np.array([False, False, True, False])
     imu, _, after = bridge(ones, ones, valid, start().imu, CONFIG)

@@ -22,6 +22,7 @@ def test_gate_boundaries_count_samples():
     # The oldest clone is exactly 0.3 s old: not yet converged, a success; then older.
     assert step((False, -1, 0), 4) == ((0, 4, 0), True)
     assert step((False, -1, 0), 5) == ((1, -1, 0), False)
+    assert step((False, -1, 0), 5, tested=False) == ((0, -1, 0), False)  # nothing to judge by
     assert step((True, 10, 0), 17) == ((1, 10, 0), False)  # exactly 0.7 s old: still active
     assert step((True, 10, 0), 18) == ((1, 18, 30), True)  # older: passes, pause of 1.2 s
     assert step((True, 18, 30), 29) == ((1, 29, 30), True)  # inside the pause

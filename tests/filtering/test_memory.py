@@ -175,7 +175,7 @@ def test_an_interval_in_which_the_filter_coasts_empties_it():
 def test_a_run_can_be_repeated_and_smoothed_without_the_network():
     _, history = run()
     gyro, accel = recording()
-    rows = history.given(EKF.noise)
+    rows = history.unscaled_displacements(EKF.noise)
     end, repeated = quick(functools.partial(filtering.run_filter, EKF, frame="own"))(
         start(), gyro, accel, *rows
     )

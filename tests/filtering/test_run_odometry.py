@@ -160,12 +160,18 @@ def test_where_it_coasted_no_window_is_a_measurement():
 
 
 def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
-    """With `history.given`, which takes the factors of the axes off again. The network's log
-    standard deviation is raised to a floor."""
+    """With `history.unscaled_displacements`, which takes the factors of the axes off again. The
+    network's log standard deviation is raised to a floor."""
     gyro, accel = recording(1)
     final, history = program(CONFIG)(start(CONFIG), gyro, accel, BASE, SLOPE)
     fixed = None, CONFIG.displacement_frame
-    given = filtering.Filter(CONFIG, NOISE), start(CONFIG), gyro, accel, *history.given(NOISE)
+    given = (
+        filtering.Filter(CONFIG, NOISE),
+        start(CONFIG),
+        gyro,
+        accel,
+        *history.unscaled_displacements(NOISE),
+    )
     again_final, again = filtering.run_filter(*given, *fixed)
     assert again.diagnostics == {}
     for wanted, found in [(history._replace(diagnostics={}), again), (final, again_final)]:
@@ -203,7 +209,7 @@ def test_under_a_vmap_the_network_is_asked_no_earlier_and_says_the_same():
 
 def test_predict_is_asked_for_what_it_must_return():
     gyro, accel = recording(0)
-    good = predict(jnp.zeros((1, CONFIG.seen, 6), jnp.float32))
+    good = predict(jnp.zeros((1, CONFIG.input_samples, 6), jnp.float32))
     for bad in (
         (good.displacement, good.log_std),
         good._replace(displacement=good.displacement[0]),

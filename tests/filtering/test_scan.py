@@ -218,7 +218,9 @@ def test_what_was_measured_can_be_given_again():
     displacement, covariance = WALK[-2:]
     measured = np.isfinite(history.nis)
     assert np.abs(covariance[measured][:, 0, 1]).min() > 0 and measured.sum() > INTERVALS / 2
-    for found, wanted in zip(history.given(noise), (displacement, covariance), strict=True):
+    for found, wanted in zip(
+        history.unscaled_displacements(noise), (displacement, covariance), strict=True
+    ):
         assert_close(found[measured], wanted[measured], 0, 1e-12)
 
 

@@ -158,6 +158,50 @@ def test_pressures_become_heights_above_the_first():
     assert (rows.start == 4.0).all()
 
 
+def test_pressures_of_once_a_second_are_interpolated():
+    for apart in (1.0, 2.9):
+        time = np.arange(0.0, 28.0, apart)
+        pressure = np.full(len(time), 101325.0)
+        height = filtering.barometer_on_intervals(time, pressure, INTERVALS, CONFIG).height
+        assert np.isfinite(height).all()
+
+
+def readings_of_a_drifting_run(samples_per_clone, seconds):
+    """Readings with errors of two seconds, and attitudes of a run whose gyro is off by 0.05 rad/s
+    about the vertical."""
+    config = dataclasses.replace(CONFIG, samples_per_clone=samples_per_clone)
+    time = config.clone_seconds * np.arange(1, round(seconds / config.clone_seconds) + 1)
+    angles = np.stack([0.1 * time, 0.1 * np.sin(time), 0.1 * np.cos(0.7 * time)], axis=1)
+    truth = Rotation.from_euler("ZYX", angles)
+    drift = 0.05 * np.cumsum(truth.as_matrix()[:, 2, 2]) * config.clone_seconds
+    white = np.random.default_rng(4).normal(size=(round(seconds / 2.0) + 2, 3))
+    knots = 2.0 * np.arange(len(white))
+    errors = np.stack([np.interp(time, knots, column) for column in white.T], axis=1)
+    field = truth.inv().apply(WORLD) + errors
+    return time, field, (Rotation.from_euler("z", drift[:, None]) * truth).as_matrix(), config
+
+
+def test_the_time_of_the_fit_is_doubled_until_the_bias_of_the_gyro_is_known():
+    time, field, attitude, config = readings_of_a_drifting_run(N, 60.0)
+    short = slice(round(8.0 / config.clone_seconds))
+    options = {"first_seconds": 8.0, "bias_std": 0.1}
+    few = filtering.fit_field(time[short], field[short], attitude[short], config, **options)
+    fit = filtering.fit_field(time, field, attitude, config, **options)
+    assert few.gyro_bias_std > 2 * fit.gyro_bias_std
+    assert abs(fit.gyro_bias[2] - 0.05) < 4 * fit.gyro_bias_std
+    assert fit.gyro_bias_std < 2.5e-3
+
+
+def test_more_readings_of_one_error_show_no_more():
+    """Errors of a building last for seconds: readings twice as often have as much information."""
+    options = {"first_seconds": 16.0, "bias_std": 0.1}
+    stds = [
+        filtering.fit_field(*readings_of_a_drifting_run(count, 16.0), **options).gyro_bias_std
+        for count in (N, 2 * N)
+    ]
+    assert stds[0] == pytest.approx(stds[1], rel=0.1)
+
+
 MAGNETIC = [
     (lambda time, field: (time, field / 100), "is 0.444 µT.*; multiply by 100"),
     (lambda time, field: (time, field * 1e-6), "is 4.44e-05 µT.*; multiply by 1e\\+06"),
@@ -171,6 +215,7 @@ BAROMETRIC = [
     (lambda time, pressure: (time, pressure / 100), "the median is 1013.2 Pa.*; multiply by 100"),
     (lambda time, pressure: (time, pressure * 10), "leave it out"),
     (lambda time, pressure: (time - 1e9, pressure), "no two stamps are within the 20 s of the IMU"),
+    (lambda time, pressure: (time[::20], pressure[::20]), "more than 3 s apart; record it more"),
     (lambda time, pressure: (np.zeros_like(time), pressure), "time: does not increase"),
     (lambda time, pressure: (time, pressure[:-1]), r"must be \(f,\), found"),
     (lambda time, pressure: (time, np.nan * pressure), "no two stamps are within"),

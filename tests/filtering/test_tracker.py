@@ -127,7 +127,7 @@ def test_equals_the_scan(config, missing):
     final, wanted = scan(state, gyro, accel, valid, config)
     tracker = compiled(config)
     tracker._start(state)
-    tracker.expect(1 / DT)  # a new stream
+    tracker.set_rate(1 / DT)  # a new stream
     time = 1.7e9 + np.arange(len(gyro)) * DT  # as a phone stamps them
     broken = np.where(valid[:, None], gyro, np.nan)
     pushed = [tracker.push(*row) for row in zip(time, broken, accel, strict=True)]

@@ -178,7 +178,7 @@ def test_waypoints_that_cannot_be_are_refused_in_one_line(waypoints, text):
         filtering.waypoint_poses(tapped(ALL)._replace(waypoints=waypoints), predict, EKF)
 
 
-def shortened(sequence, stop):
+def shorten(sequence, stop):
     """The first samples of a walk, and the waypoints before the last of them."""
     fields = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")
     arrays = {name: getattr(sequence, name)[:stop] for name in fields}
@@ -192,8 +192,8 @@ def test_an_imu_that_cannot_be_is_refused_in_one_line():
     jump = changed(sequence.time, slice(700, None), sequence.time[700:] + 0.5)
     rows = np.arange(samples)
     for spoilt, text in (
-        (shortened(sequence, 49), "has 49 samples, at least 50 are needed"),
-        (shortened(sequence, 1), "has 1 samples, at least 50 are needed"),
+        (shorten(sequence, 49), "has 49 samples, at least 50 are needed"),
+        (shorten(sequence, 1), "has 1 samples, at least 50 are needed"),
         (sequence._replace(time=rows / 100.0), r"its stamps are not uniform at 50 Hz \(median 100"),
         (sequence._replace(time=jump), r"its stamps are not uniform at 50 Hz \(median 50"),
         (sequence._replace(time=changed(sequence.time, 9, np.nan)), "its stamps are not uniform"),
@@ -406,9 +406,9 @@ CUT, WHOLE = 827, 82
 def test_a_walk_ends_with_its_samples():
     """No estimate is made with samples behind the end: those that follow the last whole interval
     change nothing before them, and their poses are integrated from the last estimate."""
-    sequence = shortened(tapped(ALL), CUT)
+    sequence = shorten(tapped(ALL), CUT)
     poses, smoothed, _ = filtering.waypoint_poses(sequence, predict, EKF, 0.1, 0.2)
-    whole = shortened(tapped(ALL), WHOLE * N)
+    whole = shorten(tapped(ALL), WHOLE * N)
     assert len(whole.waypoints.time) == len(sequence.waypoints.time)
     expected = filtering.waypoint_poses(whole, predict, EKF, 0.1, 0.2)
     for part, other in zip(smoothed, expected.smoothed, strict=True):
@@ -433,7 +433,7 @@ def test_a_walk_ends_with_its_samples():
 
 def test_a_tap_after_the_last_whole_interval_is_taken():
     """It is the only one in the last five seconds: with it the end is where it was tapped."""
-    truth, sequence = walk(), shortened(tapped(ALL), CUT)
+    truth, sequence = walk(), shorten(tapped(ALL), CUT)
     time, position = (part[:-3] for part in sequence.waypoints)
     row = CUT - 2
     taps = Waypoints(
@@ -452,7 +452,7 @@ def test_a_tap_after_the_last_whole_interval_is_taken():
 def test_taps_become_fixes_that_no_test_refuses():
     """In the intervals that the walk fills, behind which there is no rest; a small weight is a
     large covariance."""
-    sequence = shortened(tapped(ALL), CUT)
+    sequence = shorten(tapped(ALL), CUT)
     weight = np.linspace(0.1, 1.4, len(sequence.waypoints.time))
     walk_imu = smoothing._filled_walk(sequence, EKF.config)
     behind = np.linalg.norm(walk_imu.gyro[CUT:], axis=1)
@@ -473,7 +473,7 @@ def test_taps_become_fixes_that_no_test_refuses():
 def test_the_error_of_the_path_is_horizontal_and_no_displacement_is_of_samples_behind_the_walk():
     config, sequence = dataclasses.replace(EKF.config, history="core"), tapped(ALL)
     ekf = dataclasses.replace(EKF, config=config)
-    imu = smoothing._filled_walk(shortened(sequence, CUT), config)
+    imu = smoothing._filled_walk(shorten(sequence, CUT), config)
     level = smoothing._level_start(sequence, ekf)
     _, history = smoothing._odometry(predict, ekf, level, *imu[:2], None)
     displacement, covariance = smoothing._displacements(history, 0.4, imu.count, config)
@@ -527,6 +527,6 @@ def test_between_estimates_of_one_motion_lies_that_motion():
 @pytest.mark.slow
 def test_what_is_behind_the_end_is_no_rest():
     ekf = dataclasses.replace(EKF, measurements=(filtering.ZeroVelocity(0.02),))
-    cut = shortened(tapped(ALL), CUT)
+    cut = shorten(tapped(ALL), CUT)
     poses, _, _ = filtering.waypoint_poses(cut, predict, ekf, 0.1, 0.2)
     np.testing.assert_allclose(poses.velocity[-1, :2], walk().velocity[CUT - 1, :2], atol=0.2)

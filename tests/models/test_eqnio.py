@@ -168,7 +168,7 @@ def test_a_phone_at_rest_has_a_frame_and_finite_derivatives():
 
         def loss(variables, windows, model=model):
             said = model.apply(variables, windows)
-            likelihood, log_std = said.normalised(said.displacement - 1, None)
+            likelihood, log_std = said.normalise(said.displacement - 1, None)
             return jnp.sum(likelihood + log_std)
 
         slopes = quick(jax.grad(loss, argnums=(0, 1)))(variables, jnp.asarray(still))
@@ -181,7 +181,7 @@ def test_the_likelihood_has_the_full_covariance():
     said = Prediction(jnp.zeros((1, 3)), jnp.asarray(log_std), {}, jnp.asarray(axes))
     for d in (2, 3):
         covariance = np.asarray(said.covariance(-9.0, float))[0, :d, :d]
-        squared, logs = said.normalised(jnp.asarray(error[:, :d]), None)
+        squared, logs = said.normalise(jnp.asarray(error[:, :d]), None)
         found = float(jnp.sum(0.5 * squared + logs))
         e = error[0, :d]
         wanted = 0.5 * e @ np.linalg.solve(covariance, e)

@@ -16,7 +16,7 @@ IN_BODY = DataConfig(rate=50.0, window_rotation="body_axes")
 
 def save(path, config):
     model = models.from_experiment(config)
-    shapes = {"batch_stats": {}, **models.variable_shapes(model, config.data.seen)}
+    shapes = {"batch_stats": {}, **models.variable_shapes(model, config.data.input_samples)}
     path.mkdir()
     networks.write_network(path, TrainedNetwork(config, model, drawn(shapes), 1, 0))
     return path

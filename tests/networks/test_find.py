@@ -119,7 +119,7 @@ def test_the_shipped_network_answers():
     assert (network.name, network.digest, network.step) == ("pedestrian", digest, 2308)
     config = network.config
     assert config.datasets == ("tyrex", "indoor_location") and config.model.name == "gnio"
-    still = np.zeros((1, config.data.seen, 6), np.float32)
+    still = np.zeros((1, config.data.input_samples, 6), np.float32)
     still[..., 2] = 9.81
     prediction = quick(network.model.apply)(network.variables, still)
     assert np.linalg.norm(prediction.displacement) < 0.1

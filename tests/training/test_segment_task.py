@@ -33,7 +33,7 @@ from gnio_jax.training.walk_segments import (
     walk_source,
     with_errors,
 )
-from gnio_jax.training.walkway import unchanged
+from gnio_jax.training.walkway import unchanged_pace
 from gnio_jax.types import Sequence
 from tests.support import tiny_run
 from tests.support.tiny_run import assert_same_runs, rows
@@ -100,7 +100,7 @@ def test_segments_are_cut_with_the_attitude_of_the_reference():
     chosen = jnp.array([source.earliest[0], source.latest[3]], np.int32)
     grid = grid_of(config)
     assert grid == SegmentGrid(N, intervals, W, RATE)
-    cut = jax.device_get(cut_walks(jax.device_put(source), chosen, unchanged(2), grid))
+    cut = jax.device_get(cut_walks(jax.device_put(source), chosen, unchanged_pace(2), grid))
     for i, row in enumerate(chosen):
         signals, displacement = reference_segment(sequence, row % 700, intervals)
         np.testing.assert_allclose(cut.signals[i], signals, atol=2e-5)

@@ -181,7 +181,7 @@ KEY = jax.random.key(0)
 
 
 def begun(training, start):
-    return oracle(parallel.everywhere(training.initial_state(KEY, start)))
+    return oracle(parallel.copy_to_devices(training.initial_state(KEY, start)))
 
 
 def take(training, state, source, first, count=1):
@@ -194,7 +194,7 @@ def take(training, state, source, first, count=1):
 def test_each_seed_has_the_weights_of_the_run(training, start):
     """The steps take the memory of their state; that of the weights, which the next seed starts
     from, is another."""
-    state = parallel.everywhere(training[0].initial_state(KEY, start))
+    state = parallel.copy_to_devices(training[0].initial_state(KEY, start))
     for leaf in jax.tree.leaves(state):
         leaf.delete()
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(start))

@@ -12,7 +12,7 @@ from gnio_jax.training.walkway import (
     change_pace,
     draw_pace,
     slow_motion,
-    unchanged,
+    unchanged_pace,
 )
 
 RATE, DT = 100.0, 0.01
@@ -121,4 +121,4 @@ def test_factors_are_drawn_within_their_bounds():
     factors = np.log([pace.gain, pace.vertical_gain, pace.stretch])
     assert np.abs(np.corrcoef(factors) - np.eye(3)).max() < 0.06
     plain = jax.device_get(draw_pace(jax.random.key(0), 5, AugmentConfig()))
-    jax.tree.map(np.testing.assert_array_equal, plain, unchanged(5))
+    jax.tree.map(np.testing.assert_array_equal, plain, unchanged_pace(5))

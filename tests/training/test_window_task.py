@@ -37,7 +37,7 @@ def test_steps_and_validation_are_compiled_once(training):
     window that is not finite is named, where more steps follow it in the same dispatch."""
     training, (source, held_out, _), state = training
     jitted, programs = (task.train_steps, window_task.validate), []
-    state = parallel.everywhere(state)
+    state = parallel.copy_to_devices(state)
     with jax.enable_x64(False):
         for epoch, (first, count, factor) in enumerate([(0, 1, 1.0), (1, 2, 0.5), (3, 4, 0.5)]):
             order = training.order(jax.random.key(1), epoch, source)

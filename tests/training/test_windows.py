@@ -74,7 +74,7 @@ def test_gather_against_a_brute_force_cutter(rotation, stride, context):
     imu, target, steps = cut(sequences, rotation, stride, context)
     assert source.start.shape == (len(target),)
     order = np.random.default_rng(0).permutation(len(target)).astype(np.int32)
-    found = gather(jax.device_put(source), order, config.seen)
+    found = gather(jax.device_put(source), order, config.input_samples)
     np.testing.assert_allclose(found.imu, imu[order], atol=1e-5)
     np.testing.assert_allclose(found.displacement, target[order], atol=1e-5)
     np.testing.assert_allclose(found.steps, steps[order], atol=1e-5)

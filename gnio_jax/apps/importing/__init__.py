@@ -20,7 +20,7 @@ from gnio_jax.apps.importing.recording import Imported as Imported
 from gnio_jax.apps.importing.recording import RawRecording, Track, as_sequence
 from gnio_jax.config import ImportOptions
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
-from gnio_jax.data.labels import ACCEL, GYRO, resolved, sensor_named
+from gnio_jax.data.labels import ACCEL, GYRO, resolve_labels, sensor_named
 from gnio_jax.data.parsing.stamps import RATES, seconds_of
 from gnio_jax.data.parsing.text import head_of
 from gnio_jax.data.readers import euroc
@@ -76,7 +76,7 @@ def import_recording(
 def _read(path: Path, options: ImportOptions) -> RawRecording:
     is_named = any((options.columns, options.accel_path, options.where, options.sample_rate))
     path = path if is_named else _whole(path)
-    kind = "tables" if is_named else _recognised(path)
+    kind = "tables" if is_named else _recognise(path)
     if kind in bags.KINDS:
         return ros.read_bag(path, kind, options)
     if any((options.imu_topic, options.accel_topic, options.reference_topic)):
@@ -100,11 +100,11 @@ def _whole(path: Path) -> Path:
     if not path.is_file() or sensor_named(path.name) is None:
         return path
     sensors = {sensor_named(file.name) for file in folder.glob(f"*{path.suffix}")}
-    is_alone = not {*GYRO, *ACCEL} <= set(resolved(files_of(path)[0].layout.labels))
+    is_alone = not {*GYRO, *ACCEL} <= set(resolve_labels(files_of(path)[0].layout.labels))
     return folder if is_alone and {"gyro", "accel"} <= sensors else path
 
 
-def _recognised(path: Path) -> str:
+def _recognise(path: Path) -> str:
     """The kind of a file or folder, tables, euroc or one of `bags.KINDS`, by its content, because
     names may be wrong."""
     if path.is_dir():

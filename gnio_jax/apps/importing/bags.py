@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from gnio_jax.data.parsing.tables import parsed_as
+from gnio_jax.data.parsing.tables import parsing_as
 from gnio_jax.errors import InputError, require_packages
 
 KINDS = {"rosbag1": "a ROS 1 bag", "rosbag2": "a ROS 2 bag", "mcap": "an MCAP"}
@@ -62,7 +62,7 @@ class Bag(NamedTuple):
 
 
 @contextmanager
-def opened(path: Path, kind: str) -> Iterator[Bag]:
+def open_bag(path: Path, kind: str) -> Iterator[Bag]:
     """Open a recording of one of `KINDS`. Raises `InputError`, also for one that would unpack to
     more than recorders write."""
     require_packages(path, "bags", "rosbags", "mcap")
@@ -81,7 +81,7 @@ def opened(path: Path, kind: str) -> Iterator[Bag]:
 def _reading(path: Path, kind: str) -> Iterator[None]:
     """Report errors of the libraries as damage of the file, for which rosbags uses assertions
     too."""
-    with parsed_as(path, KINDS[kind]):
+    with parsing_as(path, KINDS[kind]):
         try:
             yield
         except AssertionError as error:
@@ -96,7 +96,7 @@ def _reading(path: Path, kind: str) -> Iterator[None]:
 # --- bounds
 
 
-def _unpacked(data: bytes, compression: str, path: Path) -> bytes:
+def _unpack(data: bytes, compression: str, path: Path) -> bytes:
     """The content of a chunk or message. Raises `InputError` if it is larger than recorders
     write."""
     import lz4.frame
@@ -147,7 +147,7 @@ def _rosbag1(path: Path, stack: ExitStack) -> Bag:
     names = {function: name for name, function in rosbag1.reader.decompressors.items()}
     for start, chunk in reader.chunks.items():
         compression = names[chunk.decompressor]
-        bounded = partial(_unpacked, compression=compression, path=path)
+        bounded = partial(_unpack, compression=compression, path=path)
         reader.chunks[start] = chunk._replace(decompressor=bounded)
     decode = _decoder("ros1")
 
@@ -158,7 +158,7 @@ def _rosbag1(path: Path, stack: ExitStack) -> Bag:
                 yield connection.topic, time, decode(data, connection.msgtype)
 
     connections = ((one.topic, one.msgtype, one.msgcount) for one in reader.connections)
-    return Bag(path, _joined(connections), messages)
+    return Bag(path, _join_connections(connections), messages)
 
 
 def _folder(path: Path, stack: ExitStack) -> Bag:
@@ -172,11 +172,13 @@ def _folder(path: Path, stack: ExitStack) -> Bag:
         # The library would unpack its files to the disk, at any size.
         remedy = "unpack its file (zstd -d FILE.zstd) and import that"
         raise InputError(path, "is compressed as a whole (compression_mode FILE)", remedy)
-    unpack = partial(_unpacked, compression=form if mode == "message" else "", path=path)
+    unpack = partial(_unpack, compression=form if mode == "message" else "", path=path)
     readers = {"mcap": _mcap, "sqlite3": _sqlite}
     read = readers[facts["storage_identifier"]]
     bags = [read(path / Path(name).name, stack, unpack) for name in facts["relative_file_paths"]]
-    topics = _joined((one.name, one.type, one.count) for bag in bags for one in bag.topics.values())
+    topics = _join_connections(
+        (one.name, one.type, one.count) for bag in bags for one in bag.topics.values()
+    )
 
     def messages(names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         for bag in bags:
@@ -202,7 +204,7 @@ def _sqlite(path: Path, stack: ExitStack, unpack: Callable[[bytes], bytes] = byt
                 yield connection.topic, time, decode(unpack(data), connection.msgtype)
 
     connections = ((one.topic, one.msgtype, one.msgcount) for one in reader.connections)
-    return Bag(path, _joined(connections), messages)
+    return Bag(path, _join_connections(connections), messages)
 
 
 def _mcap(path: Path, stack: ExitStack, unpack: Callable[[bytes], bytes] = bytes) -> Bag:
@@ -218,7 +220,7 @@ def _mcap(path: Path, stack: ExitStack, unpack: Callable[[bytes], bytes] = bytes
         raise InputError(path, "has no summary of its topics", "write one with mcap recover")
     counts = summary.statistics.channel_message_counts
     names = {0: ""} | {number: schema.name for number, schema in summary.schemas.items()}
-    topics = _joined(
+    topics = _join_connections(
         (channel.topic, names[channel.schema_id], counts.get(number, 0))
         for number, channel in summary.channels.items()
     )
@@ -247,7 +249,7 @@ def _mcap_messages(file: Any, indexes: list[Any], chosen: set[int], path: Path) 
     from mcap.stream_reader import StreamReader, breakup_chunk
 
     def inside(chunk: Chunk) -> Iterator[Message]:
-        content = _unpacked(chunk.data, chunk.compression, path)
+        content = _unpack(chunk.data, chunk.compression, path)
         chunk = dataclasses.replace(chunk, compression="", data=content)
         for record in breakup_chunk(chunk, validate_crc=True):
             if isinstance(record, Message) and record.channel_id in chosen:
@@ -281,7 +283,7 @@ def _check_encoding(topic: str, encoding: str, path: Path) -> None:
         raise InputError(path, problem, "record it as ROS 2 (cdr) or ROS 1 messages")
 
 
-def _joined(connections: Iterable[tuple[str, str, int]]) -> dict[str, Topic]:
+def _join_connections(connections: Iterable[tuple[str, str, int]]) -> dict[str, Topic]:
     """The topics of connections or channels, each (topic, type, messages). A topic may have
     several."""
     topics: dict[str, Topic] = {}

@@ -15,7 +15,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num, Real
 
 from gnio_jax.data.parsing import stamps as parsing
-from gnio_jax.data.parsing.stamps import CROWDED, FEW_ROWS, RATES, SAME_RATE, few, usual_step
+from gnio_jax.data.parsing.stamps import (
+    CROWDED,
+    FEW_ROWS,
+    RATES,
+    SAME_RATE,
+    most_damaged_rows,
+    usual_step,
+)
 from gnio_jax.data.parsing.tables import Table
 from gnio_jax.data.validation import from_one
 from gnio_jax.errors import InputError
@@ -59,7 +66,7 @@ class Sensor(NamedTuple):
     unit: str | None = None
     """Unit of the values (`units.scale_of`); None: it is detected."""
 
-    def where(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> Sensor:
+    def select_rows(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> Sensor:
         """The samples in these rows."""
         numbers, row = np.arange(len(self.stamps))[rows], self.row
         stamps, values = self.stamps[rows], self.values[rows]
@@ -91,7 +98,7 @@ def sensor_of(
     return Sensor(name, table.path, stamps, values, table.row, second, unit)
 
 
-def clocked(sensor: Sensor, unit: str | None, notes: list[str], warnings: list[str]) -> Clocked:
+def read_clock(sensor: Sensor, unit: str | None, notes: list[str], warnings: list[str]) -> Clocked:
     """The samples in order and in seconds. `unit` is that of the stamps; None: it is detected.
     Raises `InputError`."""
     name, file, remarks = sensor.name, sensor.file, list[str]()
@@ -100,7 +107,7 @@ def clocked(sensor: Sensor, unit: str | None, notes: list[str], warnings: list[s
         # Loggers that write all sensors into one table leave the columns of the others empty.
         problem = f"{blank.sum()} of {len(blank)} rows have no value of {name}"
         remarks.append(f"{problem} and are left out for it")
-        sensor = sensor.where(~blank)
+        sensor = sensor.select_rows(~blank)
     blank = np.isnan(sensor.stamps)
     if blank.mean() > MOST_BLANK and not blank[0]:  # only a packet's first row has a stamp
         last = np.maximum.accumulate(np.where(blank, 0, np.arange(len(blank))))
@@ -110,34 +117,34 @@ def clocked(sensor: Sensor, unit: str | None, notes: list[str], warnings: list[s
     if lost := int((~valid).sum()):
         row = sensor.row(int(np.argmin(valid)))
         problem = f"a stamp or a value of field '{name}' is NaN or Inf in {lost} rows, first in row"
-        if lost > few(len(valid)):
+        if lost > most_damaged_rows(len(valid)):
             raise InputError(file, f"{problem} {row}", "repair or cut the recording there")
         remarks.append(f"{problem} {row}: they are left out")
-        sensor = sensor.where(valid)
-    stamps, wraps = _unwrapped(sensor.stamps)
+        sensor = sensor.select_rows(valid)
+    stamps, wraps = _unwrap(sensor.stamps)
     if wraps:
         remarks.append(f"the clock of {name} wrapped {wraps} times and is continued")
         sensor = sensor._replace(stamps=stamps)
     strays = _strays(sensor.stamps)
     if lost := int(strays.sum()):
         remarks.append(f"{lost} rows of {name} are left out, whose stamps are far from all others")
-        sensor = sensor.where(~strays)
-    mixed = _mixed(sensor)
+        sensor = sensor.select_rows(~strays)
+    mixed = _find_mixed(sensor)
     if lost := int(mixed.sum()):
         row = sensor.row(int(np.argmax(mixed)))
         problem = f"the clock of {name} starts again or was set back near row {row}: {lost} rows"
         if lost > MOST_LOST * len(mixed):
             raise InputError(file, f"{problem} overlap others", "cut the recording there")
         problem = f"{file.name}: {problem} of the shorter part are left out"
-        (notes if lost <= few(len(mixed)) else warnings).append(problem)
-        sensor = sensor.where(~mixed)
+        (notes if lost <= most_damaged_rows(len(mixed)) else warnings).append(problem)
+        sensor = sensor.select_rows(~mixed)
     if backward := int((np.diff(sensor.stamps) < 0).sum()):
         remarks.append(f"{name} had {backward} steps back in time; its rows were sorted")
-        sensor = sensor.where(np.argsort(sensor.stamps, kind="stable"))
+        sensor = sensor.select_rows(np.argsort(sensor.stamps, kind="stable"))
     repeated = np.concatenate([[False], _is_same(sensor)])[: len(sensor.stamps)]
     if repeated.any():
         remarks.append(f"{repeated.sum()} rows of {name} repeat a stamp and were dropped")
-        sensor = sensor.where(~repeated)
+        sensor = sensor.select_rows(~repeated)
     stamps = sensor.stamps
     if len(stamps) < 2:
         raise InputError(file, f"holds {len(stamps)} samples of field '{name}'", "record longer")
@@ -152,7 +159,7 @@ def clocked(sensor: Sensor, unit: str | None, notes: list[str], warnings: list[s
         problem = f"field 'time' makes {name} run at {rate:.3g} Hz with the unit {second}"
         raise InputError(file, problem, f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz")
     first = parsing.first_stamp(stamps, second, file)
-    time = _even(parsing.seconds(stamps, first, second), name, remarks)
+    time = _space_evenly(parsing.seconds(stamps, first, second), name, remarks)
     start = Fraction(first) * parsing.seconds_of(second)
     notes += [f"{file.name}: {remark}" for remark in remarks]
     return Clocked(name, file, time, sensor.values, start, is_doubtful)
@@ -186,7 +193,7 @@ def _detected_unit(sensor: Sensor, notes: list[str]) -> tuple[str, bool]:
 # --- wraps, rows of other times, new starts
 
 
-def _unwrapped(stamps: Real[np.ndarray, " n"]) -> tuple[Real[np.ndarray, " n"], int]:
+def _unwrap(stamps: Real[np.ndarray, " n"]) -> tuple[Real[np.ndarray, " n"], int]:
     """Stamps that go on where a clock wrapped, and the number of wraps."""
     steps = np.diff(stamps)
     if not (steps < 0).any():
@@ -217,10 +224,10 @@ def _strays(stamps: Real[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         far = np.diff(stamps[order]).astype(np.float64) > longest
         cluster = np.concatenate([[0], np.cumsum(far)])
         strays[order] = cluster != np.bincount(cluster).argmax()
-    return strays if strays.sum() <= few(len(stamps)) else np.zeros_like(strays)
+    return strays if strays.sum() <= most_damaged_rows(len(stamps)) else np.zeros_like(strays)
 
 
-def _mixed(sensor: Sensor) -> Bool[np.ndarray, " n"]:
+def _find_mixed(sensor: Sensor) -> Bool[np.ndarray, " n"]:
     """Rows of pieces of the file that lie between the samples of a longer piece: the clock started
     again. Blocks and single rows out of order fill holes, and are not meant."""
     steps = np.diff(sensor.stamps).astype(np.float64)
@@ -236,7 +243,7 @@ def _mixed(sensor: Sensor) -> Bool[np.ndarray, " n"]:
     shorter = np.where(is_former, former, latter)
     limit = np.where(counts[piece[shorter]] > 1, NEAR, NEAR_ROW) * usual
     near = (piece[former] != piece[latter]) & (np.diff(sensor.stamps[order]) < limit)
-    near &= ~_is_same(sensor.where(order))
+    near &= ~_is_same(sensor.select_rows(order))
     hits = np.bincount(piece[np.unique(shorter[near])], minlength=len(counts))
     return ((hits > 0.5 * counts) | (hits > FEW_ROWS))[piece]
 
@@ -244,7 +251,9 @@ def _mixed(sensor: Sensor) -> Bool[np.ndarray, " n"]:
 # --- bursts and rounded stamps
 
 
-def _even(time: Float[np.ndarray, " n"], name: str, notes: list[str]) -> Float[np.ndarray, " n"]:
+def _space_evenly(
+    time: Float[np.ndarray, " n"], name: str, notes: list[str]
+) -> Float[np.ndarray, " n"]:
     """Time of samples that are evenly apart where stamps are rounded, shared, or those of the
     arrival of a packet."""
     steps, mean, grain = np.diff(time), usual_step(time), _grain(time)

@@ -17,14 +17,14 @@ from jaxtyping import Float, Num
 
 from gnio_jax.apps.importing import units
 from gnio_jax.apps.importing.clocks import Sensor
-from gnio_jax.apps.importing.files import LogFile, files_of, listed, log_file
+from gnio_jax.apps.importing.files import LogFile, files_of, log_file, spell_names
 from gnio_jax.apps.importing.readings import RawReadings, columns_of, readings_of
 from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.config import ImportOptions
 from gnio_jax.data import labels
 from gnio_jax.data.labels import ACCEL, AXES, GYRO, NAMES, POSES, REFERENCE
 from gnio_jax.data.parsing import stamps as parsing
-from gnio_jax.data.parsing.tables import Table, shortened
+from gnio_jax.data.parsing.tables import Table, shorten
 from gnio_jax.data.parsing.text import FIRST_LINES, cells_of, rows_of, without_mark
 from gnio_jax.data.readers.csv_files import check_columns, reference
 from gnio_jax.data.reference import SHORTEST_RUN
@@ -96,7 +96,7 @@ class _Log(NamedTuple):
         return stamps, unit
 
 
-def _opened(file: LogFile, names: dict[str, str], where: str | None, notes: list[str]) -> _Log:
+def _open_log(file: LogFile, names: dict[str, str], where: str | None, notes: list[str]) -> _Log:
     """A table, of which `where` "COLUMN=VALUE" may take some rows. Columns have their places as
     names if `names` has nothing but places."""
     (table, remarks), layout = file.read(), file.layout
@@ -112,7 +112,7 @@ def _opened(file: LogFile, names: dict[str, str], where: str | None, notes: list
         texts = frame[label].astype(str) if label in frame else frame.columns
         chosen = np.flatnonzero(texts.isin([value, f"{value}.0"])) if label in frame else []
         if not len(chosen):
-            values = shortened(", ".join(texts.unique()[:20]), 200)
+            values = shorten(", ".join(texts.unique()[:20]), 200)
             raise InputError(file.path, f"has no row with {where}", f"there are: {values}")
         frame = frame.iloc[chosen].reset_index(drop=True)
         rows = chosen if rows is None else rows[chosen]
@@ -169,7 +169,9 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
     names = named_by(options.columns)
     if len(files) == 1 and not (names or options.accel_path or options.where):
         files = rows_by_sensor(files[0]) or files
-    whole = [file for file in files if {*GYRO, *ACCEL} <= set(labels.resolved(file.layout.labels))]
+    whole = [
+        file for file in files if {*GYRO, *ACCEL} <= set(labels.resolve_labels(file.layout.labels))
+    ]
     if options.accel_path is not None:
         groups = {("gyro",): files, ("accel",): files_of(options.accel_path)}
     elif len(files) == 1 or len(whole) == 1:
@@ -180,13 +182,13 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
         for group, tables in groups.items():  # without the uncalibrated one if there is another
             groups[group] = [f for f in tables if "uncal" not in f.name.lower()] or tables
     if any(len(tables) != 1 for tables in groups.values()):
-        problem = f"has the layout of no known recording (found: {listed(files)})"
+        problem = f"has the layout of no known recording (found: {spell_names(files)})"
         remedy = "known: CSV, Sensor Logger, phyphox, ROS bags, MCAP and EuRoC folders"
         raise InputError(path, problem, f"{remedy}; a CSV of other columns needs --columns")
     notes, sensors, track = list[str](), dict[str, Sensor](), None
     others = dict[str, RawReadings]()
     for group, (file,) in groups.items():
-        log = _opened(file, names, options.where, notes)
+        log = _open_log(file, names, options.where, notes)
         columns = _columns(log, group, names, options, notes)
         for sensor in group:
             axes, unit = [columns[axis] for axis in AXES[sensor]], log.scales.get(sensor)
@@ -224,11 +226,11 @@ def _others_of(file: LogFile, notes: list[str]) -> dict[str, RawReadings]:
     """The sensors beside the IMU in a table of their own; none if it cannot be read, or has no
     stamps."""
     columns = columns_of(file.layout.labels)
-    time = labels.resolved(file.layout.labels).get("time")
+    time = labels.resolve_labels(file.layout.labels).get("time")
     if not columns or time is None:
         return {}
     try:
-        log = _opened(file, {}, None, notes)
+        log = _open_log(file, {}, None, notes)
         stamps, second = log.stamps(time)
         return {s: readings_of(s, log.table, stamps, c, second) for s, c in columns.items()}
     except InputError as error:
@@ -247,7 +249,7 @@ def _columns(
     needed = [] if options.sample_rate is not None else [*times]
     needed += [axis for sensor in sensors for axis in AXES[sensor]]
     is_numbered = headings == [str(index) for index in range(len(headings))]
-    guesses = _by_place(frame, alone) if is_numbered else labels.resolved(headings, alone)
+    guesses = _by_place(frame, alone) if is_numbered else labels.resolve_labels(headings, alone)
     dated = [label for label in headings if frame[label].dtype.kind == "M"]
     names_of = ({"time": dated[0]} if len(dated) == 1 else {}) | guesses | names
     columns = {name: names_of.get(name, name) for name in needed}
@@ -301,7 +303,7 @@ def _check_one_imu(frame: pd.DataFrame, columns: dict[str, str], path: Path) -> 
 def _reference(table: Table, names: dict[str, str], gyro: Sensor, unit: str | None) -> Track | None:
     """The reference in the package's own columns, on the gyro's stamps."""
     ours = {label: name for name, label in names.items()}
-    table = table.renamed(ours.get(label, label) for label in map(str, table.columns))
+    table = table.rename(ours.get(label, label) for label in map(str, table.columns))
     if not {*POSES} & set(table.columns) or not np.isfinite(gyro.stamps).all():
         return None  # without stamps the gyro is refused
     first = gyro.stamps.min().item()

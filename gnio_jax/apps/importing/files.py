@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from gnio_jax.data.parsing import text as parsing
-from gnio_jax.data.parsing.tables import Table, parsed_as
+from gnio_jax.data.parsing.tables import Table, parsing_as
 from gnio_jax.errors import InputError, require_packages
 
 XLS_MAGIC, GZIP_MAGIC = b"\xd0\xcf\x11\xe0", b"\x1f\x8b"
@@ -67,16 +67,16 @@ def log_file(
         frame, rows = parsing.tolerant_frame(path, layout, content(), notes)
         if words := [line for line in layout.preamble if parsing.is_row(line)]:
             problem = f"{len(words)} lines above the header are no rows"
-            notes.append(f"{path.name}: {problem} ('{parsing.shortened(words[0], 40)}')")
+            notes.append(f"{path.name}: {problem} ('{parsing.shorten(words[0], 40)}')")
         frame.columns = list(layout.labels or map(str, frame.columns))
         return Table(path, frame, before=layout.before, content=content(), rows=rows), notes
 
     return LogFile(name, path, layout, content, read)
 
 
-def listed(files: list[LogFile]) -> str:
+def spell_names(files: list[LogFile]) -> str:
     """Names of files, for messages."""
-    return parsing.shortened(", ".join(file.name for file in files) or "no CSV file", 200)
+    return parsing.shorten(", ".join(file.name for file in files) or "no CSV file", 200)
 
 
 def files_of(path: Path) -> list[LogFile]:
@@ -89,17 +89,17 @@ def files_of(path: Path) -> list[LogFile]:
     if magic == XLS_MAGIC:
         return _sheets(path, "xlrd")
     if magic.startswith(GZIP_MAGIC):
-        with parsed_as(path, "a gzip"), gzip.open(path) as file:
+        with parsing_as(path, "a gzip"), gzip.open(path) as file:
             content = file.read(LARGEST + 1)
         _check_size(len(content), path)
         return [log_file(path.stem, path, partial(bytes, content))]
     if not magic.startswith(b"PK"):
         return [log_file(path.name, path)]
-    with parsed_as(path, "a zip"), zipfile.ZipFile(path) as archive:
+    with parsing_as(path, "a zip"), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
     names = Counter(member.filename for member in members if not member.is_dir())
     if twice := [name for name, count in names.items() if count > 1]:
-        raise InputError(path, f"holds {parsing.shortened(twice[0])} twice", "leave one of them")
+        raise InputError(path, f"holds {parsing.shorten(twice[0])} twice", "leave one of them")
     if any(member.filename == "xl/workbook.xml" for member in members):  # ECMA-376, part 2
         _check_size(sum(member.file_size for member in members), path)
         return _sheets(path, "openpyxl")
@@ -129,7 +129,7 @@ def _texts(path: Path, members: dict[str, Path | None]) -> list[LogFile]:
 
 def _member(path: Path, name: str, most: int = -1) -> bytes:
     """The content of a file of a zip, or its first `most` bytes."""
-    with parsed_as(path, "a zip"), zipfile.ZipFile(path) as archive:
+    with parsing_as(path, "a zip"), zipfile.ZipFile(path) as archive:
         _check_size(archive.getinfo(name).file_size, path / name)
         with archive.open(name) as file:  # it gives at most the announced size
             return file.read(most)
@@ -144,7 +144,7 @@ def _check_size(size: int, file: Path) -> None:
 def _sheets(path: Path, engine: str) -> list[LogFile]:
     """The sheets of a workbook as texts."""
     require_packages(path, "excel", engine)
-    with parsed_as(path, "a workbook"), warnings.catch_warnings():
+    with parsing_as(path, "a workbook"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # warnings about styles
         texts = _new_sheets(path) if engine == "openpyxl" else _old_sheets(path)
     return [log_file(n, path / n, partial(bytes, text)) for n, text in texts.items() if text]
@@ -172,7 +172,7 @@ def _new_sheets(path: Path) -> dict[str, bytes]:
                 count += len(row) + 1
                 is_long = len(rows) >= MOST_ROWS or count > MOST_CELLS
                 if len(row) > parsing.MOST_COLUMNS or is_long:
-                    problem = f"sheet '{parsing.shortened(sheet.title)}' has a cell in column"
+                    problem = f"sheet '{parsing.shorten(sheet.title)}' has a cell in column"
                     problem += f" {len(row)} of row {len(rows) + 1}, which is too far out"
                     raise InputError(path, problem, "export the sensors' columns alone")
                 rows.append([_cell_text(cell) for cell in row])

@@ -49,7 +49,7 @@ import numpy as np
 import pandas as pd
 
 from gnio_jax.apps.importing.clocks import Sensor, sensor_of
-from gnio_jax.apps.importing.files import LogFile, listed
+from gnio_jax.apps.importing.files import LogFile, spell_names
 from gnio_jax.apps.importing.readings import ACCURACY, RawReadings, readings_of
 from gnio_jax.apps.importing.recording import RawRecording
 from gnio_jax.data.labels import unit_of, unit_text
@@ -123,7 +123,7 @@ def _sensor_logger(path: Path, files: list[LogFile]) -> RawRecording:
     parts = [part for part in parts if str(part.location.parent) in folders]
     tables = {part.location.stem: part for part in parts}
     if len(tables) < len(parts):
-        raise InputError(path, f"holds a sensor twice ({listed(parts)})", "leave one of them")
+        raise InputError(path, f"holds a sensor twice ({spell_names(parts)})", "leave one of them")
     if "Gyroscope" in tables:
         tables.pop("GyroscopeUncalibrated", None)
     sets = []
@@ -286,20 +286,20 @@ def _recording(
     kinds = {one.kind for one in sets}
     for sensor, needed in (("gyro", {"gyro"}), ("accelerometer", {"accel", "linear", "raw"})):
         if not kinds & needed:
-            raise InputError(path, f"has no {sensor} (found: {listed(files)})", REMEDY)
-    gyro = _only("gyro", sets, path)
+            raise InputError(path, f"has no {sensor} (found: {spell_names(files)})", REMEDY)
+    gyro = _require_one("gyro", sets, path)
     if "accel" in kinds:
-        parts = [_only("accel", sets, path)]
+        parts = [_require_one("accel", sets, path)]
     elif {"linear", "gravity"} <= kinds:
-        parts = [_only(kind, sets, path) for kind in ("linear", "gravity")]
+        parts = [_require_one(kind, sets, path) for kind in ("linear", "gravity")]
     elif "raw" in kinds:
-        parts = [_only("raw", sets, path)]
+        parts = [_require_one("raw", sets, path)]
     else:
         name = next(one.file.name for one in sets if one.kind == "linear")
         raise InputError(path, f"holds acceleration without gravity ({name})", REMEDY)
     accel = parts[0].sensor("accel")
     if len(parts) > 1:
-        accel = _added(accel, parts[1].sensor("accel"))
+        accel = _add_gravity(accel, parts[1].sensor("accel"))
     clock, unit = "ns" if gyro.time == "time" else "s", parts[0].unit
     of_accel = " + ".join(part.file.name for part in parts) + (f" in {unit}" if unit else "")
     note = f"{path.name}: {app}; time in {clock}, {gyro.file.name} in {gyro.unit}, {of_accel}"
@@ -309,7 +309,7 @@ def _recording(
     return RawRecording(path, gyro.sensor("gyro"), accel, notes, [], sign, raw_gyro=is_raw)
 
 
-def _only(kind: str, sets: list[_Set], path: Path) -> _Set:
+def _require_one(kind: str, sets: list[_Set], path: Path) -> _Set:
     """The only set of a kind. Raises `InputError` if there are several."""
     sets = [one for one in sets if one.kind == kind]
     if len(sets) > 1:
@@ -321,7 +321,7 @@ def _only(kind: str, sets: list[_Set], path: Path) -> _Set:
     return sets[0]
 
 
-def _added(motion: Sensor, gravity: Sensor) -> Sensor:
+def _add_gravity(motion: Sensor, gravity: Sensor) -> Sensor:
     """The accelerometer's reading on the stamps of `motion`: the sum of the acceleration without
     gravity and of gravity, which turns slowly and is interpolated linearly (ours)."""
     valid = np.isfinite(gravity.values).all(axis=1) & np.isfinite(gravity.stamps)
@@ -332,5 +332,5 @@ def _added(motion: Sensor, gravity: Sensor) -> Sensor:
     order = np.flatnonzero(valid)[np.argsort(stamps[valid], kind="stable")]
     inside = (time >= stamps[order[0]]) & (time <= stamps[order[-1]])
     down = interpolate(time[inside], stamps[order], gravity.values[order])
-    motion = motion.where(inside)
+    motion = motion.select_rows(inside)
     return motion._replace(values=motion.values + down)

@@ -152,13 +152,13 @@ def readings_on_clock(
             second = time_unit or raw.second or gyro.second
             if second is None:
                 second, _ = parsing.time_unit(gyro.stamps - gyro.stamps.min())
-            readings[raw.sensor] = _converted(raw, second or "s", start, clock, notes)
+            readings[raw.sensor] = _convert(raw, second or "s", start, clock, notes)
         except InputError as error:
             warnings.append(f"{raw.sensor}: it is left out: {error}")
     return readings
 
 
-def _converted(
+def _convert(
     raw: RawReadings,
     second: str,
     start: Fraction,

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from gnio_jax.apps.importing import units
-from gnio_jax.apps.importing.clocks import Clocked, Sensor, clocked
+from gnio_jax.apps.importing.clocks import Clocked, Sensor, read_clock
 from gnio_jax.apps.importing.readings import RawReadings, readings_on_clock
 from gnio_jax.config import ImportOptions
 from gnio_jax.data import physics
@@ -56,7 +56,7 @@ class RawRecording(NamedTuple):
     warnings: list[str]
     """Warnings about problems that may make all results wrong, one sentence each."""
     sign: str | None = None
-    """Sign of the accelerometer: android, ios or detect (see `units.signed`), if it is known."""
+    """Sign of the accelerometer: android, ios or detect (see `units.with_sign`), if it is known."""
     sign_is_assumed: bool = False
     track: Track | None = None
     raw_gyro: bool = False
@@ -80,7 +80,7 @@ def as_sequence(
     """The sequence of a recording in any format; units in `options` override those of the format.
     Raises `InputError`."""
     notes, sensors = raw.notes, (raw.gyro, raw.accel)
-    gyro, accel = (clocked(one, options.time_unit, notes, raw.warnings) for one in sensors)
+    gyro, accel = (read_clock(one, options.time_unit, notes, raw.warnings) for one in sensors)
     accel = accel._replace(time=accel.time + float(accel.start - gyro.start))
     gyro, accel = _in_si(raw, options, gyro, accel)
     if not np.array_equal(gyro.time, accel.time):
@@ -118,7 +118,7 @@ def _in_si(
     accel = accel._replace(values=accel.values * scale)
     rows, is_slower = physics.repeats(gyro.time, gyro.values)
     force = interpolate(gyro.time, accel.time, accel.values)
-    rows &= ~physics.resting(physics.ImuSamples(gyro.time, gyro.values, force), rows)
+    rows &= ~physics.find_rest(physics.ImuSamples(gyro.time, gyro.values, force), rows)
     gyro = _without_repeats(gyro, rows, is_slower, raw)
     accel = _without_repeats(accel, *physics.repeats(accel.time, accel.values), raw)
     first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
@@ -141,7 +141,7 @@ def _in_si(
     if sign is None:
         problem = "the sign of field 'accel' depends on the phone's system, which is not known here"
         raise InputError(accel.file, problem, "state it: android, ios or detect")
-    force = units.signed(accel.values, sign, accel.file, notes)
+    force = units.with_sign(accel.values, sign, accel.file, notes)
     upward = units.note_gravity(accel.time, force, accel.file, notes)
     if upward == "-z" and options.accel_sign is None and raw.sign_is_assumed:
         problem = f"gravity reads on -z in {accel.file.name}: the screen points down, or this is"

@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from gnio_jax.apps.importing.bags import Bag, Topic, opened
+from gnio_jax.apps.importing.bags import Bag, Topic, open_bag
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.readings import RawReadings
 from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.config import ImportOptions
 from gnio_jax.data.parsing.stamps import FEW_SHARE, seconds
-from gnio_jax.data.parsing.tables import shortened
+from gnio_jax.data.parsing.tables import shorten
 from gnio_jax.data.readers.euroc import SensorPose, moved_to
 from gnio_jax.data.reference import SHORTEST_RUN, Poses
 from gnio_jax.data.sensors import BAROMETER, GNSS, MAGNETOMETER
@@ -54,12 +54,12 @@ def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
     `sensor_msgs/Imu` one must be named, and of several topics of poses none is taken that is not;
     "/tf:CHILD_FRAME" names transforms. Raises `InputError` that names the existing topics."""
     notes, warnings = list[str](), list[str]()
-    with opened(path, kind) as bag:
+    with open_bag(path, kind) as bag:
         imu = _imu_topic(bag, options.imu_topic)
         other = _imu_topic(bag, options.accel_topic) if options.accel_topic else imu
         reference = _reference_topic(bag, options.reference_topic, notes)
         topics = _other_topics(bag, notes)
-        content = _collected(bag, {imu.name, other.name}, reference, topics)
+        content = _collect(bag, {imu.name, other.name}, reference, topics)
     samples, poses, mounts, rows = content
     of_gyro, of_accel = samples[imu.name], samples[other.name]
     gyro, accel = of_gyro.sensor("gyro", imu.name, path), of_accel.sensor("accel", other.name, path)
@@ -132,10 +132,10 @@ def _other_readings(
 def _imu_topic(bag: Bag, name: str | None) -> Topic:
     topics = _topics(bag, name, (IMU,), "IMU")
     if not topics:
-        remedy = f"its topics: {_listed(bag.topics.values())}"
+        remedy = f"its topics: {_spell_topics(bag.topics.values())}"
         raise InputError(bag.path, "has no topic of sensor_msgs/Imu", remedy)
     if len(topics) > 1:
-        remedy = f"choose one by --imu-topic: {_listed(topics)}"
+        remedy = f"choose one by --imu-topic: {_spell_topics(topics)}"
         raise InputError(bag.path, f"has {len(topics)} IMU topics", remedy)
     return topics[0]
 
@@ -146,7 +146,7 @@ def _reference_topic(bag: Bag, name: str | None, notes: list[str]) -> Topic | No
     topics = _topics(bag, topic, (*POSES, *TRANSFORMS), "pose")
     poses = topics if topic else [topic for topic in topics if topic.type in POSES]
     if topics and len(poses) != 1:
-        remedy = f"--reference-topic may be {_listed(topics)}"
+        remedy = f"--reference-topic may be {_spell_topics(topics)}"
         notes.append(f"{bag.path.name}: no reference is taken; {remedy}")
     return poses[0] if len(poses) == 1 else None
 
@@ -157,17 +157,17 @@ def _topics(bag: Bag, name: str | None, types: tuple[str, ...], what: str) -> li
     if name is None:
         return topics
     if name not in bag.topics:
-        remedy = f"its topics: {_listed(bag.topics.values())}"
+        remedy = f"its topics: {_spell_topics(bag.topics.values())}"
         raise InputError(bag.path, f"has no topic '{name}'", remedy)
     if bag.topics[name].type not in types:
         problem = f"topic {name} is {bag.topics[name].type}, no {what}"
-        raise InputError(bag.path, problem, f"{what} topics: {_listed(topics)}")
+        raise InputError(bag.path, problem, f"{what} topics: {_spell_topics(topics)}")
     return [bag.topics[name]]
 
 
-def _listed(topics: Iterable[Topic]) -> str:
+def _spell_topics(topics: Iterable[Topic]) -> str:
     names = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in topics]
-    return shortened(", ".join(names) or "none", 400)
+    return shorten(", ".join(names) or "none", 400)
 
 
 # --- messages
@@ -225,7 +225,7 @@ _Mounts = dict[tuple[str, str], SensorPose]
 """(parent, child) -> pose of the child in the parent, from static transforms."""
 
 
-def _collected(
+def _collect(
     bag: Bag, imus: set[str], reference: Topic | None, others: list[Topic]
 ) -> tuple[dict[str, _Imu], list[_Pose], _Mounts, dict[str, list[_Row]]]:
     """The IMU topics, the poses of the reference, the static transforms, and the messages of other

@@ -125,7 +125,7 @@ def gyro_scale(
     return TO_RAD_PER_SECOND[unit], []
 
 
-def signed(
+def with_sign(
     accel: Float[np.ndarray, "n 3"], sign: str, path: Path, notes: list[str]
 ) -> Float[np.ndarray, "n 3"]:
     """`accel` with Android's sign: at rest, level, the up axis reads +1 g. `sign` "ios" negates it,

@@ -51,13 +51,13 @@ class Nature(NamedTuple):
     imu_rate: float | None = None
     """Stated rate, Hz."""
     sign: str | None = None
-    """Sign of the accelerometer: android, ios or detect (`units.signed`); None: Android's is
+    """Sign of the accelerometer: android, ios or detect (`units.with_sign`); None: Android's is
     assumed."""
     needs: str = "send the gyro (gyro) and the accelerometer (accel)"
     """What to do if one sensor does not come."""
 
 
-def measured(
+def with_measured_rate(
     arrivals: Iterator[Arrival], nature: Nature, begin: Callable[[float], None]
 ) -> Iterator[Arrival]:
     """Hold back the samples of the first second, measure their rate, Hz, and call `begin` with it;
@@ -141,7 +141,7 @@ def _sign_of(accel: Float[np.ndarray, "n 3"], nature: Nature, notices: list[str]
         remedy = f"give --accel-unit {looks[0]}" if looks else f"give its --accel-unit: {names}"
         raise InputError(nature.name, problem, f"{remedy}; gravity must be in it")
     sign = nature.sign or "android"
-    signed = units.signed(accel, sign, Path(nature.name), notices)
+    signed = units.with_sign(accel, sign, Path(nature.name), notices)
     gravity = np.median(signed, axis=0)
     if nature.sign is None and np.argmin(gravity) == 2 and gravity[2] < -np.abs(gravity[:2]).max():
         problem = "gravity reads on -z: the screen points down, or this is iOS's sign and the path"

@@ -39,12 +39,12 @@ def on_one_clock(arrivals: Iterator[Arrival], name: str, is_live: bool) -> Itera
             yield arrival
             continue
         if clock.continues(sample.time):
-            yield from _refused(run, clock)
+            yield from _refuse(run, clock)
             run.clear()
             yield clock.take(arrival)
             continue
         if run and not _is_near(sample.time, run[-1]):
-            yield from _refused(run, clock)
+            yield from _refuse(run, clock)
             run.clear()
         run.append(arrival)
         if len(run) < AGREEING:
@@ -60,7 +60,7 @@ def on_one_clock(arrivals: Iterator[Arrival], name: str, is_live: bool) -> Itera
         yield from map(clock.take, run)
         run.clear()
     if clock.is_running:
-        yield from _refused(run, clock)
+        yield from _refuse(run, clock)
     elif run:  # a short stream
         clock.start(run[0])
         yield from map(clock.take, run)
@@ -95,7 +95,7 @@ class Clock:
         self.newest, self._heard = max(self.newest, stamp), arrival.clock
         return arrival._replace(sample=arrival.sample._replace(time=stamp))
 
-    def late(self, arrival: Arrival) -> str:
+    def describe_refusal(self, arrival: Arrival) -> str:
         """Why a sample whose stamp does not continue this clock is refused."""
         assert arrival.sample is not None
         if not self.is_running:
@@ -124,9 +124,9 @@ def _is_near(stamp: float, before: Arrival) -> bool:
     return -LATEST <= stamp - before.sample.time <= LONGEST_TRUSTED
 
 
-def _refused(run: list[Arrival], clock: Clock) -> Iterator[Arrival]:
+def _refuse(run: list[Arrival], clock: Clock) -> Iterator[Arrival]:
     for arrival in run:
-        yield Arrival(arrival.clock, refusal=clock.late(arrival))
+        yield Arrival(arrival.clock, refusal=clock.describe_refusal(arrival))
 
 
 def _check_unit(stamps: list[float], name: str) -> None:

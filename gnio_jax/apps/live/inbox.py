@@ -48,7 +48,7 @@ class Inbox:
                 self._change.notify()
         return not full
 
-    def tell(self, notice: str) -> None:
+    def add_notice(self, notice: str) -> None:
         """Add a message for the user."""
         with self._change:
             self._notices.append(notice)

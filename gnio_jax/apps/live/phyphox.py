@@ -58,7 +58,7 @@ class Phyphox:
             raise InputError(name, "is no address", "write phyphox:192.168.0.10:8080")
         self.name, self._host, self._port = name, host, int(port or PORT)
         try:
-            self._buffers = self._find_buffers(self.ask("/config"))
+            self._buffers = self._find_buffers(self.request("/config"))
             status, newest = self._read_status()
         except (OSError, http.client.HTTPException, KeyError, TypeError, ValueError) as error:
             problem = f"does not answer ({error or type(error).__name__})"
@@ -82,9 +82,9 @@ class Phyphox:
         self._stopping.set()
         if self._starts:
             with contextlib.suppress(OSError, http.client.HTTPException, ValueError):
-                self.ask("/control?cmd=stop")
+                self.request("/control?cmd=stop")
 
-    def ask(self, path: str) -> dict[str, Any]:
+    def request(self, path: str) -> dict[str, Any]:
         """The answer to a question."""
         connection = http.client.HTTPConnection(self._host, self._port, timeout=TIMEOUT)
         with contextlib.closing(connection):
@@ -120,7 +120,7 @@ class Phyphox:
     def _read_status(self) -> tuple[bool, dict[str, float]]:
         """Whether it measures, and the newest stamp of each sensor."""
         names = {kind: names[0] for kind, names in self._buffers.items()}
-        answer = self.ask("/get?" + "&".join(quote(name) for name in names.values()))
+        answer = self.request("/get?" + "&".join(quote(name) for name in names.values()))
         newest = {kind: answer["buffer"][name]["buffer"] for kind, name in names.items()}
         stamps = {
             kind: float(values[-1] or 0.0) if values else 0.0 for kind, values in newest.items()
@@ -132,14 +132,16 @@ class Phyphox:
         while not self._stopping.wait(EVERY):
             try:
                 if not is_started:
-                    self.ask("/control?cmd=start")
+                    self.request("/control?cmd=start")
                     is_started = True
                 rows = self._read_rows(inbox)
                 failures = 0
             except (OSError, http.client.HTTPException, KeyError, TypeError, ValueError) as error:
                 failures += 1
                 if failures == MOST_FAILURES:
-                    inbox.tell(f"{self.name} does not answer ({error or type(error).__name__})")
+                    inbox.add_notice(
+                        f"{self.name} does not answer ({error or type(error).__name__})"
+                    )
                 continue
             if rows:
                 inbox.put(rows, 64 * sum(map(len, rows.values())))
@@ -150,7 +152,7 @@ class Phyphox:
         for kind, names in self._buffers.items():
             condition = f"{self._newest[kind]!r}|{names[0]}"
             words += [f"{quote(name)}={quote(condition)}" for name in names]
-        answer, now = self.ask("/get?" + "&".join(words)), time.monotonic()
+        answer, now = self.request("/get?" + "&".join(words)), time.monotonic()
         rows: Rows = {}
         for kind, names in self._buffers.items():
             columns = [answer["buffer"][name]["buffer"] for name in names]
@@ -170,7 +172,7 @@ class Phyphox:
     def _note_pause(self, is_measuring: bool, now: float, inbox: Inbox) -> None:
         if not is_measuring and self._is_running and self._paused_at is None:
             self._paused_at = now
-            inbox.tell(f"{self.name} is paused: press play on the phone")
+            inbox.add_notice(f"{self.name} is paused: press play on the phone")
         elif is_measuring and self._paused_at is not None:
             self._added += now - self._paused_at
             self._paused_at = None

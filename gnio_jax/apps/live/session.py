@@ -208,7 +208,8 @@ def follow(
         if arrival.sample is not None:
             latest, is_silent = time.monotonic(), False
             pose = _push(tracker, arrival.sample, nature, result)
-            result.waiting = "" if result.pose is not None or pose is not None else _rest(tracker)
+            waits = result.pose is None and pose is None
+            result.waiting = _describe_rest(tracker) if waits else ""
         if result.samples == 0 and result.refused >= LINES_BEFORE_A_SAMPLE:
             problem = f"has no sample in its first {LINES_BEFORE_A_SAMPLE} lines"
             raise InputError(nature.name, problem, f"the last of them {result.reasons[1]}")
@@ -225,7 +226,7 @@ def follow(
             seconds = int(now - begin)
             if seconds > spoken and (seconds <= OFTEN or seconds % OFTEN == 0):
                 spoken = seconds
-                say(f"waiting for {_described(result)}")
+                say(f"waiting for {_describe(result)}")
         elif now - latest >= QUIET_SECONDS and not is_silent:
             is_silent = True
             say(f"nothing has come on {nature.name} for {now - latest:.0f} s")
@@ -242,13 +243,13 @@ def _push(tracker: Any, sample: Sample, nature: Nature, result: Followed) -> Pos
     return pose
 
 
-def _rest(tracker: Any) -> str:
+def _describe_rest(tracker: Any) -> str:
     """What a tracker without a pose needs."""
     hindrance = tracker.hindrance
     return f"a rest{f' ({hindrance})' if hindrance else ''}"
 
 
-def _described(result: Followed) -> str:
+def _describe(result: Followed) -> str:
     """What is needed, and how many lines were refused."""
     needed = result.waiting or "the first sample"
     if not result.refused:

@@ -126,11 +126,11 @@ def recording(name: str, stated: Stated) -> Source:
     )
     sequence, notes, warnings = read_imported(Path(name), options)
     rate = stated.imu_rate or 1 / float(np.median(np.diff(sequence.time)))
-    arrivals = played(sequence, stated.speed)
+    arrivals = play(sequence, stated.speed)
     return Source(arrivals, Nature(sequence.name), False, rate, (*warnings, *notes))
 
 
-def played(sequence: Sequence, speed: float) -> Iterator[Arrival]:
+def play(sequence: Sequence, speed: float) -> Iterator[Arrival]:
     """The samples of a recording, `speed` times as fast as they were recorded; 0: as fast as
     possible. Samples that are interpolated across a gap are missing."""
     begin, first, measured = time.monotonic(), float(sequence.time[0]), sequence.imu_valid

@@ -30,7 +30,7 @@ def create_tracker(
     samples are interpolated linearly if the rates differ.
 
     `imu_rate` is the rate of the samples that will come, Hz; None: the network's, until
-    `Tracker.expect` changes it. If samples are further apart than 1.5 of its intervals, some are
+    `Tracker.set_rate` changes it. If samples are further apart than 1.5 of its intervals, some are
     missing between them. Raises `ValueError` for a rest that is shorter than two samples.
     """
     network = Network.of(run.model, run.variables)

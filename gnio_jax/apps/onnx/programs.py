@@ -81,7 +81,7 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
 
     def infer(arrays: Arrays) -> dict[str, Array]:
         prediction = network.apply(network.variables, arrays["window"])
-        prediction = prediction.measured(config.measures)
+        prediction = prediction.with_quantity(config.measures)
         outputs = {"displacement": prediction.displacement, "log_std": prediction.log_std}
         return outputs if prediction.axes is None else {**outputs, "axes": prediction.axes}
 
@@ -127,7 +127,7 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
     read_by_window = {STATE + name: state[STATE + name] for name in _READ_BY_WINDOW}
     interval = {"gyro": float64(n, 3), "accel": float64(n, 3)}
     measured = {"displacement": float64(3), "covariance": float64(3, 3)}
-    network_input = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
+    network_input = jax.ShapeDtypeStruct((1, config.input_samples, config.channels), jnp.float32)
     return [
         Program("network", infer, {"window": network_input}),
         Program(

@@ -237,8 +237,8 @@ def align(
         accel_delay=float(x[DELAY]),
         gyro_residual=robust_std(fit.gyro),
         accel_residual=robust_std(fit.accel),
-        gyro_unexplained=unexplained(fit.gyro, fit.tracker.rate),
-        accel_unexplained=unexplained(fit.accel, fit.tracker.acceleration),
+        gyro_unexplained=unexplained_share(fit.gyro, fit.tracker.rate),
+        accel_unexplained=unexplained_share(fit.accel, fit.tracker.acceleration),
         runner_up=best.unexplained / min(others) if others else 0.0,
         turn_std=fit.turn_std,
         poses=_poses_of_the_imu(fit, finer, track, levelling(up)),
@@ -430,7 +430,9 @@ def _first_guesses(
             u, _, vt = np.linalg.svd(turning.T @ rate)
             u[:, 2] *= np.linalg.det(u @ vt)  # a rotation, no reflection
             rotation = Rotation.from_matrix(u @ vt)
-            guesses.append((unexplained(turning - rotation.apply(rate), turning), lag, rotation))
+            guesses.append(
+                (unexplained_share(turning - rotation.apply(rate), turning), lag, rotation)
+            )
     guesses.sort(key=lambda guess: guess[0])
     return [(lag, rotation) for _, lag, rotation in guesses]
 
@@ -455,8 +457,8 @@ class _Fit(NamedTuple):
     def unexplained(self) -> float:
         """Geometric mean of the shares of both signals' power. For noise of unknown size the fit
         with the smallest mean is the most likely."""
-        turning = unexplained(self.gyro, self.tracker.rate)
-        return float(np.sqrt(turning * unexplained(self.accel, self.tracker.acceleration)))
+        turning = unexplained_share(self.gyro, self.tracker.rate)
+        return float(np.sqrt(turning * unexplained_share(self.accel, self.tracker.acceleration)))
 
 
 def _fit(
@@ -576,15 +578,15 @@ class Problem(NamedTuple):
 
     def residuals(self, change: Float[np.ndarray, " u"]) -> Float[np.ndarray, " r"]:
         x = self.start + change
-        return self._whitened(self.errors(x), x)
+        return self._whiten(self.errors(x), x)
 
     def derivatives(self, change: Float[np.ndarray, " u"]) -> Float[np.ndarray, "r u"]:
         x = self.start + change
-        return self._whitened(self.jacobians(x), np.eye(len(x)))
+        return self._whiten(self.jacobians(x), np.eye(len(x)))
 
-    def _whitened(self, sides: tuple[np.ndarray, np.ndarray], x: np.ndarray) -> np.ndarray:
+    def _whiten(self, sides: tuple[np.ndarray, np.ndarray], x: np.ndarray) -> np.ndarray:
         """Rows of both sides and of the priors, for the errors or their derivatives."""
-        rows = (noise.whitened(side) for noise, side in zip(self.noises, sides, strict=True))
+        rows = (noise.whiten(side) for noise, side in zip(self.noises, sides, strict=True))
         prior = (x[3:15].T / PRIOR_STD).T
         return np.concatenate([*rows, prior, np.diff(x[LAG], 2, axis=0) / LAG_BEND_STD])
 
@@ -604,7 +606,7 @@ class _Noise(NamedTuple):
     spread: Float[np.ndarray, " b"]
     """Standard deviation of each block's mean over `scale`."""
 
-    def whitened(self, values: Float[np.ndarray, "n 3 *u"]) -> Float[np.ndarray, "r *u"]:
+    def whiten(self, values: Float[np.ndarray, "n 3 *u"]) -> Float[np.ndarray, "r *u"]:
         """Errors, or their derivatives, as uncorrelated rows of unit variance."""
         values, ones = values / self.scale, (1,) * (values.ndim - 1)
         mean = np.add.reduceat(values, self.starts) / self.counts.reshape(-1, *ones)
@@ -625,7 +627,7 @@ def upward(tilt: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
     return np.array([*tilt, 1.0]) / np.sqrt(1.0 + tilt @ tilt)
 
 
-def unexplained(error: Float[np.ndarray, "n 3"], signal: Float[np.ndarray, "n 3"]) -> float:
+def unexplained_share(error: Float[np.ndarray, "n 3"], signal: Float[np.ndarray, "n 3"]) -> float:
     """Power of the errors over that of the signal, on the `TRUSTED_SHARE` of the rows with the
     smallest errors."""
     square = (error**2).sum(axis=1)

@@ -106,7 +106,7 @@ class _Signals(NamedTuple):
     good: Bool[np.ndarray, " m"]
     """False near positions that are missing, and where the tracker relocalised."""
 
-    def filtered(self, seconds: float) -> _Signals:
+    def low_pass(self, seconds: float) -> _Signals:
         """The signals with both accelerations passed through a Gaussian filter."""
         inertial, tracked = (
             smooth(acceleration, seconds * RATE) for acceleration in (self.inertial, self.tracked)
@@ -202,7 +202,7 @@ def _constant_lag(signals: _Signals) -> tuple[float, float, float]:
     unexplained share over that of the next best peak."""
     from scipy.signal import find_peaks  # takes half a second to import
 
-    signals = signals.filtered(STEP_FILTER_SECONDS)
+    signals = signals.low_pass(STEP_FILTER_SECONDS)
     stretch = np.floor((signals.grid - signals.grid[0]) / STRETCH_SECONDS).astype(int)
 
     def correlate_at(lag: float) -> tuple[float, float]:
@@ -247,7 +247,7 @@ def _dot_and_cross(inertial: np.ndarray, tracked: np.ndarray) -> tuple[np.ndarra
 def _yaw(signals: _Signals, knots: Float[np.ndarray, " k"], lag: float) -> Float[np.ndarray, " k"]:
     """Yaw (rad) from the device's world to the tracker's about each knot, by the slow horizontal
     accelerations of one and a half stretches to either side."""
-    rows, inertial, tracked = signals.filtered(SLOW_FILTER_SECONDS).overlap_at(lag)
+    rows, inertial, tracked = signals.low_pass(SLOW_FILTER_SECONDS).overlap_at(lag)
     near = np.abs(signals.grid[rows, None] + lag - knots) < 1.5 * STRETCH_SECONDS
     along, across = _dot_and_cross(inertial, tracked)
     observed = near.any(axis=0)  # in a gap of the tracker the yaw is unknown

@@ -122,7 +122,7 @@ def seconds(
     return np.asarray((stamps - start) / float(1 / seconds_of(unit)), dtype=np.float64)
 
 
-def distinct(
+def first_rows(
     stamps: Real[np.ndarray, " n"], source: object, field: str = "time"
 ) -> Int[np.ndarray, " m"]:
     """The first row of each stamp, in their order, for a logger that writes some rows late and some
@@ -169,12 +169,12 @@ def in_order(
 # --- damaged rows, the time of day
 
 
-def few(count: int) -> float:
+def most_damaged_rows(count: int) -> float:
     """Largest number of damaged rows among `count` that are left out."""
     return float(max(min(FEW_ROWS, MOST_SHARE * count), FEW_SHARE * count))
 
 
-def parsed_times(cells: pd.Series) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def parse_times(cells: pd.Series) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Stamps of times of day, and which cells are one: ns since 1970, or since midnight if there is
     no date, in UTC if there is no zone. Examples are 2024-05-03 09:15:02.250, 09:15:02:250,
     15:02.250 and 5/3/2024 9:15:02 AM. A time without a date that is earlier by half a day than the

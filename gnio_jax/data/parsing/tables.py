@@ -20,9 +20,9 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int, Num
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
+from gnio_jax.data.parsing.stamps import first_rows, first_stamp, seconds
 from gnio_jax.data.parsing.text import head_of, is_row, layout_of, open_text, strict_frame
-from gnio_jax.data.parsing.text import shortened as shortened
+from gnio_jax.data.parsing.text import shorten as shorten
 from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, check_increasing
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
@@ -34,13 +34,13 @@ LARGEST_RATIO = 100
 """Largest ratio of the size of a compressed field of HDF5 in memory to that in the file."""
 
 
-def damaged(path: object, problem: str) -> InputError:
+def damage_error(path: object, problem: str) -> InputError:
     """The error for a file whose content cannot be the published one."""
     return InputError(path, problem, "copy it again")
 
 
 @contextmanager
-def parsed_as(path: Path, kind: str) -> Iterator[None]:
+def parsing_as(path: Path, kind: str) -> Iterator[None]:
     """Convert errors of a parser to an `InputError`. Only the parser's own calls belong inside,
     because otherwise our own errors would be reported as damage of the file."""
     try:
@@ -53,8 +53,8 @@ def parsed_as(path: Path, kind: str) -> Iterator[None]:
     except Exception as error:  # a damaged file may cause any other error in a parser
         if path.is_file():
             head_of(path)
-        reason = f"it may be cut short ({shortened(error, 200)})"
-        raise damaged(path, f"cannot be read as {kind}, {reason}") from None
+        reason = f"it may be cut short ({shorten(error, 200)})"
+        raise damage_error(path, f"cannot be read as {kind}, {reason}") from None
 
 
 def _is_odd(cell: object) -> bool:
@@ -79,7 +79,7 @@ class Table(NamedTuple):
     rows: Int[np.ndarray, " n"] | None = None
     """Numbers of the rows among those of the text, from 0; None: all."""
 
-    def renamed(self, names: Iterable[str]) -> Table:
+    def rename(self, names: Iterable[str]) -> Table:
         """The columns of a text under these names, in their order."""
         return self._replace(columns=pd.DataFrame(self.columns).set_axis([*names], axis=1))
 
@@ -135,7 +135,7 @@ class Table(NamedTuple):
         stamps, field = self.stamps(name), name if isinstance(name, str) else "time"
         first = first_stamp(stamps, unit, self.path, field)
         start = first if start is None else start
-        rows = distinct(stamps, self.path, field) if repeats == "dropped" else slice(None)
+        rows = first_rows(stamps, self.path, field) if repeats == "dropped" else slice(None)
         time = seconds(stamps[rows], start, unit)
         if repeats == "refused":
             check_increasing(time, self.path, self.row)
@@ -174,7 +174,7 @@ class Table(NamedTuple):
 
     def _column(self, name: Any) -> Any:
         if name not in self.columns:
-            names = shortened(", ".join(str(column) for column in self.columns), 600)
+            names = shorten(", ".join(str(column) for column in self.columns), 600)
             raise InputError(self.path, f"{self.kind} '{name}' is missing", f"found: {names}")
         column = self.columns[name]
         if isinstance(column, pd.DataFrame):
@@ -194,14 +194,14 @@ class Table(NamedTuple):
                 cells = pd.to_numeric(column.where(~column.map(_is_odd), "").astype(str), "coerce")
                 bad = ~np.isfinite(pd.Series(cells, dtype=np.float64).to_numpy())
                 row = int(np.argmax(bad & column.notna().to_numpy()))
-                cell = f"'{shortened(column.iloc[row])}' in its row {self.row(row)}"
+                cell = f"'{shorten(column.iloc[row])}' in its row {self.row(row)}"
                 raise InputError(self.path, f"{what} holds {cell}, no number") from None
         if column.dtype.kind not in "fiu":
-            raise damaged(self.path, f"{what} holds {column.dtype}, expected numbers")
+            raise damage_error(self.path, f"{what} holds {column.dtype}, expected numbers")
         rows = np.shape(next(iter(self.columns.values())))[:1] or (0,)
         if column.shape != rows + axes or rows[0] < 2:
             expected = rows + axes if rows[0] >= 2 else f"at least two rows of {axes or 'numbers'}"
-            raise damaged(self.path, f"{what} has shape {column.shape}, expected {expected}")
+            raise damage_error(self.path, f"{what} has shape {column.shape}, expected {expected}")
         return column.astype(np.float64)
 
 
@@ -214,7 +214,7 @@ def text_of(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise damaged(path, f"is no text ({shortened(error)})") from None
+        raise damage_error(path, f"is no text ({shorten(error)})") from None
 
 
 def read_text(
@@ -245,7 +245,7 @@ def read_text(
     subheaders = (layout.separator.join(cells) for cells in layout.subheaders)
     words = [line for line in (*layout.preamble, *subheaders) if is_row(line)]
     if header and words:
-        problem = f"has a line with '{shortened(words[0], 60)}' above its rows of {layout.width}"
+        problem = f"has a line with '{shorten(words[0], 60)}' above its rows of {layout.width}"
         raise InputError(path, f"{problem} numbers", "gnio data import reads such a table")
     if header and layout.labels:
         frame.columns = list(layout.labels)
@@ -265,7 +265,7 @@ def hdf5_node(group: h5py.Group, name: str, path: Path) -> Any:
         if not isinstance(node, h5py.Group):
             return None
         if isinstance(node.get(part, getlink=True), h5py.ExternalLink | h5py.SoftLink):
-            raise damaged(path, f"field '{name}' is a link")
+            raise damage_error(path, f"field '{name}' is a link")
         node = node.get(part)
     return node
 
@@ -286,7 +286,7 @@ def hdf5_field(group: h5py.Group, name: str, path: Path) -> np.ndarray | None:
     size = max(node.nbytes, chunk)
     if node.external or node.is_virtual or size > most:
         problem = f"would take {size} bytes, which the file does not hold"
-        raise damaged(path, f"field '{name}' {problem}")
+        raise damage_error(path, f"field '{name}' {problem}")
     return np.asarray(node)
 
 
@@ -294,25 +294,25 @@ def read_hdf5_fields(path: Path, names: Iterable[str]) -> Table:
     """The fields `names` (at any depth, "group/field") that exist in an HDF5 file."""
     import h5py
 
-    with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
+    with parsing_as(path, "HDF5"), h5py.File(path, "r") as file:
         fields = {name: hdf5_field(file, name, path) for name in names}
     return Table(path, {n: values for n, values in fields.items() if values is not None}, "field")
 
 
 def read_npz(path: Path) -> Table:
     """The arrays of an npz."""
-    with parsed_as(path, "npz"), np.load(path, allow_pickle=False) as file:
+    with parsing_as(path, "npz"), np.load(path, allow_pickle=False) as file:
         return Table(path, dict(file), "field")
 
 
 def read_npy(path: Path, names: Mapping[str, slice], width: int) -> Table:
     """The fields, by name, of the table (N, `width`) of floats in an npy; one column is (N,)."""
-    with parsed_as(path, "a NumPy array"):
+    with parsing_as(path, "a NumPy array"):
         # The file is mapped, because a damaged header may state more rows than fit into memory.
         table = np.load(path, mmap_mode="r", allow_pickle=False)
     if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
         problem = f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})"
-        raise damaged(path, problem)
+        raise damage_error(path, problem)
     fields = {name: np.asarray(table[:, columns]) for name, columns in names.items()}
     fields = {n: field[:, 0] if field.shape[1] == 1 else field for n, field in fields.items()}
     return Table(path, fields, "field")
@@ -325,7 +325,7 @@ def read_feather(path: Path) -> Table:
 
     if not path.exists():
         raise InputError(path, "no such file")
-    with parsed_as(path, "feather"):
+    with parsing_as(path, "feather"):
         # The metadata of pandas about its index are not needed here.
         return Table(path, feather.read_table(str(path)).to_pandas(ignore_metadata=True))
 
@@ -337,7 +337,7 @@ def json_object(path: Path, remedy: str = "copy it again") -> dict[str, Any]:
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", remedy) from None
     except (ValueError, RecursionError) as error:
-        raise damaged(path, f"is no JSON ({shortened(error, 200)})") from None
+        raise damage_error(path, f"is no JSON ({shorten(error, 200)})") from None
     if not isinstance(content, dict):
-        raise damaged(path, "is no JSON object")
+        raise damage_error(path, "is no JSON object")
     return content

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Int
 
-from gnio_jax.data.parsing.stamps import few, parsed_times
+from gnio_jax.data.parsing.stamps import most_damaged_rows, parse_times
 from gnio_jax.errors import InputError
 
 HEAD, FIRST_LINES, PUBLISHED_LINES = 1 << 17, 400, 20
@@ -57,7 +57,7 @@ class Layout(NamedTuple):
     """Other lines above the rows that are not blank."""
 
 
-def shortened(text: object, most: int = 80) -> str:
+def shorten(text: object, most: int = 80) -> str:
     """A text from a file in a form that a message can quote: one line of at most `most` printable
     characters."""
     words = " ".join(str(text).strip()[: 4 * most].split())
@@ -204,7 +204,7 @@ def _score(rows: list[list[str]]) -> tuple[int, list[int]]:
 # --- from the shape to columns
 
 
-def _parsed(path: Path, layout: Layout, content: bytes | None) -> pd.DataFrame:
+def _parse(path: Path, layout: Layout, content: bytes | None) -> pd.DataFrame:
     try:
         return pd.read_csv(
             path if content is None else io.BytesIO(content),
@@ -227,11 +227,11 @@ def strict_frame(path: Path, layout: Layout, content: bytes | None = None) -> pd
     """The rows of a table. Raises `InputError` naming a row with another number of cells."""
     problem = "is no table of text"
     try:
-        frame = _parsed(path, layout, content)
+        frame = _parse(path, layout, content)
         if frame.shape[1] == (layout.width or frame.shape[1]):
             return frame
     except (UnicodeDecodeError, pd.errors.ParserError) as error:
-        problem = f"{problem} ({shortened(error, 200)})"
+        problem = f"{problem} ({shorten(error, 200)})"
     for number, cells in rows_of(path, layout, content):
         if len(cells) != layout.width:
             problem = f"row {number} has {len(cells)} cells, expected {layout.width}"
@@ -247,7 +247,7 @@ def tolerant_frame(
     datetime64 in ns, others remain as they are. Raises `InputError` if more are damaged."""
     frame, is_mixed, width = None, False, layout.width
     with contextlib.suppress(UnicodeDecodeError, pd.errors.ParserError):
-        frame = _parsed(path, layout, content)
+        frame = _parse(path, layout, content)
     if frame is not None and frame.iloc[:, -1].isna().any():  # the parser fills short rows
         text = path.read_bytes() if content is None else content
         count = text.split(b"\n", layout.before)[-1].count(layout.separator.encode())
@@ -268,20 +268,20 @@ def tolerant_frame(
     columns = {index: frame[index] for index in frame}
     for index, column in columns.items():
         if column.dtype.kind == "O":
-            columns[index], valid = _typed(column, damaged, layout.decimal)
+            columns[index], valid = _convert_columns(column, damaged, layout.decimal)
             damaged = damaged | ~valid
     if damaged.any():
         number, cells = next(islice(rows_of(path, layout, content), int(np.argmax(damaged)), None))
         problem = f"row {number} is no row of {width} numbers: it has {len(cells)} cells"
-        problem += f" ('{shortened(layout.separator.join(cells), 40)}')"
-        if is_mixed or damaged.sum() > few(len(damaged)):
+        problem += f" ('{shorten(layout.separator.join(cells), 40)}')"
+        if is_mixed or damaged.sum() > most_damaged_rows(len(damaged)):
             problem += f", as {damaged.sum() - 1} others"
             raise InputError(path, problem, "give a table whose rows have the same columns")
         notes.append(f"{path.name}: {problem}; {damaged.sum()} such rows are left out")
     return pd.DataFrame(columns).loc[~damaged].reset_index(drop=True), np.flatnonzero(~damaged)
 
 
-def _typed(
+def _convert_columns(
     column: pd.Series, damaged: Bool[np.ndarray, " n"], decimal: str
 ) -> tuple[pd.Series, Bool[np.ndarray, " n"]]:
     """A column of cells as numbers or times, if most are that, and which of them are."""
@@ -294,7 +294,7 @@ def _typed(
     valid = numbers.notna().to_numpy()
     if (valid & ~blank & ~damaged).sum() >= least:
         return numbers, valid | blank
-    stamps, valid = parsed_times(text)
+    stamps, valid = parse_times(text)
     if (valid & ~blank & ~damaged).sum() >= least:
         return pd.Series(stamps.astype("datetime64[ns]")), valid
     return column, np.ones(len(column), dtype=bool)

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
-from gnio_jax.data.parsing.tables import damaged, read_hdf5_fields, read_text
+from gnio_jax.data.parsing.tables import damage_error, read_hdf5_fields, read_text
 from gnio_jax.data.splits import read_list
 from gnio_jax.data.validation import FASTEST, check_unit_norm
 from gnio_jax.files import file_in
@@ -95,9 +95,9 @@ def _velocity(
     stamps, velocity = table.take(0), table.take(8, 9, 10)
     if len(stamps) != len(time) or np.abs(stamps - start - time).max() > 1e-3:
         rows = f"{len(stamps)} and {len(time)} rows"
-        raise damaged(path, f"field 'ts' is not that of {_TABLE} beside it ({rows})")
+        raise damage_error(path, f"field 'ts' is not that of {_TABLE} beside it ({rows})")
     if np.abs(velocity).max() > FASTEST:
-        raise damaged(path, f"field 'velocity' is beyond {FASTEST:g} m/s")
+        raise damage_error(path, f"field 'velocity' is beyond {FASTEST:g} m/s")
     return velocity
 
 

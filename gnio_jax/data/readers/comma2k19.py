@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
-from gnio_jax.data.parsing.tables import damaged, parsed_as
+from gnio_jax.data.parsing.tables import damage_error, parsing_as
 from gnio_jax.data.splits import draw_share
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
@@ -98,10 +98,12 @@ def read(minute: Path) -> list[Sequence]:
     radius = np.linalg.norm(position, axis=1)
     if not ((radius > RADII[0]) & (radius < RADII[1])).all():
         problem = "field 'positions' is not near the earth's surface"
-        raise damaged(pose / "frame_positions", problem)
+        raise damage_error(pose / "frame_positions", problem)
     size = np.linalg.norm(quaternion, axis=1)
     if not (np.abs(size - 1) < 0.01).all():
-        raise damaged(pose / "frame_orientations", "holds quaternions that are not of length 1")
+        raise damage_error(
+            pose / "frame_orientations", "holds quaternions that are not of length 1"
+        )
     level = level_axes(position[0])
     start = min(sensors[0][0][0], sensors[1][0][0])
     poses = Poses(
@@ -140,22 +142,24 @@ def _array(path: Path, width: int | None = None) -> np.ndarray:
     """The numbers of a NumPy file without a suffix: (n,), or (n, width)."""
     if not path.is_file():
         raise InputError(path, "no such file", f"expected layout: {DATASET.layout}")
-    with parsed_as(path, "a NumPy array"):
+    with parsing_as(path, "a NumPy array"):
         values = np.load(path, mmap_mode="r", allow_pickle=False)
     shape = values.shape[:1] if width is None else (*values.shape[:1], width)
     if values.dtype.kind != "f" or values.shape != shape or len(values) < 2:
         expected = "(n,)" if width is None else f"(n, {width})"
-        raise damaged(path, f"holds {values.dtype} of shape {values.shape}, expected {expected}")
+        raise damage_error(
+            path, f"holds {values.dtype} of shape {values.shape}, expected {expected}"
+        )
     values = np.asarray(values, np.float64)
     if not np.isfinite(values).all():
         row = int(np.argwhere(~np.isfinite(values))[0][0])
-        raise damaged(path, f"row {row} is not finite")
+        raise damage_error(path, f"row {row} is not finite")
     return values
 
 
 def _check_rows(path: Path, values: np.ndarray, time: np.ndarray) -> None:
     if len(values) != len(time):
-        raise damaged(path, f"holds {len(values)} rows, but there are {len(time)} stamps")
+        raise damage_error(path, f"holds {len(values)} rows, but there are {len(time)} stamps")
 
 
 DATASET = Dataset(

@@ -22,9 +22,9 @@ from jaxtyping import Float
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.hdf5 import read_hdf5
-from gnio_jax.data.labels import ACCEL, GYRO, REFERENCE, probable
+from gnio_jax.data.labels import ACCEL, GYRO, REFERENCE, guess_label
 from gnio_jax.data.parsing.stamps import check_seconds, rounded_rate
-from gnio_jax.data.parsing.tables import Table, read_text, shortened
+from gnio_jax.data.parsing.tables import Table, read_text, shorten
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.splits import read_list
 from gnio_jax.data.validation import check_gaps, check_increasing
@@ -166,8 +166,8 @@ def check_columns(
     if missing:
         lacking = ", ".join(f"'{expected[field]}'" for field in missing)
         are = "columns {} are" if len(missing) > 1 else "column {} is"
-        words = " ".join(f"{field}={probable(field, names)}" for field in missing)
-        problem = f"{are.format(lacking)} missing; found: {shortened(', '.join(names), 600)}"
+        words = " ".join(f"{field}={guess_label(field, names)}" for field in missing)
+        problem = f"{are.format(lacking)} missing; found: {shorten(', '.join(names), 600)}"
         raise InputError(path, problem, f"{remedy} {words}")
 
 

@@ -38,7 +38,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
-from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text
+from gnio_jax.data.parsing.tables import Table, damage_error, parsing_as, read_text
 from gnio_jax.data.reference import LONGEST_BRIDGE, SHORTEST_RUN
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_in
@@ -159,7 +159,7 @@ def read_table(path: Path) -> Table:
     used = {STAMP, *GYRO, *ACCEL, *_POSITION, *_QUATERNION, *_VELOCITY}
     pairs = zip(names, table.columns, strict=True)
     labels = [title if title in used else name for title, name in pairs]
-    return table.renamed(labels)
+    return table.rename(labels)
 
 
 def read_reference(mav: Path, start: float | int) -> Poses | None:
@@ -177,7 +177,7 @@ def read_reference(mav: Path, start: float | int) -> Poses | None:
     if velocity is not None:
         present &= finite_rows(velocity)
     if present.sum() < SHORTEST_RUN:
-        raise damaged(path, f"holds {present.sum()} poses")
+        raise damage_error(path, f"holds {present.sum()} poses")
     time = time[present]
     if (usual := float(np.median(np.abs(np.diff(time))))) > LONGEST_BRIDGE:
         problem = f"field 'time' runs at {1 / usual:.3g} Hz, too slow for a reference"
@@ -243,7 +243,7 @@ def moved_to(imu: SensorPose, poses: Poses) -> Poses:
 
 
 def _yaml(path: Path) -> Any:
-    with parsed_as(path, "YAML"):  # tags may raise any error
+    with parsing_as(path, "YAML"):  # tags may raise any error
         # Some exports have OpenCV's header and tag, which are not YAML.
         text = path.read_text(encoding="utf-8")
         return yaml.safe_load(re.sub(r"(?m)^%YAML.*$|!!opencv-matrix", "", text))

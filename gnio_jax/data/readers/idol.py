@@ -31,8 +31,8 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.alignment.body import LONGEST_POSE_LAG, pose_lag
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
-from gnio_jax.data.parsing.stamps import distinct
-from gnio_jax.data.parsing.tables import Table, damaged, json_object, read_feather, shortened
+from gnio_jax.data.parsing.stamps import first_rows
+from gnio_jax.data.parsing.tables import Table, damage_error, json_object, read_feather, shorten
 from gnio_jax.data.reference import LONGEST_BRIDGE
 from gnio_jax.data.splits import draw_share
 from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE, WINDOW_SECONDS
@@ -101,9 +101,9 @@ def find_walks(root: Path, part: str) -> list[RecordingSource]:
                 if (person := entry.get("subjectID")) is None:
                     nameless.append(path)
                 else:
-                    subject = shortened(f"subject{person}")
+                    subject = shorten(f"subject{person}")
                 # Times at which the rig was turned about its axes: start, end, ...
-                attributes = {"calibration": shortened(entry.get("calibration", "unknown"))}
+                attributes = {"calibration": shorten(entry.get("calibration", "unknown"))}
                 attributes |= {"subject": subject, "group": subject}
                 walks.append(
                     RecordingSource(
@@ -133,14 +133,14 @@ def read(path: Path) -> list[Sequence]:
     """
     table = read_feather(path)
     stamps = table.take("timestamp")
-    rows, start = distinct(stamps, path, "timestamp"), float(np.median(stamps))
+    rows, start = first_rows(stamps, path, "timestamp"), float(np.median(stamps))
     time = stamps[rows] - start
     fewest = SHORTEST / float(np.median(np.diff(time)))
     gyro, accel = table.axes("iphoneGyro", "XYZ")[rows], table.axes("iphoneAcc", "XYZ")[rows]
     pull = float(np.median(np.linalg.norm(accel, axis=1)))
     if not 0.5 < pull < 2.0:
         problem = f"columns 'iphoneAcc' have a median length of {pull:.3g}, expected about 1 (G)"
-        raise damaged(path, problem)
+        raise damage_error(path, problem)
     orientation = table.axes("orient", "WXYZ", gaps=True)[rows]
     position = table.axes("processedPos", "XYZ", gaps=True)[rows]
     # Neither a quaternion of zeros nor NaN is an attitude.

@@ -28,7 +28,7 @@ import numpy as np
 
 from gnio_jax.data.assembly import Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
-from gnio_jax.data.parsing.tables import Table, damaged, shortened, text_of
+from gnio_jax.data.parsing.tables import Table, damage_error, shorten, text_of
 from gnio_jax.data.validation import FARTHEST, FEWEST_WAYPOINTS
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
@@ -84,7 +84,7 @@ def read(path: Path) -> list[Sequence]:
         fewest = FEWEST_WAYPOINTS if kind == _WAYPOINT else 2
         if (count := len(table.stamps(kind))) < fewest:
             problem = f"field '{kind}' holds {count}, at least {fewest} are needed"
-            raise Refusal(path, problem) if kind == _WAYPOINT else damaged(path, problem)
+            raise Refusal(path, problem) if kind == _WAYPOINT else damage_error(path, problem)
     start = tables[_GYRO].clock(_GYRO, "ms", repeats="kept")[1]
 
     def samples(kind: str) -> Samples:
@@ -148,8 +148,8 @@ def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
         cells = line.split("\t")
         kind = cells[1] if len(cells) > 1 else ""
         if not kind.startswith("TYPE_"):
-            problem = f"line {number} is '{shortened(line, 40)}', expected time, type and values"
-            raise damaged(path, problem)
+            problem = f"line {number} is '{shorten(line, 40)}', expected time, type and values"
+            raise damage_error(path, problem)
         if kind not in _VALUES:
             continue
         stamps, values = columns[kind]
@@ -160,14 +160,14 @@ def read_lines(path: Path) -> tuple[str, dict[str, Table]]:
                 raise ValueError
         except ValueError:
             problem = f"field '{kind}' is cut short or damaged in line {number}"
-            raise damaged(path, f"{problem} ('{shortened(line, 60)}')") from None
+            raise damage_error(path, f"{problem} ('{shorten(line, 60)}')") from None
         stamps.append(stamp)
         values.append(row)
     tables = {}
     for kind, (stamps, rows) in columns.items():
         values = np.array(rows).reshape(-1, _VALUES[kind])
         if not (np.abs(values) < FARTHEST).all():
-            raise damaged(path, f"field '{kind}' holds NaN, Inf or impossible values")
+            raise damage_error(path, f"field '{kind}' holds NaN, Inf or impossible values")
         fields = {kind: np.array(stamps, dtype=np.int64), "values": values}
         tables[kind] = Table(path, fields, "field")
     return header, tables

@@ -41,7 +41,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.stamps import in_order
-from gnio_jax.data.parsing.tables import damaged, read_npz, shortened, text_of
+from gnio_jax.data.parsing.tables import damage_error, read_npz, shorten, text_of
 from gnio_jax.data.splits import draw_share
 from gnio_jax.data.validation import FASTEST
 from gnio_jax.errors import InputError
@@ -125,7 +125,7 @@ def find_drives(root: Path) -> dict[str, list[Path]]:
     if missing := sorted(slow - drives.keys()):
         remedy = "get the _extract archives, which carry the 100 Hz of the IMU"
         problem = f"{len(missing)} drives are there only as the 10 Hz export (_sync)"
-        problem += f": {shortened(', '.join(missing))}"
+        problem += f": {shorten(', '.join(missing))}"
         if not drives:
             raise InputError(root, problem, remedy)
         warnings.warn(f"{root}: {problem}; left out; {remedy}", stacklevel=3)
@@ -146,10 +146,10 @@ def read_packets(oxts: Path) -> list[Sequence]:
     rows, packets = _packets(oxts / "data")
     stamps = _stamps(times)
     if rows.max() >= len(stamps):
-        raise damaged(times, f"holds {len(stamps)} stamps, but there is a packet {rows.max()}")
+        raise damage_error(times, f"holds {len(stamps)} stamps, but there is a packet {rows.max()}")
     stamped = ~np.isnat(stamps[rows])
     if stamped.sum() < 2:
-        raise damaged(times, f"gives {stamped.sum()} packets a stamp")
+        raise damage_error(times, f"gives {stamped.sum()} packets a stamp")
     stamps, packets = stamps[rows][stamped], packets[stamped]
     start = stamps.min()
     time = (stamps - start).astype(np.int64) * 1e-9
@@ -244,7 +244,7 @@ def _packets(folder: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 
     if absurd.any():
         row, index = np.argwhere(absurd)[0]
         problem = f"field '{_VALUES[index]}' is {table[row, index]:g}"
-        raise damaged(folder / names[row], f"{problem}, expected within ±{_MOST[index]:g}")
+        raise damage_error(folder / names[row], f"{problem}, expected within ±{_MOST[index]:g}")
     return np.array([int(name.removesuffix(".txt")) for name in names]), table
 
 
@@ -255,9 +255,11 @@ def _packet(path: str) -> list[float]:
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
     except ValueError as error:
-        raise damaged(path, f"holds a value that is no number ({shortened(error, 200)})") from None
+        raise damage_error(
+            path, f"holds a value that is no number ({shorten(error, 200)})"
+        ) from None
     if len(values) != len(_VALUES):
-        raise damaged(
+        raise damage_error(
             path, f"holds {len(values)} values, expected {len(_VALUES)}; it may be cut short"
         )
     return values
@@ -273,7 +275,7 @@ def _stamps(path: Path) -> np.ndarray:
                 raise ValueError
             stamps[row] = np.datetime64(line or "NaT", "ns")
         except ValueError:
-            problem = f"line {row + 1} ('{shortened(line)}') is no stamp"
+            problem = f"line {row + 1} ('{shorten(line)}') is no stamp"
             remedy = "stamps look like 2011-09-26 14:02:22.484109563"
             raise InputError(path, problem, remedy) from None
     return stamps

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
-from gnio_jax.data.parsing.tables import damaged, parsed_as
+from gnio_jax.data.parsing.tables import damage_error, parsing_as
 from gnio_jax.data.readers.kitti import LARGEST_JUMP, project
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_in
@@ -85,12 +85,12 @@ def read(drive: Path) -> list[Sequence]:
     stamps, increments = tables.pop("imu-nav")
     time = functools.reduce(np.intersect1d, [of_pose for of_pose, _ in tables.values()])
     if len(time) < 2:
-        raise damaged(drive, "has no stamps that position, velocity and attitude share")
+        raise damage_error(drive, "has no stamps that position, velocity and attitude share")
     geodetic, velocity, angles = (
         values[np.searchsorted(of_pose, time)] for of_pose, values in tables.values()
     )
     if not (np.abs(geodetic[:, :2]) <= LARGEST_ANGLES).all():
-        raise damaged(paths["position"], "field 'Latitude' or 'Longitude' is no angle in rad")
+        raise damage_error(paths["position"], "field 'Latitude' or 'Longitude' is no angle in rad")
     latitude, longitude = np.degrees(geodetic[:, 0]), np.degrees(geodetic[:, 1])
     position = project(latitude, longitude, geodetic[:, 2])
     to_world = TO_EAST_NORTH_UP @ Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()
@@ -122,10 +122,10 @@ def read_zipped(
     names = [STAMP, MODE, *fields]
     if not path.is_file():
         raise InputError(path, "no such file", f"expected layout: {DATASET.layout}")
-    with parsed_as(path, "a zip of one CSV"), zipfile.ZipFile(path) as archive:
+    with parsing_as(path, "a zip of one CSV"), zipfile.ZipFile(path) as archive:
         (member,) = archive.infolist()
         if member.file_size > LARGEST_TABLE:
-            raise damaged(path, f"holds a table of {member.file_size / 2**30:.1f} GiB")
+            raise damage_error(path, f"holds a table of {member.file_size / 2**30:.1f} GiB")
         text = io.TextIOWrapper(archive.open(member), encoding="utf-8")
         header = [name.strip() for name in text.readline().split(",")]
         columns = {name: header.index(name) for name in names if name in header}
@@ -136,7 +136,7 @@ def read_zipped(
     table = table[rows]
     table = table[np.unique(table[:, 0], return_index=True)[1]]
     if len(table) < 2:
-        raise damaged(path, f"holds {len(table)} rows with a stamp and an INS that is aligned")
+        raise damage_error(path, f"holds {len(table)} rows with a stamp and an INS that is aligned")
     return table[:, 0], table[:, 2:]
 
 

@@ -40,7 +40,7 @@ from gnio_jax.data.alignment.body import (
 from gnio_jax.data.alignment.positions import align_positions
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
-from gnio_jax.data.parsing.tables import Table, damaged, read_text, shortened
+from gnio_jax.data.parsing.tables import Table, damage_error, read_text, shorten
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_in
 from gnio_jax.numerics import quaternions
@@ -264,12 +264,12 @@ def _read_lists(walks: list[WalkFiles], name: str, root: Path) -> list[WalkFiles
         text = path.read_text(encoding="utf-8", errors="replace")
         entries = [line.strip().replace("\\", "/") for line in text.splitlines() if line.strip()]
         if not entries:
-            raise damaged(path, "the list is empty")
+            raise damage_error(path, "the list is empty")
         for entry in entries:
             match = re.fullmatch(r"(data\d+)(?:/(?:imu)?(\d+)(?:\.csv)?)?", entry)
             if not match:
-                problem = f"entry '{shortened(entry)}' is neither dataN nor dataN/imuK.csv"
-                raise damaged(path, problem)
+                problem = f"entry '{shorten(entry)}' is neither dataN nor dataN/imuK.csv"
+                raise damage_error(path, problem)
             session = f"{scene}/{match[1]}"
             number = None if match[2] is None else int(match[2])
             matches = [
@@ -388,7 +388,7 @@ def _nexus_events(table: Table) -> Streams:
         rows = np.flatnonzero(kind == number)
         if len(rows) < SHORTEST * RATE:
             problem = f"holds {len(rows)} rows of type {number}, less than {SHORTEST:g} s"
-            raise damaged(table.path, problem)
+            raise damage_error(table.path, problem)
         rows = rows[np.argsort(stamps[rows], kind="stable")]
         time = restore_clock(stamps[rows] / 1e3 - start, table.path)
         sensors.append(Samples(time, values[rows], str(table.path)))
@@ -401,8 +401,8 @@ def _read_table(path: Path, *layouts: list[str]) -> Table:
     named = {len(names): names for names in layouts}
     table = read_text(path, header=False, widths=tuple(named))
     if (rows := len(table.columns[0])) < SHORTEST * RATE:
-        raise damaged(path, f"holds {rows} rows, less than {SHORTEST:g} s")
-    return table.renamed(named[table.width()])
+        raise damage_error(path, f"holds {rows} rows, less than {SHORTEST:g} s")
+    return table.rename(named[table.width()])
 
 
 def _fresh_samples(stamps: np.ndarray, values: np.ndarray, path: Path) -> Samples:
@@ -500,7 +500,7 @@ def _usable_rows(usable: Bool[np.ndarray, " n"], share: float, what: str, path: 
     """The usable rows; raises `InputError` if they are fewer than this share."""
     rows = np.flatnonzero(usable)
     if len(rows) < share * len(usable):
-        raise damaged(path, f"only {len(rows)} of {len(usable)} {what}")
+        raise damage_error(path, f"only {len(rows)} of {len(usable)} {what}")
     return rows
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
-from gnio_jax.data.parsing.tables import damaged, json_object, read_hdf5_fields, shortened
+from gnio_jax.data.parsing.tables import damage_error, json_object, read_hdf5_fields, shorten
 from gnio_jax.data.splits import find_folders, find_list, read_list
 from gnio_jax.data.validation import FASTEST_WALKER, UNIT_NORM_TOLERANCE
 from gnio_jax.files import file_in
@@ -90,7 +90,7 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
     accel = accel * _vector(info, "imu_acce_scale", 3, info_path)
     on_chest = _vector(info, "start_calibration", 4, info_path)
     if abs(np.linalg.norm(on_chest) - 1.0) > UNIT_NORM_TOLERANCE:
-        raise damaged(info_path, "field 'start_calibration' is not a unit quaternion")
+        raise damage_error(info_path, "field 'start_calibration' is not a unit quaternion")
 
     source, error = "game_rv", info.get(_ERRORS["game_rv"])
     if choose:
@@ -105,7 +105,7 @@ def read(folder: Path, choose: bool = False) -> list[Sequence]:
     attributes = {
         "group": folder.name.partition("_")[0],
         "subject": folder.name.partition("_")[0],
-        "device": shortened(info.get("device", "unknown")),
+        "device": shorten(info.get("device", "unknown")),
         "placement": "free",
         "truth": "tango on the chest (positions)",
         "position_of": "chest",
@@ -144,14 +144,14 @@ def _choose_orientation(info: dict[str, Any], has_ekf: bool, path: Path) -> tupl
 def _start_frame(info: dict[str, Any], rows: int, path: Path) -> int:
     start = _vector(info, "start_frame", 1, path)[0] if "start_frame" in info else 0.0
     if not 0 <= start < rows - 1 or start != int(start):
-        raise damaged(path, f"field 'start_frame' is {start:g}, the recording has {rows} rows")
+        raise damage_error(path, f"field 'start_frame' is {start:g}, the recording has {rows} rows")
     return int(start)
 
 
 def _vector(info: dict[str, Any], name: str, length: int, path: Path) -> Float[np.ndarray, "d"]:
     """A field of `length` finite numbers, or of a single one."""
     if info.get(name) is None:
-        raise damaged(path, f"field '{name}' is missing")
+        raise damage_error(path, f"field '{name}' is missing")
     entries = [info[name]] if length == 1 else info[name]
     values = np.empty(0)
     numbers = isinstance(entries, list) and all(type(number) in (int, float) for number in entries)
@@ -160,7 +160,7 @@ def _vector(info: dict[str, Any], name: str, length: int, path: Path) -> Float[n
         values = np.array([float(number) if abs(number) < 1e300 else np.inf for number in entries])
     if values.shape != (length,) or not np.isfinite(values).all():
         what = "is no number" if length == 1 else f"does not hold {length} numbers"
-        raise damaged(path, f"field '{name}' {what}")
+        raise damage_error(path, f"field '{name}' {what}")
     return values
 
 

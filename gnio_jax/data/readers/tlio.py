@@ -15,7 +15,7 @@ from pathlib import Path
 
 from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
-from gnio_jax.data.parsing.tables import json_object, read_npy, shortened
+from gnio_jax.data.parsing.tables import json_object, read_npy, shorten
 from gnio_jax.data.splits import read_list
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_in
@@ -82,12 +82,12 @@ def _columns(path: Path) -> tuple[dict[str, slice], int]:
     for entry in entries:
         match = re.fullmatch(r"\s*(.+?)\s*\((\d{1,4})\)\s*", str(entry))
         if match is None:
-            raise InputError(path, f"field '{field}' has the entry '{shortened(entry)}'", like)
+            raise InputError(path, f"field '{field}' has the entry '{shorten(entry)}'", like)
         columns[match[1]] = slice(start, start + int(match[2]))
         start += int(match[2])
     for name, expected in _WIDTHS.items():
         if name not in columns:
-            names = shortened(", ".join(columns), 600)
+            names = shorten(", ".join(columns), 600)
             raise InputError(path, f"column '{name}' is missing", f"found: {names}")
         width = columns[name].stop - columns[name].start
         if width != expected:

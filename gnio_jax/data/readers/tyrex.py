@@ -42,7 +42,14 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.alignment.body import with_tracker_poses, without_jumps
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
-from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text, shortened, text_of
+from gnio_jax.data.parsing.tables import (
+    Table,
+    damage_error,
+    parsing_as,
+    read_text,
+    shorten,
+    text_of,
+)
 from gnio_jax.data.sensors import MAGNETOMETER
 from gnio_jax.data.splits import find_folders
 from gnio_jax.errors import InputError
@@ -231,7 +238,7 @@ def _boot_time(path: Path) -> float:
     """Time of the beginning of an iPhone's record, s since boot."""
     match = re.search(r"BootTime\s*=\s*(\d{1,12}(?:\.\d{1,9})?)", text_of(path))
     if match is None:
-        raise damaged(path, "field 'BootTime' is missing")
+        raise damage_error(path, "field 'BootTime' is missing")
     return float(match[1])
 
 
@@ -244,7 +251,7 @@ def _offset(folder: Path) -> float:
     except ValueError:
         offset = np.nan
     if not abs(offset) <= LONGEST_RECORD:
-        raise damaged(path, f"holds '{shortened(text)}', expected one number of seconds")
+        raise damage_error(path, f"holds '{shorten(text)}', expected one number of seconds")
     return offset
 
 
@@ -258,7 +265,7 @@ def read_track(path: Path, offset: float) -> Poses:
 
     if not path.is_file():
         raise InputError(path, "no such file", f"expected layout: {DATASET.layout}")
-    with parsed_as(path, "MATLAB 5"):
+    with parsing_as(path, "MATLAB 5"):
         content = loadmat(path, simplify_cells=True)
     structs = [value for name, value in content.items() if not name.startswith("__")]
     struct = structs[0] if len(structs) == 1 and isinstance(structs[0], dict) else {}
@@ -268,23 +275,23 @@ def read_track(path: Path, offset: float) -> Poses:
         problem = "field 'RigidBodies' with Positions and Rotations is missing"
         raise InputError(path, problem, "export it from QTM with its one rigid body (6DOF)")
     if not isinstance(rate, int | float) or not 1.0 <= rate <= 1000.0:
-        raise damaged(path, f"field 'FrameRate' is {shortened(rate)} Hz, expected 60")
+        raise damage_error(path, f"field 'FrameRate' is {shorten(rate)} Hz, expected 60")
     table = Table(path, {name: np.asarray(bodies[name]).T for name in widths}, "field")
     position, matrices = (table.take(name, width=w, gaps=True) for name, w in widths.items())
     frames = np.flatnonzero(finite_rows(position) & finite_rows(matrices))
     if len(frames) < 0.5 * len(position):
-        raise damaged(path, f"only {len(frames)} of {len(position)} frames hold a pose")
+        raise damage_error(path, f"only {len(frames)} of {len(position)} frames hold a pose")
     position = position[frames] * 1e-3
     turns = matrices[frames].reshape(-1, 3, 3).transpose(0, 2, 1)  # column by column
     deviation = np.abs(turns.transpose(0, 2, 1) @ turns - np.eye(3)).max(axis=(1, 2))
     bad = ~(deviation <= 1e-3) | ~(np.linalg.det(turns) > 0)
     if bad.any():
         frame = f"first in frame {frames[np.argmax(bad)] + 1}"
-        raise damaged(path, f"field 'Rotations' is no rotation in {bad.sum()} frames, {frame}")
+        raise damage_error(path, f"field 'Rotations' is no rotation in {bad.sum()} frames, {frame}")
     poses = Poses(frames / rate - offset, Rotation.from_matrix(turns), position, noisy=True)
     plausible = without_jumps(poses, FASTEST_TURN, FASTEST)._replace(source=str(path))
     if len(plausible.time) < 0.5 * len(frames):
-        raise damaged(path, f"only {len(plausible.time)} of {len(frames)} poses are plausible")
+        raise damage_error(path, f"only {len(plausible.time)} of {len(frames)} poses are plausible")
     least, most = WIDEST
     if not least <= (span := float(np.ptp(plausible.position, axis=0).max())) <= most:
         problem = f"field 'Positions' spans {span:.3g} m as mm, expected {least:g} to {most:g} m"

@@ -26,19 +26,19 @@ BOMB = "holds a chunk that unpacks to gigabytes; record it anew"
 @pytest.mark.parametrize("name", COMPRESSED)
 def test_what_is_compressed_is_unpacked_up_to_a_bound(tmp_path, name):
     content = b"recording" * 1000
-    assert bags._unpacked(COMPRESSED[name](content), name, tmp_path) == content
+    assert bags._unpack(COMPRESSED[name](content), name, tmp_path) == content
     bomb = COMPRESSED[name](bytes(1 << 27))
     tracemalloc.start()
     try:
         with pytest.raises(InputError, match=BOMB):
-            bags._unpacked(bomb, name, tmp_path)
+            bags._unpack(bomb, name, tmp_path)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     most = bags.SMALL_CHUNK + bags.LARGEST_RATIO * len(bomb)
     assert len(bomb) < 1 << 20 and peak < 2.5 * most
     with pytest.raises(InputError, match="is compressed as 'xz'"):
-        bags._unpacked(content, "xz", tmp_path)
+        bags._unpack(content, "xz", tmp_path)
 
 
 def test_the_bounds_fit_into_the_memory_of_a_phone():
@@ -130,7 +130,7 @@ def test_messages_come_in_the_order_in_which_they_were_logged(tmp_path, monkeypa
     entries = imu(Maker(), seconds=2.0)
     order = np.argsort(np.arange(len(entries)) + np.random.default_rng(0).uniform(0, 40, 200))
     path = bag_files.write_mcap(tmp_path / "walk.mcap", "mcap", [entries[n] for n in order])
-    with bags.opened(path, "mcap") as bag:
+    with bags.open_bag(path, "mcap") as bag:
         times = [time for _, time, _ in bag.messages(["/imu/data"])]
         assert list(bag.messages([])) == []
     assert times == sorted(entry[2] for entry in entries) and len(times) == 200

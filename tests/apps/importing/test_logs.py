@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.apps.importing import units
-from gnio_jax.data.labels import resolved
+from gnio_jax.data.labels import resolve_labels
 from gnio_jax.errors import InputError
 from tests.support.csv_writers import AXES, compare_imu
 from tests.support.importing import import_recording, imported, refused
@@ -288,11 +288,15 @@ def test_a_column_that_is_written_twice_is_one(tmp_path):
 
 
 def test_what_fits_twice_is_not_taken():
-    assert "gyro_x" not in resolved(["time", *(f"imu{n}_gyro_{a}" for n in (0, 1) for a in "xyz")])
+    assert "gyro_x" not in resolve_labels(
+        ["time", *(f"imu{n}_gyro_{a}" for n in (0, 1) for a in "xyz")]
+    )
     labels = ["t", "ACCELEROMETER X (m/s²)", "LINEAR ACCELERATION X (m/s²)", "GRAVITY X (m/s²)"]
     labels += [label.replace(" X ", f" {axis} ") for label in labels[1:] for axis in "YZ"]
-    assert resolved(labels)["accel_x"] == "ACCELEROMETER X (m/s²)"
-    assert "accel_x" not in resolved(["time", *(f"userAcceleration.{axis}" for axis in "xyz")])
+    assert resolve_labels(labels)["accel_x"] == "ACCELEROMETER X (m/s²)"
+    assert "accel_x" not in resolve_labels(
+        ["time", *(f"userAcceleration.{axis}" for axis in "xyz")]
+    )
 
 
 def test_a_sign_and_a_reference_can_be_named(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gnio_jax.apps.live import checks, samples
-from gnio_jax.apps.live.checks import Nature, measured
+from gnio_jax.apps.live.checks import Nature, with_measured_rate
 from gnio_jax.errors import InputError
 from tests.support import known_walk
 from tests.support.checks import unchecked
@@ -18,7 +18,7 @@ WALK = Path(__file__).parents[3] / "examples" / "walk.csv"
 def rate_of(lines, imu_rate=None):
     """What is measured of a stream, whose samples all come through."""
     rates = []
-    stage = measured(of_lines(lines), Nature("udp:5", imu_rate), rates.append)
+    stage = with_measured_rate(of_lines(lines), Nature("udp:5", imu_rate), rates.append)
     assert len(samples_of(stage)) == len(lines)
     return rates[0] if rates else None
 
@@ -44,7 +44,9 @@ def test_a_rate_that_no_imu_has_is_refused(second, problem):
     """Stamps in minutes and days: the first second of a day would be held for a day."""
     taken = []
     lines = (f"{k / 100 / second!r},{STILL}" for k in range(10**6))
-    stage = measured(of_lines(taken.append(0) or line for line in lines), Nature("udp:5"), print)
+    stage = with_measured_rate(
+        of_lines(taken.append(0) or line for line in lines), Nature("udp:5"), print
+    )
     with pytest.raises(InputError, match=rf"udp:5: its samples come at {problem}.*10 to 2000 Hz"):
         with unchecked():
             list(stage)
@@ -53,11 +55,11 @@ def test_a_rate_that_no_imu_has_is_refused(second, problem):
 
 def test_until_the_rate_is_measured_it_says_what_it_waits_for():
     lines = [f"{k / 50},{STILL}" for k in range(100)]
-    stage = list(measured(of_lines(lines), Nature("udp:5"), print))
+    stage = list(with_measured_rate(of_lines(lines), Nature("udp:5"), print))
     waiting = texts_of(stage, "waiting")
     assert len(waiting) == 50 and waiting[30] == "a second of samples: 0.6 s have come"
     lines = [f"{k / 50},0,0,0.1,,," for k in range(700)]
-    waiting = texts_of(measured(of_lines(lines), Nature("udp:5"), print), "waiting")
+    waiting = texts_of(with_measured_rate(of_lines(lines), Nature("udp:5"), print), "waiting")
     assert waiting[-1].startswith("the accelerometer: send the gyro (gyro) and the accel")
     assert len(waiting) == 500  # after ten seconds it is an error of its own
 
@@ -75,7 +77,9 @@ def test_samples_pass_as_they_come():
     """Those of the first second at its end, later ones at once."""
     taken = []
     lines = [f"{k / 50},{STILL}" for k in range(150)]
-    stage = measured(of_lines(taken.append(0) or one for one in lines), Nature("udp:5"), print)
+    stage = with_measured_rate(
+        of_lines(taken.append(0) or one for one in lines), Nature("udp:5"), print
+    )
     counts = [len(taken) for arrival in stage if arrival.sample]
     assert counts == [51] * 51 + list(range(52, 151))
 
@@ -83,7 +87,7 @@ def test_samples_pass_as_they_come():
 def test_wrong_stamps_before_the_first_second_cost_no_memory():
     """The units are checked of the samples that count: here they are apart by 50 days."""
     lines = [f"0,{STILL}", *(f"{4.3e6 + k / 50!r},{STILL}" for k in range(100))]
-    stage = measured(of_lines(lines), Nature("udp:5"), print)
+    stage = with_measured_rate(of_lines(lines), Nature("udp:5"), print)
     assert len(samples_of(stage)) == 101
 
 
@@ -119,7 +123,7 @@ FLIP = np.array([-1.0, 1.0, 1.0])
 )
 def test_sensors_that_contradict_each_other_end_the_stream(change, problem):
     """Nine seconds after its begin, or with the next look at it, as a recording is refused."""
-    stage = measured(of_lines(walk(change)), Nature("udp:5"), print)
+    stage = with_measured_rate(of_lines(walk(change)), Nature("udp:5"), print)
     seen = []
     with pytest.raises(InputError, match=rf"udp:5: .*{problem}"):
         seen += (arrival.sample.time for arrival in stage if arrival.sample)
@@ -140,7 +144,7 @@ def test_a_remedy_names_no_option_that_a_stream_lacks(remedy, wanted):
 
 
 def test_the_walk_as_it_is_passes_without_a_word():
-    assert texts_of(measured(of_lines(walk()), Nature("udp:5"), print)) == []
+    assert texts_of(with_measured_rate(of_lines(walk()), Nature("udp:5"), print)) == []
 
 
 @pytest.mark.parametrize("sign", [None, "android", "ios", "detect"])
@@ -149,7 +153,7 @@ def test_the_sign_of_ios_is_named_or_warned_of(sign, platform):
     """Where it is not stated and gravity reads on −z; detect finds it."""
     negative = -1.0 if platform == "ios" else 1.0
     lines = walk(lambda gyro, accel: (gyro, negative * accel), seconds=3)
-    stage = list(measured(of_lines(lines), Nature("udp:5", None, sign), print))
+    stage = list(with_measured_rate(of_lines(lines), Nature("udp:5", None, sign), print))
     wanted = np.loadtxt(WALK, delimiter=",", skiprows=1)[:300, 4:]
     right = sign == "detect" or (sign or "android") == platform
     found = np.array([sample.accel for sample in samples_of(stage)])
@@ -165,7 +169,7 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_said():
     with pytest.raises(InputError, match=r"udp:5: its gyro looks like deg/s.*state the unit"):
         rate_of(lines)
     parsed = [samples.parse_line(line, samples.Units("deg/s")) for line in lines]
-    found = samples_of(measured(arrivals(parsed), Nature("udp:5"), print))
+    found = samples_of(with_measured_rate(arrivals(parsed), Nature("udp:5"), print))
     np.testing.assert_allclose([s.gyro for s in found], known_walk.rate(time), atol=1e-9)
 
 
@@ -182,7 +186,7 @@ def ride_and_walk():
 
 
 def test_a_ride_is_no_walk_until_there_are_steps():
-    notices = texts_of(measured(of_lines(ride_and_walk()), Nature("udp:5"), print))
+    notices = texts_of(with_measured_rate(of_lines(ride_and_walk()), Nature("udp:5"), print))
     ride, *again = [notice for notice in notices if "steps" in notice]
     assert ride.startswith("warning: no walk: no steps in the last 40 s")
     assert again == ["there are steps again"]
@@ -192,4 +196,4 @@ def test_a_device_at_rest_is_no_ride():
     values = np.random.default_rng(2).normal([0, 0, 0, 0, 0, 9.81], 0.005, (3000, 6))
     rows = np.column_stack([np.arange(3000) / 50, values])
     lines = [",".join(map(repr, row)) for row in rows.tolist()]
-    assert texts_of(measured(of_lines(lines), Nature("udp:5"), print)) == []
+    assert texts_of(with_measured_rate(of_lines(lines), Nature("udp:5"), print)) == []

@@ -259,7 +259,7 @@ class Diverging:
     def __init__(self, first=6):
         self.time, self.first = 0, first
 
-    def expect(self, *_):
+    def set_rate(self, *_):
         pass
 
     def push(self, time, gyro, accel):

@@ -86,7 +86,7 @@ def test_jumps_and_drop_outs_and_repeated_rows_bend_nothing():
     # Of a fit the worst tenth of the rows is not asked.
     error = np.full((100, 3), 0.1)
     error[:9] = 100.0
-    assert body.unexplained(error, np.ones((100, 3))) == pytest.approx(0.01)
+    assert body.unexplained_share(error, np.ones((100, 3))) == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize(
@@ -162,9 +162,9 @@ def test_whitened_errors_have_the_covariance_of_white_noise_with_shared_offsets(
     covariance[:3, :3], covariance[3:, 3:] = scale**2 * blocks[0], scale**2 * blocks[1]
     errors = np.random.default_rng(0).standard_normal((8, 3))
     expected = np.einsum("ik,ij,jk->", errors, np.linalg.inv(covariance), errors)
-    assert (noise.whitened(errors) ** 2).sum() == pytest.approx(expected, rel=1e-12)
+    assert (noise.whiten(errors) ** 2).sum() == pytest.approx(expected, rel=1e-12)
     jacobian = np.random.default_rng(1).standard_normal((8, 3, 2))
-    np.testing.assert_allclose(noise.whitened(jacobian)[:, 1], noise.whitened(jacobian[..., 1]))
+    np.testing.assert_allclose(noise.whiten(jacobian)[:, 1], noise.whiten(jacobian[..., 1]))
 
 
 @pytest.mark.parametrize(("lag", "hz"), [(-0.12, 100), (0.033, 60)])
