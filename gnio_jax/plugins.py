@@ -48,11 +48,13 @@ def load() -> None:
 
 def _import_file(path: Path) -> None:
     if not path.is_file():
-        raise InputError(VARIABLE, f"names {path}, which is no file", "give the path of a .py file")
+        raise InputError(
+            VARIABLE, f"names {path}, which is not a file", "give the path of a .py file"
+        )
     name = f"gnio_jax_plugin_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise InputError(VARIABLE, f"names {path}, which is no Python file")
+        raise InputError(VARIABLE, f"names {path}, which is not a Python file")
     # The types of a class are read from its module.
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     try:

@@ -130,7 +130,7 @@ def _checked_array(name: str, values: Any, count: int | None) -> np.ndarray:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(name, f"is no array of numbers ({error})") from None
+        raise InputError(name, f"is not an array of numbers ({error})") from None
     if count is None and (array.ndim != 1 or len(array) < 2):
         problem = f"has shape {array.shape}, expected (n,): a stamp in s for each sample"
         raise InputError(name, problem)

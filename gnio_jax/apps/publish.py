@@ -50,13 +50,13 @@ def publish(
     """
     if name != file_stem(name):
         remedy = "use letters, digits, '.', '_', '+' and '-'"
-        raise InputError("--name", f"'{name}' is no name of a folder", remedy)
+        raise InputError("--name", f"'{name}' is not the name of a folder", remedy)
     for option, text in (("--data", data), ("--license", license)):
         if not text.strip():
             remedy = "describe it in a sentence, because other people rely on it"
             raise InputError(option, "is empty", remedy)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())) and not has_card(out):
-        raise InputError(out, "is there already and is no published network", "name another --out")
+        raise InputError(out, "exists already and is no published network", "name another --out")
     trained = networks.with_corrector(networks.load(network))
     figures = _read_figures(trained.path)
     card = Card(

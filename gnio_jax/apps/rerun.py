@@ -39,7 +39,7 @@ def check(target: str | Path) -> None:
         return
     path = Path(target)
     if path.suffix.lower() != ".rrd":
-        raise InputError(OPTION, f"'{path}' is no name of Rerun's files", "name it NAME.rrd")
+        raise InputError(OPTION, f"'{path}' is not the name of Rerun's files", "name it NAME.rrd")
     if path.is_dir():
         raise InputError(OPTION, f"'{path}' is a folder", "name a file in it, NAME.rrd")
 

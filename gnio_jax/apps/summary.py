@@ -179,7 +179,7 @@ def _warnings_of_start(ready: PreparedRecording, recording: Imported, ekf: Filte
     conditions = {
         f"gaps: samples are missing{where}, and nothing shows the turn in a gap: trust the shape "
         "of the path before and after it, but not the angle between both parts. The heading and "
-        f"the place behind it are uncertain{counted}": has_holes
+        f"the place after it are uncertain{counted}": has_holes
         or any(GAPS in note for note in recording.notes),
         "gyro: raw, and without a rest that shows its bias: the heading may be lost within a "
         "minute; hold the phone still for some seconds first": ready.start.raw_gyro,

@@ -72,7 +72,7 @@ def choose_networks(run: TrainedNetwork, config: CalibrateConfig) -> tuple[str, 
             raise InputError(f"--split {config.split}", problem, remedy)
         return config.split or val, [FoldNetwork(run, None)]
     if config.split:
-        problem = "is of no use with --out-of-fold, which takes the training split"
+        problem = "has no effect with --out-of-fold, which takes the training split"
         raise InputError(f"--split {config.split}", problem)
     runs = [load_network(folder, config) for folder in config.out_of_fold]
     for folder, fold_run in zip(config.out_of_fold, runs, strict=True):

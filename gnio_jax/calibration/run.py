@@ -150,7 +150,7 @@ def _choose_folder(config: CalibrateConfig, path: Path) -> Path:
     parent = Path("runs") if path.is_file() or has_card(path) else path.resolve().parent
     folder = Path(config.out) if config.out else parent / f"{name_of(path.resolve())}_calibrated"
     if folder.exists():
-        raise InputError(folder, "is there already", "remove it, or give another --out")
+        raise InputError(folder, "exists already", "remove it, or give another --out")
     return folder
 
 

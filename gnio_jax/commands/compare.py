@@ -64,7 +64,7 @@ def _check_out(out: str) -> None:
     path = Path(out)
     if path.name in ("", "..") or path.suffix in ENDINGS or out.endswith(("/", "\\")):
         remedy = "give the name of a file without its ending: runs/both"
-        raise InputError("--out", f"'{out}' is no such name", remedy)
+        raise InputError("--out", f"'{out}' is not such a name", remedy)
     for ending in ENDINGS:
         try:
             check_writable(with_ending(path, ending))

@@ -25,7 +25,7 @@ NETWORKS = {
     "ionet": "a bidirectional LSTM for polar displacements (Chen et al. 2018)",
     "ionext": "convolutions that choose between three sizes of kernel (arXiv 2507.17089)",
     "trunk": "one trunk with four kinds of block, for ideas published without sizes (ours)",
-    "experts": "a ResNet-18 each for low and high speed, behind a router (ours)",
+    "experts": "a ResNet-18 each for low and high speed, chosen by a router (ours)",
     "ridi": "support vectors on features of the window (Yan et al. 2018)",
     "gru": "a gated recurrent unit with memory, the smallest (ours)",
     "state_space": "a state-space network with memory (ours)",

@@ -53,7 +53,9 @@ def import_file(request: ImportFile, _call: options.Call) -> None:
       {prog} ios.csv --accel-sign ios --gyro-unit deg/s --rate 100 --out recordings/ios.h5
     """
     if request.out.suffix.lower() not in HDF5:
-        raise InputError("--out", f"'{request.out}' is no name of an HDF5 file", "name it NAME.h5")
+        raise InputError(
+            "--out", f"'{request.out}' is not the name of an HDF5 file", "name it NAME.h5"
+        )
     from gnio_jax.apps import importing  # late: mistakes do not wait for JAX
     from gnio_jax.data.readers import csv_files
 

@@ -161,7 +161,7 @@ def _stored_sequence(stored: _StoredGroup, path: Path) -> Sequence:
 
 def _plain(key: str, value: object, path: Path) -> str | bool | int | float:
     """An attribute as a text, number or boolean. Raises `InputError` for anything else, and for one
-    of `_NUMBERS` that is no number."""
+    of `_NUMBERS` that is not a number."""
     plain = value.item() if isinstance(value, np.generic) else value
     problem = f"attribute '{key}' is {shorten(ascii(plain))}"
     if not isinstance(plain, str | bool | int | float):

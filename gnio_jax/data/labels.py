@@ -46,7 +46,7 @@ _TAIL = re.compile(
     r"(?<=[xyz])[_ .]?((rad|deg)[/_]?(s|sec|per_?sec)|[cm]?m[/_]?(s|sec)\^?2|m?dps|mps2|m?g)$",
     re.IGNORECASE,
 )
-"""A unit behind the axis, as in gyro_x_dps."""
+"""A unit after the axis, as in gyro_x_dps."""
 _AXIS = r"_?{axis}(_?(axis|cal|value|uncal|data))?"
 _ALIASES = {
     "gyro": (
@@ -85,7 +85,7 @@ _TAGS = {"gyro": r".*(gyr|rotation_?rate)", "accel": r"(?!.*(lin|user|gravity)).
 
 
 def unit_text(label: str) -> str | None:
-    """The text in round or square brackets at the end of a column's header, or a known unit behind
+    """The text in round or square brackets at the end of a column's header, or a known unit after
     the axis; None if there is none."""
     match = _BRACKETS.search(label) or _TAIL.search(label)
     return match[1].strip() if match else None

@@ -78,7 +78,7 @@ class ImuSamples(NamedTuple):
 
 def agreement(imu: ImuSamples, scale: float = 1.0, clock: float = 1.0) -> tuple[float, float]:
     """How well the gyro, times `scale`, on a clock of which a second lasts `clock` s, explains the
-    turning of gravity: (error, contrast), and (inf, 1) if it cannot be told.
+    turning of gravity: (error, contrast), and (inf, 1) if the samples do not show it.
 
     The error is the mean square change of the force turned back relative to that of the force
     itself, the contrast the error of the opposite rotation relative to it.
@@ -231,8 +231,8 @@ def check_alive(values: Float[np.ndarray, "n 3"], name: str, source: object) -> 
 def repeats(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n 3"]
 ) -> tuple[Bool[np.ndarray, " n"], bool]:
-    """Rows that repeat the row before and are no samples, and whether that is because the sensor is
-    slower than its rows; otherwise it hung. A sensor so coarse that equal rows may be measured
+    """Rows that repeat the row before and are not samples, and whether that is because the sensor
+    is slower than its rows; otherwise it hung. A sensor so coarse that equal rows may be measured
     repeats none."""
     same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
     changes = np.diff(values, axis=0)[~same[1:]]

@@ -70,7 +70,9 @@ def check_readings(
     field = f"field '{sensor}'"
     kind = SENSOR_KINDS.get(sensor)
     if kind is None:
-        raise InputError(source, f"{field} is no known sensor", f"known: {', '.join(SENSOR_KINDS)}")
+        raise InputError(
+            source, f"{field} is not a known sensor", f"known: {', '.join(SENSOR_KINDS)}"
+        )
     shape = (len(time), len(kind.columns))
     if time.ndim != 1 or not len(time) or values.shape != shape or std.shape != shape:
         shapes = f"time {time.shape}, values {values.shape} and std {std.shape}"

@@ -194,7 +194,7 @@ def _check(config: EvaluateConfig) -> None:
     for assignment in config.set:
         if not assignment.startswith("filter."):
             remedy = "write filter.FIELD=VALUE, e.g. filter.noise.measurement_scale=1"
-            raise InputError(f"--set {assignment}", "is no setting of the filter", remedy)
+            raise InputError(f"--set {assignment}", "is not a setting of the filter", remedy)
 
 
 def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:

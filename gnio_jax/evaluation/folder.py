@@ -38,7 +38,7 @@ from gnio_jax.files import file_stems, replacing_folder, write_csv
 from gnio_jax.reporting import Progress, silent
 
 PAGE = "report.html"
-REMEDY = "evaluate the run anew with gnio evaluate"
+REMEDY = "evaluate the run again with gnio evaluate"
 SHARED = ("dataset", "split", "data_root", "recordings", "contents", "model", "checkpoint", "step")
 """Settings that evaluations must share to be shown together."""
 

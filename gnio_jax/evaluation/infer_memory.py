@@ -34,7 +34,7 @@ def remembered_displacements(
     """Displacement and covariance over the window that ends with each stride, in the yaw frame of
     the window's start, and the selected diagnostics; float64, NaN where there is none.
 
-    The memory begins anew behind a stride with a sample that was not measured. Each stretch is one
+    The memory begins anew after a stride with a sample that was not measured. Each stretch is one
     run of the network, in the frame of its first attitude.
     """
     assert recording.attitude is not None

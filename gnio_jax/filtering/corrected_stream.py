@@ -1,4 +1,4 @@
-"""Grid samples behind a corrector, block by block while they come."""
+"""Grid samples as a corrector corrects them, block by block while they come."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def explain_failure(history: FilterHistory, config: FilterConfig) -> str:
     cause = describe_failure(mean, variances, config)
     coasted = gaps > config.bridge_seconds
     if coasted.any():
-        cause += f", behind a hole of {gaps.max():.1f} s in the IMU's samples"
+        cause += f", after a hole of {gaps.max():.1f} s in the IMU's samples"
     return cause
 
 

@@ -41,7 +41,7 @@ STRENGTH_RATIO = 1.25
 LARGEST_DIP = np.radians(15.0)
 """Largest difference of the dip from that of the beginning, rad."""
 LEAST_LEVEL = 5.0
-"""Horizontal field below which there is no heading, µT. The earth's is 15 to 40 µT but for the
+"""Horizontal field below which there is no heading, µT. The earth's is 15 to 40 µT except in the
 polar regions."""
 FIELDS = 15.0, 150.0
 """Strengths of which the median of a recording must be, µT: the earth's is 22 to 67 µT, and the
@@ -165,7 +165,7 @@ def fit_field(
         m_t = b + R_tᵀ Rz(J_t β) h,   J_t = ∫ e_zᵀ R dt,
 
     over the first seconds, with the priors b ~ N(0, `IRON_STD`²), |h| ~ N(48, 12²) µT, the earth's,
-    and β ~ N(0, `bias_std`²): gravity shows the attitude R_t but for its yaw, which drifts with the
+    and β ~ N(0, `bias_std`²): gravity shows the attitude R_t except its yaw, which drifts with the
     vertical part of β. Several starts of it are compared, because the yaw is an angle. If the phone
     turns only about the vertical, the vertical part of b is not known, and has no effect.
 

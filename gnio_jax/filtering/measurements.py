@@ -42,7 +42,7 @@ def register(measurement: type) -> None:
     name = getattr(measurement, "name", None)
     parts = isinstance(name, str), hasattr(measurement, "_fields"), hasattr(measurement, "update")
     if not all(parts):
-        problem = "is no NamedTuple with a `name` and a method `update(state, step)`"
+        problem = "is not a NamedTuple with a `name` and a method `update(state, step)`"
         raise InputError(measurement.__name__, problem)
     if name in _PUBLISHED:
         problem = "is a measurement of gnio-jax"

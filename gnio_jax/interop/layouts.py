@@ -78,7 +78,7 @@ def load_state_dict(source: Mapping[str, Any] | str | Path) -> Weights:
     ronin = f"{prefix}output_block.fc.0.weight" in weights
     first = f"{prefix}output_block{'.fc.0' if ronin else '1.fc1'}.weight"
     if first not in weights or len(np.shape(weights[first])) != 2:
-        raise InputError(where, f"'{first}' is missing, or is no matrix", REMEDY)
+        raise InputError(where, f"'{first}' is missing, or is not a matrix", REMEDY)
     features, left_over = divmod(np.shape(weights[first])[1], 128)
     if left_over or not features:
         problem = f"'{first}' must have 128·⌈N/32⌉ columns for windows of N samples"

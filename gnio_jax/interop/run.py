@@ -21,10 +21,10 @@ def write_run(weights: Path, workdir: Path, data: DataConfig, dataset: str = "tl
     `data` gives rate, window and stride that the network was trained with. The filter cuts windows
     as TLIO's tracker does for networks that were trained with it. RoNIN's predicts no uncertainty:
     its σ is 1 m until `gnio calibrate` fits it. Raises `InputError` for weights that do not fit, or
-    a folder that is there already.
+    a folder that exists already.
     """
     if workdir.exists():
-        raise InputError(workdir, "is there already", "name another folder")
+        raise InputError(workdir, "exists already", "name another folder")
     model, variables, features = load_state_dict(weights)
     rotation = "tlio" if model.name == "tlio" else None
     settings = FilterSettings(window_rotation=rotation)

@@ -146,7 +146,7 @@ def check_experiment(model: nn.Module, config: TrainConfig, source: str = "confi
 
 
 def innermost(model: nn.Module) -> nn.Module:
-    """The network inside an equivariant construction or behind a corrector, or the network
+    """The network inside an equivariant construction or after a corrector, or the network
     itself."""
     while isinstance(inner := getattr(model, "network", None), nn.Module):
         model = inner

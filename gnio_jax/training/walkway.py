@@ -5,7 +5,7 @@ with such a gait. With these changes the same gait has another speed, and only s
 turns tell it.
 
 - The moving walkway: the walk goes on a belt that moves with the walker's own slow motion s (the
-  positions behind a zero-phase low-pass), at a share k − 1 of its velocity. The phone moves by
+  positions after a zero-phase low-pass), at a share k − 1 of its velocity. The phone moves by
   (k − 1) s more and measures (k − 1) s̈ more. The gait is the same, and the mean speed is k times
   as large.
 - The gain of the alternating part: what is not slow, in position and acceleration, times a factor.

@@ -122,7 +122,7 @@ def _load_smoother(pose_network: PoseNetwork) -> tuple[float, Predict, filtering
     trained = networks.load(pose_network.name)
     if digest_network(trained) != pose_network.digest:
         raise InputError(
-            pose_network.name, "has changed while it made poses", "begin the training anew"
+            pose_network.name, "has changed while it made poses", "begin the training again"
         )
     network, windows = Network.of(trained.model, trained.variables), trained.config.data
     return windows.rate, network.predict(), filtering.make_filter(windows, trained.config.filter)

@@ -227,7 +227,7 @@ def random_mirror(key: PRNGKeyArray, count: int, share: float) -> Float[jax.Arra
 def mirror_channels(
     mirror: Float[jax.Array, "b 3"], imu: Float[jax.Array, "b n c"]
 ) -> Float[jax.Array, "b n c"]:
-    """Signals behind a mirror (ours). A specific force changes its sign across the mirror, an
+    """Signals of a mirrored walk (ours). A specific force changes its sign across the mirror, an
     angular rate along it, because a rate is an axial vector. The mirrored body has its y axis on
     the other side, so that its axes are right-handed again."""
     axial = mirror * mirror[:, 1:2]

@@ -115,7 +115,7 @@ WRONG = {
     ),
     "accel: has shape (579, 3), expected (580, 3)": lambda t, g, a: (t, g, a[1:]),
     "gyro: has shape (580,), expected (580, 3)": lambda t, g, a: (t, g[:, 0], a),
-    "accel: is no array of numbers": lambda t, g, a: (t, g, [["1", "2", "x"]] * len(t)),
+    "accel: is not an array of numbers": lambda t, g, a: (t, g, [["1", "2", "x"]] * len(t)),
     "time: is NaN or infinite in 1 of 580 rows, the first is row 3": lambda t, g, a: (
         np.where(np.arange(len(t)) == 3, np.nan, t),
         g,

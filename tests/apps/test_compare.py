@@ -230,7 +230,7 @@ def test_figures_of_recordings_that_have_changed_are_refused(runs, tmp_path):
     problem = f"its figures are of other recordings: recording a in {root} has changed since"
     with pytest.raises(InputError) as error:
         compare(*folders)
-    assert str(error.value) == f"{folders[0]}: {problem}; evaluate the run anew with gnio evaluate"
+    assert str(error.value) == f"{folders[0]}: {problem}; evaluate the run again with gnio evaluate"
     shutil.rmtree(root)
     with pytest.raises(InputError) as error:
         compare(*folders)

@@ -138,7 +138,7 @@ def test_a_file_is_a_plugin_too_and_a_broken_one_is_named(registries, tmp_path, 
     broken.write_text("import nowhere_to_be_found", encoding="utf-8")
     for value, words in (
         (f"{file}:{broken}", rf"plugin {broken}: ModuleNotFoundError: .*leave it out of GNIO_PL"),
-        (str(tmp_path / "none.py"), r"GNIO_PLUGINS: names .*none.py, which is no file"),
+        (str(tmp_path / "none.py"), r"GNIO_PLUGINS: names .*none.py, which is not a file"),
     ):
         monkeypatch.setenv("GNIO_PLUGINS", value)
         with pytest.raises(InputError, match=words):

@@ -140,7 +140,7 @@ def test_the_command(run, tmp_path, gnio, mistake):
     (tmp_path / "other" / "README.md").write_text("---\ntitle: mine\n---\n")
     for wrong, words in (
         (["--out", tmp_path / "other"], "is no published network"),
-        (["--name", "a/b"], "no name of a folder"),
+        (["--name", "a/b"], "not the name of a folder"),
         (["--license", " "], "--license: is empty"),
     ):
         assert words in mistake(*given, *wrong)

@@ -671,7 +671,7 @@ def fit_positions_without_covariance(_):
 EXACT_START = changed(TRUE, start={"gyro_bias": 0.0})
 REFUSED = [
     (lambda x: calibrate(x, split="test"), "neither the validation nor the training split"),
-    (lambda x: calibrate(x, out="."), "is there already; remove it, or give another --out"),
+    (lambda x: calibrate(x, out="."), "exists already; remove it, or give another --out"),
     (lambda x: calibrate(x, fit=()), "--fit: names nothing; name some of measurement, noise"),
     (calibrate_again, "is a calibrated run; calibrate the run that it was made from"),
     (
@@ -684,7 +684,7 @@ REFUSED = [
     ),
     (
         lambda x: calibrate(x, out_of_fold=x.folds, split="train"),
-        "--split train: is of no use with --out-of-fold",
+        "--split train: has no effect with --out-of-fold",
     ),
     (compare_with_another_model, "fold0: differs from the calibrated run in 'model'"),
     (

@@ -327,7 +327,10 @@ HEADS = ["--data-root", "heads"]
         (["convert", "tlio", "heads/test_list.txt", *HEADS], "heads/test_list.txt: is a file"),
         (["convert", "tlio", "taken", *HEADS], "taken: holds files of another origin; choose"),
         (["convert", "tlio", "ours", *HEADS], "ours: holds another conversion (dataset tlio, rate"),
-        (["import", "walk.csv", "--out", "x.csv"], "--out: 'x.csv' is no name of an HDF5 file"),
+        (
+            ["import", "walk.csv", "--out", "x.csv"],
+            "--out: 'x.csv' is not the name of an HDF5 file",
+        ),
         (["import", "walk.csv", "--out", "folder.h5"], "--out: must not be a folder, found"),
     ],
 )

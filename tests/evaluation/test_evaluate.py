@@ -251,7 +251,7 @@ def test_options_default_to_those_of_the_run():
 
 def test_mistakes_are_one_line_and_leave_nothing(workdir, command, capsys):
     for arguments, words in (
-        (["--set", "workdir=B"], "--set workdir=B: is no setting of the filter; write"),
+        (["--set", "workdir=B"], "--set workdir=B: is not a setting of the filter; write"),
         (["--orientation", "device"], "leave it out"),
         (["--checkpoint", "latest"], "holds no checkpoint"),
         (["--network", "/"], "holds no network"),

@@ -168,7 +168,7 @@ def test_a_mistake_is_named_in_one_line(inputs, call, message):
     assert "\n" not in str(caught.value)
 
 
-NO_FIGURES = "metrics.json: is not a metrics.json of an evaluation; evaluate the run anew"
+NO_FIGURES = "metrics.json: is not a metrics.json of an evaluation; evaluate the run again"
 DAMAGED = [
     (("sequences", "blind", "reasons"), {"ate": 5}, NO_FIGURES),
     (("sequences", "blind", "group"), None, NO_FIGURES),

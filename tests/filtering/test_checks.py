@@ -217,7 +217,7 @@ def test_the_cause_of_what_is_not_healthy_is_told():
     assert cause(CONFIG) == ""
     assert cause(CONFIG, gyro=put(GYRO, (7, 1), NAN)) == "a value is not finite"
     assert re.fullmatch(too_fast, cause(limited, accel=pushed))
-    behind = rf"{too_fast}, behind a hole of 0\.5 s in the IMU's samples"
+    behind = rf"{too_fast}, after a hole of 0\.5 s in the IMU's samples"
     assert re.fullmatch(behind, cause(limited, accel=pushed, imu_valid=valid))
     held = np.ones(SAMPLES, bool)
     held[60] = False  # the filter holds a sample, which is no hole that it coasts through

@@ -261,7 +261,10 @@ def test_numbers_of_measurements_in_settings():
             parse("filter: {measurements: {height: 1}}")
     finally:
         measurements._MEASUREMENTS.pop("height", None)
-    for name, words in (("zero_velocity", "is a measurement of gnio-jax"), (3, "is no NamedTuple")):
+    for name, words in (
+        ("zero_velocity", "is a measurement of gnio-jax"),
+        (3, "is not a NamedTuple"),
+    ):
         kind = type("Kind", (SteadyHeight,), {"name": name})
         with pytest.raises(InputError, match=words):
             filtering.register(kind)

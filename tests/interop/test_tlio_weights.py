@@ -169,7 +169,7 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     assert make_filter(run.config.data, FilterSettings()).config.window_rotation == "per_sample"
     equal(run.variables, loaded)
     for name, options, problem in (
-        ("run", (), f"{tmp_path / 'run'}: is there already; name another folder"),
+        ("run", (), f"{tmp_path / 'run'}: exists already; name another folder"),
         ("new", ("--rate", "100"), "is for windows of 193 to 224 samples, not 100; give"),
         ("new", ("--stride-seconds", "0.3"), "data.stride_seconds"),
     ):

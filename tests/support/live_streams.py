@@ -44,7 +44,9 @@ def arrivals(samples, clocks=None):
     """As they come from a source; None stands for a line that is none."""
     clocks = itertools.repeat(0.0) if clocks is None else map(float, clocks)
     for sample, clock in zip(samples, clocks, strict=False):
-        yield Arrival(clock, refusal="is no sample") if sample is None else Arrival(clock, sample)
+        yield (
+            Arrival(clock, refusal="is not a sample") if sample is None else Arrival(clock, sample)
+        )
 
 
 def of_lines(lines, clocks=None):

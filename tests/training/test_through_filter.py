@@ -201,7 +201,7 @@ def test_each_seed_has_the_weights_of_the_run(training, start):
 
 
 def test_wild_steps_are_skipped_and_counted(training, start):
-    """A sample that is no number; a reference that jumps, whose gradient is finite and far too
+    """A sample that is not a number; a reference that jumps, whose gradient is finite and far too
     large."""
     training, source = training
     first = int(source.earliest[0])

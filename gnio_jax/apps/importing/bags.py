@@ -113,9 +113,9 @@ def _unpack(data: bytes, compression: str, path: Path) -> bytes:
         case "zstd":
             content = zstandard.ZstdDecompressor().stream_reader(data).read(most + 1)
         case _:
-            raise InputError(path, f"is compressed as '{compression}'", "record it anew")
+            raise InputError(path, f"is compressed as '{compression}'", "record it again")
     if len(content) > most:
-        raise InputError(path, "holds a chunk that unpacks to gigabytes", "record it anew")
+        raise InputError(path, "holds a chunk that unpacks to gigabytes", "record it again")
     return content
 
 
@@ -134,7 +134,7 @@ def _check_tables(path: Path) -> None:
             odd += [f"{table}.{name}" for _, name, *_, hidden in columns if hidden]
     if odd:
         problem = f"holds '{odd[0]}', which no recorder writes"
-        raise InputError(path, problem, "record it anew, or convert it to MCAP")
+        raise InputError(path, problem, "record it again, or convert it to MCAP")
 
 
 # --- the formats

@@ -1,7 +1,8 @@
 """The samples of a sensor on the clock of its logger.
 
 Clocks of boards and phones count samples, wrap, start again, jump, and stamp a packet when it
-arrives. What can be told is repaired and noted, the rest is refused. All limits are ours.
+arrives. What can be recognised is repaired and noted; everything else is refused. All limits are
+ours.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def log_file(
         notes: list[str] = []
         frame, rows = parsing.tolerant_frame(path, layout, content(), notes)
         if words := [line for line in layout.preamble if parsing.is_row(line)]:
-            problem = f"{len(words)} lines above the header are no rows"
+            problem = f"{len(words)} lines above the header are not rows"
             notes.append(f"{path.name}: {problem} ('{parsing.shorten(words[0], 40)}')")
         frame.columns = list(layout.labels or map(str, frame.columns))
         return Table(path, frame, before=layout.before, content=content(), rows=rows), notes

@@ -160,7 +160,7 @@ def _without_repeats(
     rate, gaps = rounded_rate(samples.time), np.diff(samples.time)
     problem = f"{file.name}: {name} repeats the same values in {rows.sum()} of {len(rows)} rows"
     if is_slower and is_rate(rate):
-        raw.notes.append(f"{problem}: they are no samples, and it runs at {rate:g} Hz")
+        raw.notes.append(f"{problem}: they are not samples, and it runs at {rate:g} Hz")
     elif is_slower:
         remedy = f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz"
         raise InputError(file, f"{name} runs at {rate:.3g} Hz without repeated values", remedy)

@@ -253,7 +253,7 @@ def _collect(
     samples = {}
     for topic in imus:
         if not rows[topic]:
-            raise InputError(bag.path, f"topic {topic} has no messages", "record it anew")
+            raise InputError(bag.path, f"topic {topic} has no messages", "record it again")
         headers, logged, *values = (np.array(column) for column in zip(*rows[topic], strict=True))
         samples[topic] = _Imu(first[topic], headers, logged, np.stack(values, axis=1).astype(float))
     return samples, poses, mounts, readings

@@ -87,7 +87,7 @@ class Batches:
                 continue
             self._last = stamp
             sample = sample_of(stamp, rate, force, self._stated)
-            yield sample or "is no sample: its values are beyond the range of an IMU"
+            yield sample or "is not a sample: its values are beyond the range of an IMU"
         for rows in needed:
             del rows[: max(self._before(rows, self._last) - 1, 0)]
 

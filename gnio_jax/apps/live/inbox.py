@@ -1,7 +1,7 @@
 """Messages that wait for the filter, and the readers of standard input and of datagrams.
 
 Threads receive messages from the beginning, so that nothing is lost while the filter is compiled.
-What waits is bounded in number and in bytes. What is lost is counted and told.
+What waits is bounded in number and in bytes. What is lost is counted and reported.
 """
 
 from __future__ import annotations

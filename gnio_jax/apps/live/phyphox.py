@@ -55,7 +55,7 @@ class Phyphox:
     def __init__(self, address: str, name: str):
         host, _, port = address.partition(":")
         if not re.fullmatch(r"[A-Za-z0-9.-]+", host) or not re.fullmatch(r"\d{0,5}", port):
-            raise InputError(name, "is no address", "write phyphox:192.168.0.10:8080")
+            raise InputError(name, "is not an address", "write phyphox:192.168.0.10:8080")
         self.name, self._host, self._port = name, host, int(port or PORT)
         try:
             self._buffers = self._find_buffers(self.request("/config"))

@@ -14,7 +14,7 @@ LONGEST_LINE = 4096
 """Largest number of characters of a sample."""
 MISSING = (math.nan, math.nan, math.nan)
 """Values of a sensor that was not read."""
-NO_SAMPLE = "is no sample: time,gyro x,y,z,accel x,y,z or JSON is wanted"
+NO_SAMPLE = "is not a sample: time,gyro x,y,z,accel x,y,z or JSON is expected"
 Vector = tuple[float, float, float]
 
 
@@ -42,7 +42,7 @@ class Arrival(NamedTuple):
     """Time at which it came by the clock of this machine (`time.monotonic`), s."""
     sample: Sample | None = None
     refusal: str = ""
-    """Why a line, or a row of a message, is no sample."""
+    """Why a line, or a row of a message, is not a sample."""
     notice: str = ""
     """A message for the user."""
     waiting: str = ""
@@ -60,7 +60,7 @@ SI = Units()
 
 
 def parse_line(line: str, stated: Units = SI) -> Sample | None:
-    """The sample of a line with the units `stated`, or None if it is no sample.
+    """The sample of a line with the units `stated`, or None if it is not a sample.
 
     There are two forms. One is seven numbers `time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z`,
     separated by commas, semicolons, tabs or blanks; an empty cell is a missing value. The other is

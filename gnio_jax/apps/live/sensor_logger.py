@@ -26,9 +26,9 @@ from gnio_jax.errors import InputError
 KINDS = {name.lower(): kind for name, (kind, _) in SENSORS.items()}
 HELD_MESSAGES = 3
 """Number of newer messages that wait for a late one (ours)."""
-NO_MESSAGE = "is no message of Sensor Logger: a JSON object with payload is wanted"
+NO_MESSAGE = "is not a message of Sensor Logger: a JSON object with payload is expected"
 
-NO_READING = "is no reading of Sensor Logger: name, time and values x, y, z are wanted"
+NO_READING = "is not a reading of Sensor Logger: name, time and values x, y, z are expected"
 
 
 class SensorLogger:

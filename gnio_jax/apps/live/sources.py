@@ -50,7 +50,7 @@ class Source(NamedTuple):
     arrivals: Iterator[Arrival]
     nature: Nature
     is_live: bool = True
-    """Whether samples come when they are measured, so that the clock of this machine tells of
+    """Whether samples come when they are measured, so that the clock of this machine shows
     gaps, and samples from before the start are of no use."""
     imu_rate: float | None = None
     """Rate of the samples, Hz; None: it is measured, with units and sign."""

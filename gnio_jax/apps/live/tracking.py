@@ -84,6 +84,6 @@ def begins_at_rest(samples: list[Sample], ekf: Filter) -> bool:
     config = dataclasses.replace(ekf.config, dt=float(np.median(np.diff(rows[:, 0]))))
     try:
         state = level_state(dataclasses.replace(ekf, config=config), rows[:, 1:4], rows[:, 4:])
-    except ValueError:  # it shows no gravity, which is told later
+    except ValueError:  # it shows no gravity, which is reported later
         return True
     return float(state.core_covariance[VELOCITY.start, VELOCITY.start]) <= ROUGH_START**2

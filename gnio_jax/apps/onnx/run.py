@@ -83,7 +83,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     package, or a conversion with a large deviation.
     """
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise InputError(out, "is there already", "name another --out, or remove it")
+        raise InputError(out, "exists already", "name another --out, or remove it")
     require_packages("gnio export", "onnx", *PACKAGES)
     run = load(which)
     network = Network.of(run.model, run.variables)

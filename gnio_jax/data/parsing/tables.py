@@ -339,5 +339,5 @@ def json_object(path: Path, remedy: str = "copy it again") -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise damage_error(path, f"is no JSON ({shorten(error, 200)})") from None
     if not isinstance(content, dict):
-        raise damage_error(path, "is no JSON object")
+        raise damage_error(path, "is not a JSON object")
     return content

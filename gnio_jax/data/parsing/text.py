@@ -225,7 +225,7 @@ def _parse(path: Path, layout: Layout, content: bytes | None) -> pd.DataFrame:
 
 def strict_frame(path: Path, layout: Layout, content: bytes | None = None) -> pd.DataFrame:
     """The rows of a table. Raises `InputError` naming a row with another number of cells."""
-    problem = "is no table of text"
+    problem = "is not a table of text"
     try:
         frame = _parse(path, layout, content)
         if frame.shape[1] == (layout.width or frame.shape[1]):
@@ -272,7 +272,7 @@ def tolerant_frame(
             damaged = damaged | ~valid
     if damaged.any():
         number, cells = next(islice(rows_of(path, layout, content), int(np.argmax(damaged)), None))
-        problem = f"row {number} is no row of {width} numbers: it has {len(cells)} cells"
+        problem = f"row {number} is not a row of {width} numbers: it has {len(cells)} cells"
         problem += f" ('{shorten(layout.separator.join(cells), 40)}')"
         if is_mixed or damaged.sum() > most_damaged_rows(len(damaged)):
             problem += f", as {damaged.sum() - 1} others"

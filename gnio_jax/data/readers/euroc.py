@@ -232,7 +232,7 @@ def sensor_pose(path: Path) -> SensorPose:
             raise ValueError(f"its translation is beyond {LONGEST_LEVER:g} m")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         remedy = "it holds cols, rows and data of a 4 × 4 matrix"
-        raise InputError(path, f"field 'T_BS' is no pose ({error})", remedy) from None
+        raise InputError(path, f"field 'T_BS' is not a pose ({error})", remedy) from None
     return SensorPose(Rotation.from_matrix(turn), translation)
 
 

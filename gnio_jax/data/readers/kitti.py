@@ -256,7 +256,7 @@ def _packet(path: str) -> list[float]:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
     except ValueError as error:
         raise damage_error(
-            path, f"holds a value that is no number ({shorten(error, 200)})"
+            path, f"holds a value that is not a number ({shorten(error, 200)})"
         ) from None
     if len(values) != len(_VALUES):
         raise damage_error(
@@ -275,7 +275,7 @@ def _stamps(path: Path) -> np.ndarray:
                 raise ValueError
             stamps[row] = np.datetime64(line or "NaT", "ns")
         except ValueError:
-            problem = f"line {row + 1} ('{shorten(line)}') is no stamp"
+            problem = f"line {row + 1} ('{shorten(line)}') is not a stamp"
             remedy = "stamps look like 2011-09-26 14:02:22.484109563"
             raise InputError(path, problem, remedy) from None
     return stamps

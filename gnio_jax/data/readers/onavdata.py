@@ -90,7 +90,9 @@ def read(drive: Path) -> list[Sequence]:
         values[np.searchsorted(of_pose, time)] for of_pose, values in tables.values()
     )
     if not (np.abs(geodetic[:, :2]) <= LARGEST_ANGLES).all():
-        raise damage_error(paths["position"], "field 'Latitude' or 'Longitude' is no angle in rad")
+        raise damage_error(
+            paths["position"], "field 'Latitude' or 'Longitude' is not an angle in rad"
+        )
     latitude, longitude = np.degrees(geodetic[:, 0]), np.degrees(geodetic[:, 1])
     position = project(latitude, longitude, geodetic[:, 2])
     to_world = TO_EAST_NORTH_UP @ Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()

@@ -159,7 +159,7 @@ def _vector(info: dict[str, Any], name: str, length: int, path: Path) -> Float[n
         # JSON's integers may be of any size.
         values = np.array([float(number) if abs(number) < 1e300 else np.inf for number in entries])
     if values.shape != (length,) or not np.isfinite(values).all():
-        what = "is no number" if length == 1 else f"does not hold {length} numbers"
+        what = "is not a number" if length == 1 else f"does not hold {length} numbers"
         raise damage_error(path, f"field '{name}' {what}")
     return values
 

@@ -287,7 +287,9 @@ def read_track(path: Path, offset: float) -> Poses:
     bad = ~(deviation <= 1e-3) | ~(np.linalg.det(turns) > 0)
     if bad.any():
         frame = f"first in frame {frames[np.argmax(bad)] + 1}"
-        raise damage_error(path, f"field 'Rotations' is no rotation in {bad.sum()} frames, {frame}")
+        raise damage_error(
+            path, f"field 'Rotations' is not a rotation in {bad.sum()} frames, {frame}"
+        )
     poses = Poses(frames / rate - offset, Rotation.from_matrix(turns), position, noisy=True)
     plausible = without_jumps(poses, FASTEST_TURN, FASTEST)._replace(source=str(path))
     if len(plausible.time) < 0.5 * len(frames):

@@ -20,7 +20,7 @@ from tests.support.bag_files import Maker, imu, write
 from tests.support.importing import imported, refused
 
 COMPRESSED = {"bz2": bz2.compress, "lz4": lz4.frame.compress, "zstd": zstandard.compress}
-BOMB = "holds a chunk that unpacks to gigabytes; record it anew"
+BOMB = "holds a chunk that unpacks to gigabytes; record it again"
 
 
 @pytest.mark.parametrize("name", COMPRESSED)
@@ -111,7 +111,7 @@ def test_a_table_that_computes_is_refused(tmp_path, kind, name, change):
     with sqlite3.connect(file) as connection:
         connection.executescript(change)
     connection.close()
-    words = f"holds '{name}', which no recorder writes; record it anew, or convert it to MCAP"
+    words = f"holds '{name}', which no recorder writes; record it again, or convert it to MCAP"
     refused(path, words)
 
 

@@ -224,12 +224,14 @@ def test_rows_of_other_times_are_left_out(tmp_path):
 
 def test_many_damaged_rows_are_refused_by_line_and_cells(tmp_path):
     header, others = rows(table())
-    words = r"walk\.csv: row 3 is no row of 7 numbers: it has 2 cells .'error,x'., as 139 others"
+    words = r"walk\.csv: row 3 is not a row of 7 numbers: it has 2 cells .'error,x'., as 139 others"
     broken = [row for n, r in enumerate(others) for row in ([r] if n % 10 else [r, "error, x"])]
     refused(put(tmp_path, lines(header, *broken)), words)
     # Rows with a position between the sensors are of another kind: their cells are others.
     longer = [row + ",1.0,52.1,4.3" if n in (40, 80) else row for n, row in enumerate(others)]
-    refused(put(tmp_path, lines(header, *longer)), r"row 42 is no row of 7 numbers: it has 10 cel")
+    refused(
+        put(tmp_path, lines(header, *longer)), r"row 42 is not a row of 7 numbers: it has 10 cel"
+    )
 
 
 # --- names
@@ -752,7 +754,7 @@ def test_a_sensor_slower_than_its_rows_runs_at_its_own_rate(tmp_path):
     slow = WALK[ROWS // 5 * 5]
     sequence, notes = import_recording(put(tmp_path, table(values=slow)), gyro_unit="rad/s")
     assert np.median(np.diff(sequence.time)) == pytest.approx(0.05)
-    assert any("they are no samples, and it runs at 20 Hz" in note for note in notes)
+    assert any("they are not samples, and it runs at 20 Hz" in note for note in notes)
     half = np.hstack([WALK[:, :3], WALK[ROWS // 2 * 2, 3:]])
     sequence, notes = import_recording(put(tmp_path, table(values=half)))
     np.testing.assert_allclose(

@@ -43,7 +43,7 @@ def test_a_stream_gives_the_trackers_poses(follow, run, recorded, monkeypatch, t
     lines = ["time,gx,gy,gz,ax,ay,az", *lines[:70], "\udcff\udcfe", lines[69], *lines[70:]]
     told = follow(lines, "--out", out, *shown)
     assert {path.name for path in tmp_path.iterdir()} == {"live.txt", *(["live.rrd"] * bool(shown))}
-    assert "\x1b" not in told and "warning: 3 lines refused, the first: is no sample" in told
+    assert "\x1b" not in told and "warning: 3 lines refused, the first: is not a sample" in told
     # A line a second, the last one repeated at the end.
     assert sum(line.lstrip()[0].isdigit() for line in told.splitlines()) == 6
 
@@ -158,7 +158,7 @@ SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 9]
         ([], ["udp:203.0.113.1:5555"], "udp:203.0.113.1:5555: cannot listen there"),
         ([], ["udp:5555", "--silence", "-1"], "--silence: must be a time to wait"),
         ([], ["http:0.0.0.0"], "http:0.0.0.0: names no port; write 8000"),
-        ([], ["phyphox:"], "phyphox:: is no address"),
+        ([], ["phyphox:"], "phyphox:: is not an address"),
         ([], ["--page", "x"], "--page x: names no port"),
         ([], ["nowhere.csv", "--speed", "-1"], "--speed: must be finite and not negative"),
         ([], ["--rerun", "live.txt"], "--rerun"),

@@ -126,7 +126,7 @@ def test_the_sign_must_be_stated_where_the_system_is_not_known():
 )
 def test_a_message_that_is_none_is_refused(body):
     samples, refusals = read([body])
-    assert samples == [] and len(refusals) == 1 and refusals[0].startswith("is no message")
+    assert samples == [] and len(refusals) == 1 and refusals[0].startswith("is not a message")
 
 
 def test_readings_that_are_none_cost_only_themselves():
@@ -250,8 +250,8 @@ def test_a_pause_on_the_phone_is_a_gap():
 @pytest.mark.parametrize(
     ("address", "problem"),
     [
-        ("", "is no address; write phyphox:192.168.0.10:8080"),
-        ("a/b:1", "is no address"),
+        ("", "is not an address; write phyphox:192.168.0.10:8080"),
+        ("a/b:1", "is not an address"),
         ("127.0.0.1:9", "does not answer .*Allow remote access"),
     ],
 )

@@ -49,7 +49,9 @@ def followed(lines, tracker=None):
 
 
 def test_a_stream_of_nonsense_or_of_one_sensor_ends_with_one_line():
-    with pytest.raises(InputError, match=r"udp:5555: has no sample in its first 100.*is no sample"):
+    with pytest.raises(
+        InputError, match=r"udp:5555: has no sample in its first 100.*is not a sample"
+    ):
         followed(["HTTP/1.1 400"] * 500)
     lines = [f"{k / 100},0,0,0.1,,," for k in range(1200)]
     with pytest.raises(InputError, match=r"udp:5555: has no sample with both sensors in its first"):
@@ -84,7 +86,7 @@ def test_each_second_it_says_what_it_waits_for(monkeypatch):
     assert said[1:10] == [said[0], *[rest] * 8] and len(said) == 11
     _, said = Followed(), []
     follow(Clocked(), of_lines(["noise", *samples]), UDP, Followed(), print, said.append)
-    assert said[-1] == f"{rest}; 1 lines are refused, the newest is no sample"
+    assert said[-1] == f"{rest}; 1 lines are refused, the newest is not a sample"
 
 
 class Walker:
@@ -178,7 +180,7 @@ def test_the_page_says_rest_as_the_filter_means_it(holds):
 
 
 def test_a_filter_that_has_diverged_is_shown_as_such():
-    """Also from its first pose on, and with a state that is no number."""
+    """Also from its first pose on, and with a state that is not a number."""
     result = Followed()
     covariance = np.full((15, 15), np.nan)
     result.add(pose_at(1.0, [np.nan] * 3, healthy=False, covariance=covariance))

@@ -110,7 +110,7 @@ def test_the_filter_is_in_float64_and_every_tensor_is_described(models):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["untrained", "--out", "taken"], "taken: is there already"),
+        (["untrained", "--out", "taken"], "taken: exists already"),
         (["untrained"], "untrained: holds no weights"),
         (None, "gnio export: needs the package jax2onnx; pip install 'gnio-jax[onnx]'"),
     ],

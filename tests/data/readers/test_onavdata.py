@@ -36,7 +36,7 @@ def test_a_drive_comes_back(tmp_path):
         ("position", lambda text: text.replace("Latitude", "Lat"), "'Latitude' is missing"),
         ("velocity", lambda text: text[: len(text) // 2] + "\nx,y\n", "cannot be read as a zip"),
         ("attitude", lambda text: text.replace(",4.0", ",1.0"), "holds 0 rows with a stamp"),
-        ("position", lambda text: text.replace(",0.78", ",45.78"), "is no angle in rad"),
+        ("position", lambda text: text.replace(",0.78", ",45.78"), "is not an angle in rad"),
     ],
 )
 def test_damaged_tables_are_refused(tmp_path, name, change, words):
