@@ -26,6 +26,10 @@ STANDARD_G = 9.80665
 """The unit "G" in which phones report acceleration, m/s²."""
 
 
+KITTI_LENGTHS = tuple(range(100, 900, 100))
+"""Lengths of the pieces of a path over which KITTI's relative errors are taken, m."""
+
+
 class Waypoints(NamedTuple):
     """Known positions at a few moments, instead of a pose at every sample."""
 

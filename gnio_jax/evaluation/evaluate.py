@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from gnio_jax import config as configuration
-from gnio_jax import data
+from gnio_jax import data, models
 from gnio_jax.config import EvaluateConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimate import (
@@ -98,6 +98,10 @@ def evaluate(
         trained = load_latest(path)
     else:
         trained = read_network(path)
+    if _infers(config) and not models.predicts_displacement(trained.model):
+        problem = f"needs displacements, and '{trained.config.model.name}' predicts none"
+        choice = "integrate" if config.estimator == "integrate" else "loose"
+        raise InputError(choice, problem, "evaluate it with the filter's tight coupling")
     config = resolve(config, trained.config)
     windows, ekf = trained.config.data, make_filter(trained.config.data, config.filter)
 

@@ -20,7 +20,7 @@ from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import align_recording, cut_windows, window_starts, without_any
 
 WINDOWS_PER_CALL = 512
-DIAGNOSTICS = ("gate", "scale", "body_velocity", "body_velocity_log_std")
+DIAGNOSTICS = ("gate", "scale", "body_velocity", "body_velocity_log_std", "nonholonomic_log_factor")
 """Diagnostics of the network that are stored for every window. Attention is too large."""
 
 

@@ -179,9 +179,10 @@ def network_measurement(
         oldest: Array | int,
     ) -> tuple[Displacement, dict[str, Array]]:
         def infer() -> Prediction:
-            gyro, accel, gap = latest()
-            prediction = predict_one(network_window(state, oldest, gyro, accel, config))
-            whole = gap is None or jnp.all(gap.used > 0)
+            imu = latest()
+            window = network_window(state, oldest, imu.gyro, imu.accel, config)
+            prediction = predict_one(window)
+            whole = imu.gap is None or jnp.all(imu.gap.used > 0)
             says = prediction.diagnostics
             measured = {name: jnp.where(whole, says[name], jnp.nan) for name in needs}
             if needs:  # they are measured in its place

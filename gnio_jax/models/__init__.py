@@ -8,6 +8,7 @@ from gnio_jax.models.registry import (
     from_config,
     initialise,
     names,
+    predicts_displacement,
     register,
     variable_shapes,
 )
@@ -22,6 +23,7 @@ __all__ = [
     "inference_variables",
     "initialise",
     "names",
+    "predicts_displacement",
     "register",
     "variable_shapes",
 ]

@@ -215,6 +215,43 @@ def test_derivatives_are_finite_at_rest_and_with_the_axis_ahead_upright():
                 assert all(np.isfinite(slope).all() for slope in slopes)
 
 
+def test_a_network_gives_the_factors_of_both_standard_deviations():
+    """Where it says nothing, the constants remain."""
+    gyro = np.random.default_rng(1).normal(size=(N, 3))
+    ekf = filtering.Filter(CONFIG)
+    state = filtering.initial_state(ekf, np.eye(3), np.array([9.0, 0.4, -0.3]), np.zeros(3))
+
+    def updated(constraint, factors=None):
+        says = {} if factors is None else {"nonholonomic_log_factor": jnp.log(jnp.array(factors))}
+        imu = Imu(jnp.asarray(gyro), jnp.zeros((N, 3)), None)
+        step = filtering.Step(imu, 0, 1, CONFIG, NOISE, diagnostics=says)
+        return constraint.update(state, step)[:2]
+
+    wider = MOUNTED._replace(lateral_std=4 * MOUNTED[0], vertical_std=0.5 * MOUNTED[1])
+    for factors, same in (([4.0, 0.5], wider), ([np.nan, 1.0], MOUNTED), ([1.0, 1.0], MOUNTED)):
+        found, expected = updated(MOUNTED, factors), updated(same)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), found, expected)
+    assert abs(updated(wider)[1].nis - updated(MOUNTED)[1].nis) > 0.5
+
+
+def test_the_derivative_by_a_factor_is_finite_at_rest_and_where_there_is_none():
+    ekf = filtering.Filter(CONFIG)
+
+    def loss(log_factor, velocity):
+        state = filtering.initial_state(ekf, jnp.eye(3), velocity, jnp.zeros(3))
+        imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), None)
+        says = {"nonholonomic_log_factor": log_factor}
+        step = filtering.Step(imu, 0, 1, CONFIG, NOISE, diagnostics=says)
+        after, outcome, _ = MOUNTED.update(state, step)
+        return jnp.sum(after.velocity**2) + outcome.volume
+
+    gradient = quick(jax.grad(loss))
+    for velocity in (np.zeros(3), np.array([9.0, 0.02, -0.03])):
+        assert np.isfinite(gradient(jnp.zeros(2), velocity)).all()
+        assert np.abs(gradient(jnp.zeros(2), velocity)).min() > 0
+        np.testing.assert_array_equal(gradient(jnp.array([jnp.nan, 0.0]), velocity), 0.0)
+
+
 def test_it_is_a_measurement_of_the_settings():
     text = "filter: {measurements: {nonholonomic: {pitch: -0.01, lateral_std: 0.5}}}"
     settings = configuration.parse(text, "text")

@@ -320,7 +320,7 @@ def test_the_errors_of_the_starts_do_not_depend_on_the_yaws(training):
 def test_the_error_at_waypoints_is_logged_where_walks_have_them(training, start, monkeypatch):
     training, source = training
     horizons = np.ones(3)
-    found = FilterLosses(1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.09, 1.0, 1.0, True)
+    found = FilterLosses(1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.0, 0.09, 1.0, 1.0, True)
     monkeypatch.setattr(filter_task, "validate", lambda *_, **__: found)
     for tapped in (False, True):
         walks = source._replace(tapped=np.arange(len(source.tapped)) < 7 * tapped)
@@ -455,6 +455,33 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
     assert same(statistics["norm"], theirs["batch_stats"]["norm"])
     assert state.variables.keys() == {"params", "batch_stats"}
     assert (np.asarray(statistics["uncertainty"]["log_factor"]) == 0).all()
+
+
+def test_a_network_without_displacements_is_trained_from_random_weights(recording, tmp_path):
+    """Its factors of the constraint learn, with the constants, the mounting and the lever."""
+    numbers = {"lateral_std": 0.3, "vertical_std": 0.3, "yaw": 0.0, "lever_x": 0.0}
+    run = tmp_path / "run"
+    config = tiny(
+        recording,
+        run,
+        init_from=None,
+        data=DataConfig(rate=50.0, window_seconds=WINDOW, window_rotation="body_axes"),
+        model=ModelConfig(name="ai_imu"),
+        filter=dataclasses.replace(OPTIONS, measurements={"nonholonomic": numbers}),
+        through_filter=dataclasses.replace(THROUGH, learn=("all",), start_spread=0.0),
+    )
+    loop.train(config)
+    first, last = rows(run)
+    assert last["skipped"] == 0 and last["gradient_norm/log_std"] > 0
+    assert last["gradient_norm/filter/measurements.nonholonomic.yaw"] > 0
+    assert last["gradient_norm/filter1"] > 0 and first["gradient_norm/filter2"] > 0
+    assert not {"val_rmse", "val_nis"} & last.keys() and last["val_loss"] > 0
+    trained = checkpoint.load_latest(run)
+    assert np.abs(trained.variables["params"]["log_std"]["kernel"]).max() > 0
+    found = trained.config.filter.measurements["nonholonomic"]
+    assert all(found[name] != number for name, number in numbers.items())
+    with pytest.raises(InputError, match=r"'ai_imu' is trained in the filter's loop alone; name"):
+        loop.train(dataclasses.replace(config, through_filter=ThroughFilter()))
 
 
 def test_mistakes(recording, tmp_path):

@@ -37,7 +37,7 @@ from gnio_jax.filtering.resampler import ACCEL, GYRO
 from gnio_jax.filtering.start import REST_SECONDS
 from gnio_jax.filtering.state import invariant_errors, state_shapes
 from gnio_jax.filtering.tracker import advance_filter
-from gnio_jax.models import Network
+from gnio_jax.models import Network, predicts_displacement
 from gnio_jax.types import Array
 
 STATE, NEXT, POSE = "state.", "next.", "pose."
@@ -81,6 +81,13 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
             problem = "is not measured by an exported filter, which takes displacements"
             remedy = "set it to null: the filter then takes the network's displacement"
             raise InputError(f"filter.measurements.{other.name}", problem, remedy)
+    if config.low_pass_seconds:
+        problem = "is not undone by an exported filter"
+        raise InputError("filter.low_pass_seconds", problem, "set it to 0")
+    model = getattr(network.apply, "model", None)
+    if model is not None and not predicts_displacement(model):
+        problem = "predicts no displacement, and an exported filter takes nothing else"
+        raise InputError("network", problem, "export another network")
     samples = jax.ShapeDtypeStruct((config.reach, 6), jnp.float64)
     inside = functools.partial(invariant_errors, config=config)
     shape = DeployedState(jax.eval_shape(inside, state_shapes(config, noise, jnp.float64)), samples)
