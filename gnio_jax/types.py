@@ -5,7 +5,7 @@ Units are SI (s, rad, m), quaternions are wxyz, the world is z-up with gravity (
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +57,18 @@ class Waypoints(NamedTuple):
         return ""
 
 
+class Readings(NamedTuple):
+    """Readings of a sensor beside the IMU, which has stamps of its own. `data.sensors` has the
+    names of the sensors, the columns of their values, and the units."""
+
+    time: Float[np.ndarray, "f"]
+    """Increasing stamps on the clock of the sequence, s."""
+    values: Float[np.ndarray, "f w"]
+    """One reading in each row. A column that a reading does not have is NaN."""
+    std: Float[np.ndarray, "f w"]
+    """Standard deviations as the sensor states them; NaN where it states none."""
+
+
 class Sequence(NamedTuple):
     """One recording: IMU and reference on one uniform clock. Host arrays in float64.
 
@@ -86,6 +98,8 @@ class Sequence(NamedTuple):
     waypoints: Waypoints | None = None
     """Known positions at a few moments. A recording with no other reference is valid nowhere, and
     functions that need poses refuse it."""
+    readings: dict[str, Readings] = {}
+    """The readings of other sensors by the name of the sensor (`data.sensors`)."""
     attributes: dict[str, Any] = {}
     """The origin: dataset, session, group, subject, device, placement, truth, licence, ...
     (str, float or bool)."""
@@ -118,6 +132,19 @@ class Windows(NamedTuple):
     predicts a velocity for every sample."""
 
 
+Quantity = Literal["displacement", "velocity"]
+"""What a filter can measure of a network: the displacement over its window, or its velocity."""
+
+
+class Velocity(NamedTuple):
+    """The velocity that a network predicts for the end of its window, in metres per window."""
+
+    value: Float[Array, "*b 3"]
+    """In the body."""
+    log_std: Float[Array, "*b 3"]
+    """Logarithm of its standard deviation, per axis of the body."""
+
+
 class Prediction(NamedTuple):
     """The prediction of a network for a window."""
 
@@ -131,6 +158,18 @@ class Prediction(NamedTuple):
     axes: Float[Array, "*b 2"] | None = None
     """Cosine and sine of the angle about z by which the axes of `log_std` are turned; None: they
     are those of `displacement`. With turned axes the covariance is full in the plane."""
+    velocity: Velocity | None = None
+    """The velocity in the body, if the network predicts one."""
+
+    def measured(self, quantity: Quantity) -> Prediction:
+        """The prediction with the measured quantity in the place of its displacement. Raises
+        `ValueError` for a velocity that the network does not predict."""
+        if quantity == "displacement":
+            return self
+        if self.velocity is None:
+            raise ValueError("filter.measures: is velocity, which this network does not predict")
+        value, log_std = self.velocity
+        return self._replace(displacement=value, log_std=log_std, axes=None)
 
     def covariance(self, least: float, dtype: Any) -> Float[jax.Array, "*b 3 3"]:
         """Covariance of `displacement`, m²: A diag(exp 2u) Aᵀ with the axes A, u raised to

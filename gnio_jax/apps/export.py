@@ -7,17 +7,22 @@
   whole trajectory at the first stamp. The schemas are embedded (`ros2msg`), so that no message
   package is needed. Frames by REP 105: `odom`, fixed and z-up, in which the path drifts, and `imu`,
   the recording's body.
+- `geojson` (RFC 7946) and `gpx` (1.1): a line on the map, for a track that a receiver has placed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.data.geodesy import Place, geodetic
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation.trajectory import Trajectory, write_tum
 from gnio_jax.files import replacing
@@ -25,8 +30,12 @@ from gnio_jax.numerics import rotations, turns_between
 
 SUFFIXES = {".tum": "tum", ".txt": "tum", ".csv": "csv", ".mcap": "mcap"}
 FORMATS = tuple(dict.fromkeys(SUFFIXES.values()))
+MAP_FORMATS = ("geojson", "gpx")
+"""Formats of `export_map`."""
 LAST_STAMP = 2.0**31
 """Largest stamp of builtin_interfaces/Time, s."""
+EPOCHS = 1.0e9, 2.2e9
+"""Stamps that are a time from 2001 to 2039, s since 1970."""
 WORLD, BODY = "odom", "imu"
 TOPICS = {
     "/odometry": "nav_msgs/msg/Odometry",
@@ -68,6 +77,53 @@ def export(
             case _:
                 _write_mcap(temporary, poses, None if covariance is None else covariance[finite])
     return len(poses.time)
+
+
+def check_map(formats: Iterable[str]) -> None:
+    """Raise `InputError` for formats of a map, if the recording has no fixes."""
+    for kind in formats:
+        if kind in MAP_FORMATS:
+            problem = f"{kind} needs the place of the start, and no receiver shows it"
+            raise InputError("--format", problem, "switch on the location, or leave the format out")
+
+
+def export_map(path: Path, trajectory: Trajectory, origin: Place) -> None:
+    """Write the path on the map, one point a second, as the suffix says. `origin` is the place of
+    the trajectory's origin, whose axes are east, north and up."""
+    rows = np.flatnonzero(trajectory.known & np.isfinite(trajectory.time))
+    seconds = np.floor(trajectory.time[rows] - trajectory.time[rows[0]] + 1e-6)
+    rows = rows[np.unique(np.append(np.unique(seconds, return_index=True)[1], len(rows) - 1))]
+    places = geodetic(trajectory.position[rows], origin)
+    stamps = [None] * len(rows)
+    if EPOCHS[0] < trajectory.time[rows[0]] < EPOCHS[1]:
+        moments = (datetime.fromtimestamp(s, UTC) for s in trajectory.time[rows].tolist())
+        stamps = [moment.isoformat(timespec="milliseconds")[:23] + "Z" for moment in moments]
+    with replacing(path) as temporary:
+        if path.suffix == ".gpx":
+            _write_gpx(temporary, path.parent.name, places, stamps)
+            return
+        line = [[round(east, 7), round(north, 7), round(up, 2)] for north, east, up in places]
+        properties: dict[str, Any] = {"coordTimes": stamps} if stamps[0] else {}
+        feature = {
+            "type": "Feature",
+            "properties": properties,
+            "geometry": {"type": "LineString", "coordinates": line},
+        }
+        text = json.dumps({"type": "FeatureCollection", "features": [feature]}, indent=1)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _write_gpx(
+    path: Path, name: str, places: Float[np.ndarray, "n 3"], stamps: list[str | None]
+) -> None:
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>']
+    lines += ['<gpx version="1.1" creator="gnio-jax" xmlns="http://www.topografix.com/GPX/1/1">']
+    lines += [f"<trk><name>{escape(name)}</name><trkseg>"]
+    for (latitude, longitude, altitude), stamp in zip(places, stamps, strict=True):
+        time = f"<time>{stamp}</time>" if stamp else ""
+        point = f'<trkpt lat="{latitude:.7f}" lon="{longitude:.7f}"><ele>{altitude:.2f}</ele>'
+        lines += [f"{point}{time}</trkpt>"]
+    path.write_text("\n".join([*lines, "</trkseg></trk></gpx>\n"]), encoding="utf-8")
 
 
 def check(where: object, kind: str, time: Float[np.ndarray, "n"]) -> None:

@@ -57,7 +57,7 @@ def publish(
             raise InputError(option, "is empty", remedy)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())) and not has_card(out):
         raise InputError(out, "is there already and is no published network", "name another --out")
-    trained = networks.load(network)
+    trained = networks.with_corrector(networks.load(network))
     figures = _read_figures(trained.path)
     card = Card(
         name,

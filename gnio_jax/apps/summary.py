@@ -9,8 +9,10 @@ import numpy as np
 
 from gnio_jax.apps.importing import GAPS, Imported
 from gnio_jax.apps.publish import describe_data, describe_error
+from gnio_jax.apps.sensors import SensorUse
 from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.gait import Gait, detect_gait
+from gnio_jax.data.geodesy import Place
 from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, metrics
 from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.filtering import Filter
@@ -75,6 +77,11 @@ class Summary(NamedTuple):
     """What limits the value of the figures, the most important first."""
     notes: tuple[str, ...]
     """Notes about what the import and the start detected, assumed or repaired."""
+    sensors: tuple[SensorUse, ...] = ()
+    """What the other sensors did."""
+    origin: Place | None = None
+    """The place of the start, if the axes of the world are east, north and up; None: they are those
+    of the start."""
 
 
 def summarise(
@@ -84,6 +91,8 @@ def summarise(
     recording: Imported,
     trained: TrainedNetwork,
     ekf: Filter,
+    sensors: tuple[SensorUse, ...] = (),
+    origin: Place | None = None,
 ) -> Summary:
     """The figures of a finished track, up to a divergence if there was one.
 
@@ -94,6 +103,8 @@ def summarise(
         recording: The recording as it was imported, with its notes and warnings.
         trained: The network, for its name, its training data and its measured error.
         ekf: The filter.
+        sensors: What the other sensors did.
+        origin: The place of the start, if a receiver shows it.
     """
     filtered, sequence = estimate.filtered, recording.sequence
     assert filtered is not None
@@ -124,6 +135,8 @@ def summarise(
         errors=errors,
         warnings=(),
         notes=(*recording.notes, *ready.notes),
+        sensors=sensors,
+        origin=origin,
     )
     rate = 1.0 / float(np.median(np.diff(sequence.time)))
     recorded_rate = min(rate, float(sequence.attributes.get(RECORDED_RATE, rate)) or rate)
@@ -131,6 +144,7 @@ def summarise(
         *(note for note in estimate.notes if note not in ready.notes),  # of a divergence
         *_warnings_of_gait(gait, summary.steps),
         *recording.warnings,
+        *(f"{use.sensor}: {use.text}" for use in sensors if use.accepted is None),
         *_warnings(summary, recorded_rate, ekf),
         *_warnings_of_start(ready, recording, ekf),
     )

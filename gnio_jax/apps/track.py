@@ -1,6 +1,6 @@
 """The trajectory of your own recording and its accuracy (`gnio track`).
 
-recording + network → check → prepare → estimate → score → summarise → write
+recording + network → check → prepare → estimate → other sensors → score → summarise → write
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax import config as configuration
-from gnio_jax.apps import export, rerun
+from gnio_jax.apps import export, rerun, sensors
 from gnio_jax.apps.importing import Imported
 from gnio_jax.apps.summary import Summary, summarise
 from gnio_jax.config import TrainConfig
@@ -33,7 +33,7 @@ from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
 from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.models import Network
-from gnio_jax.networks import TrainedNetwork
+from gnio_jax.networks import TrainedNetwork, load_corrector
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.types import Sequence
 
@@ -57,6 +57,7 @@ def track(
     progress: Progress = silent,
     command: str = "",
     rerun_file: Path | None = None,
+    without: tuple[str, ...] = (),
 ) -> Tracked:
     """Track a recording and write trajectory, picture, page and summary into a folder.
 
@@ -71,6 +72,7 @@ def track(
         progress: A function that gets the finished share.
         command: The command line, for the page.
         rerun_file: A file to write for the viewer Rerun.
+        without: Sensors beside the IMU that are not used (`sensors.NAMES`).
 
     Raises:
         InputError: The results could not be written, or the recording is too short or has a hole
@@ -79,10 +81,21 @@ def track(
     out, sequence, config = Path(out), recording.sequence, trained.config
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
+    readings = sensors.usable_readings(sequence, without)
+    if sensors.GNSS not in readings:
+        export.check_map(formats)
     result, ready, ekf = estimate_recording(sequence, trained, progress)
+    uses, origin = (), None
+    if readings:
+        network = Network.of(trained.model, trained.variables)
+
+        def run(ready: PreparedRecording, ekf: Filter) -> SequenceEstimate:
+            return estimate([ready], network, config.data, ekf, 1)[0]
+
+        result, ready, ekf, uses, origin = sensors.fuse(result, ready, ekf, readings, run)
     compared = np.isfinite(result.reference.position).any() or result.waypoints is not None
     errors = metrics.score([result])[result.name].values if compared else {}
-    summary = summarise(result, errors, ready, recording, trained, ekf)
+    summary = summarise(result, errors, ready, recording, trained, ekf, uses, origin)
     with replacing_folder(out) as folder:
         _write_figures(folder, result, summary, formats)
         _draw(folder, result, summary, config, command)
@@ -125,6 +138,7 @@ def estimate_recording(
         init="static",
         gyro_bias="rest",
         from_first=True,
+        corrector=load_corrector(config.filter, config.data.rate, trained),
     )
     if not ready:
         raise InputError(sequence.name, left_out[sequence.name], "record for longer")
@@ -152,8 +166,12 @@ def _write_figures(
 ) -> None:
     """Write the summary and the trajectories, with the stamps of the recording's own clock."""
     plain = summary._asdict() | {"errors": report.finite(summary.errors)}
-    if np.isnan(summary.expected_error):
-        del plain["expected_error"]
+    plain["sensors"] = [use._asdict() for use in summary.sensors]
+    plain["origin"] = summary.origin and summary.origin._asdict()
+    absent = [name for name in ("sensors", "origin") if not plain[name]]
+    absent += ["expected_error"] if np.isnan(summary.expected_error) else []
+    for name in absent:
+        del plain[name]
     text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False)
     (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     path, reference = (
@@ -165,7 +183,10 @@ def _write_figures(
         write_tum(folder / "reference.txt", reference)
     for kind in formats:
         covariance = result.filtered and result.filtered.covariance
-        export.export(folder / f"trajectory.{kind}", path, kind, covariance)
+        if kind not in export.MAP_FORMATS:
+            export.export(folder / f"trajectory.{kind}", path, kind, covariance)
+        elif summary.origin is not None:
+            export.export_map(folder / f"trajectory.{kind}", path, summary.origin)
 
 
 def _draw(
@@ -193,6 +214,7 @@ def _draw(
         "walked": f"{length}, ends {summary.from_start:.1f} m from the start",
         "expected error at the end": "" if np.isnan(error) else f"{error:.1f} m",
         "steps": "" if summary.steps is None else f"{summary.steps:.0%} of the time",
+        **{use.sensor: use.line for use in summary.sensors},
         "network": summary.network,
         "training data": summary.trained_on,
         "measured error": summary.measured,

@@ -97,7 +97,8 @@ def fit_std_factors(
     """Root mean square of error over standard deviation, for each axis, over all windows.
 
     `truths` are the true displacements of the windows, in the yaw frame of the reference at their
-    starts. Those of the network are expressed in the filter's own yaw frame. Raises `ValueError` if
+    starts, or the true velocities in the body. The displacements of the network are expressed in
+    the filter's own yaw frame. Raises `ValueError` if
     too few windows have both.
     """
     errors = []
@@ -292,7 +293,8 @@ def _make_run(
     options = walk.imu_valid, ekf.config.displacement_frame
 
     def run(state: FilterState, displacement: Array) -> FilterHistory:
-        return run_filter(ekf, state, walk.gyro, walk.accel, displacement, covariance, *options)[1]
+        rows = displacement, covariance, *options
+        return run_filter(ekf, state, walk.gyro, walk.accel, *rows, variance=walk.variance)[1]
 
     return run, jnp.asarray(value)
 
@@ -432,7 +434,8 @@ def _run_walks(
         state = start.state(ekf)
         run, displacement = _make_run(walk, ekf)
         history = run(state, displacement)
-        derivatives = sensitivity(run, state, displacement)
+        rotation = history.rotation if ekf.config.measures == "velocity" else None
+        derivatives = sensitivity(run, state, displacement, rotation)
         assert history.covariance is not None
         covariance = history.covariance[:, POSITION, POSITION]
         of_position = covariance, derivatives[:, POSITION]

@@ -15,7 +15,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, estimate, prepare
 from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
-from gnio_jax.networks import TrainedNetwork
+from gnio_jax.networks import TrainedNetwork, load_corrector
 
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
@@ -135,7 +135,9 @@ def predict(
                 sequence for dataset in datasets for sequence in fold_network.fold.select(dataset)
             ]
         with_reference = [sequence for sequence in sequences if sequence.valid.any()]
-        prepared, _ = prepare(with_reference, windows, make_filter(windows, settings))
+        corrector = load_corrector(settings, windows.rate, fold_network.run)
+        ekf = make_filter(windows, settings)
+        prepared, _ = prepare(with_reference, windows, ekf, corrector=corrector)
         if not prepared:
             problem = "has no recording with a reference that is long enough to be fitted"
             raise InputError(subset, problem)

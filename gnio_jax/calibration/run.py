@@ -30,7 +30,13 @@ from gnio_jax.evaluation import Displacements
 from gnio_jax.evaluation.estimate import filter_inputs
 from gnio_jax.files import replacing_folder, write_text
 from gnio_jax.filtering.settings import filter_config
-from gnio_jax.networks import TrainedNetwork, find_network, newest_run, write_network
+from gnio_jax.networks import (
+    TrainedNetwork,
+    find_network,
+    newest_run,
+    with_corrector,
+    write_network,
+)
 from gnio_jax.networks.folder import SPLITS, has_card, name_of
 from gnio_jax.numerics import filled_up
 
@@ -92,7 +98,7 @@ def calibrate(
         raise InputError("--fit", "names nothing", f"name some of {', '.join(GROUPS)}")
     paths = [path for group in dict.fromkeys(config.fit) for path in GROUPS[group]]
     path = find_network(config.network or newest_run())
-    run = load_network(path, config)
+    run = with_corrector(load_network(path, config))
     folder = _choose_folder(config, path)
     split, networks = choose_networks(run, config)
     windows = run.config.data
@@ -102,7 +108,8 @@ def calibrate(
     start_of_fit(uncalibrated, paths)  # finds mistakes before reading data
     recordings, estimates = predict(split, networks, config, uncalibrated, progress, workers)
     try:
-        factors = fit_std_factors(estimates, [recording.displacement for recording in recordings])
+        truths = [recording.truth(uncalibrated.measures) for recording in recordings]
+        factors = fit_std_factors(estimates, truths)
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
     x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as written to the settings

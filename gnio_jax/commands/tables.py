@@ -24,12 +24,14 @@ def tables(request: TablesConfig, _call: options.Call) -> None:
     Every row is trained with the same recordings, batches, epochs, learning rate and augmentation,
     each network with its own published loss, clipping and weight decay. Runs are kept below
     OUT/runs and shared by the tables. If an interrupted command is called again, it continues where
-    it stopped. A finished one only writes its summary again. Results:
+    it stopped. A finished one only writes its summary again. Before comparison trains, it times a
+    few steps of each network and says how long it will take. Results:
     OUT/<table>_<split>_<estimator>.md, .csv and .png.
 
     examples:
       {prog} complexity                              parameters, operations, latency
       {prog} comparison --base quickstart            the networks side by side
+      {prog} comparison --methods all --calibrate    every network, with calibrated filters
       {prog} components --base gnio_oxiod_small --data-root DIR --split sessions_test
       {prog} gates --base ... --epochs 3             gate and scale functions, their gradients
       {prog} bank-size --base ...                    size of the Motion Bank, entropy of attention

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
-from gnio_jax.config.schema import UNNAMED
+from gnio_jax.config.schema import UNNAMED, Words
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_stem
 
@@ -30,8 +30,13 @@ class TrackOptions:
     comes with gnio-jax, else the newest run below runs/."""
     out: Path | None = None
     """Folder for the results; by default tracks/ and the recording's name."""
-    format: tuple[Literal["csv", "mcap"], ...] = ()
-    """Further formats of the trajectory, one or both."""
+    format: tuple[Literal["csv", "mcap", "geojson", "gpx"], ...] = ()
+    """Further formats of the trajectory. geojson and gpx need fixes of a receiver in the
+    recording."""
+    without: Annotated[
+        tuple[Literal["magnetometer", "barometer", "gnss"], ...], Words(repeated=True)
+    ] = ()
+    """A sensor beside the IMU that is not used; may be repeated."""
     rerun: Path | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     recording: Annotated[ImportOptions, UNNAMED] = ImportOptions()  # noqa: RUF009 - it is frozen
@@ -41,13 +46,16 @@ def track(request: TrackOptions, call: options.Call) -> None:
     """Compute the trajectory of a recording and its expected accuracy.
 
     FILE is anything that gnio data import reads, or an HDF5 file that it has written. Stand still
-    for a second at the beginning. The folder OUT gets trajectory.txt (TUM format), track.png,
-    report.html and summary.json. gnio weights lists the networks that are found by name.
+    for a second at the beginning. A magnetometer, a barometer and the fixes of a receiver in FILE
+    are used: for the heading, the height and the place on the map. The folder OUT gets
+    trajectory.txt (TUM format), track.png, report.html and summary.json. gnio weights lists the
+    networks that are found by name.
 
     examples:
       {prog} walk.zip                              of Sensor Logger or phyphox
       {prog} walk.bag --imu-topic /imu --network runs/mine --out tracks/walk
       {prog} walk.csv --accel-sign ios --format csv mcap
+      {prog} walk.zip --without magnetometer --format gpx
       {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
           accel_z=az
     """
@@ -66,7 +74,8 @@ def track(request: TrackOptions, call: options.Call) -> None:
     out = request.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)
-        details = {"command": str(call), "rerun_file": request.rerun}
+        details: dict[str, Any] = {"command": str(call), "rerun_file": request.rerun}
+        details["without"] = request.without
         result = tracking.track(recording, trained, out, request.format, **details)
     summary = result.summary
     first = summary.warnings[:1] if math.isnan(summary.expected_error) else ()
@@ -75,6 +84,9 @@ def track(request: TrackOptions, call: options.Call) -> None:
     for note in summary.notes:
         console.say(f"  {note}")
     console.say(_table(summary))
+    for use in summary.sensors:
+        if use.accepted is not None:
+            console.say(f"{use.sensor}: {use.text}")
     for warning in summary.warnings[len(first) :]:
         console.say(f"warning: {warning}")
     if not first:  # what was measured are whole walks
@@ -107,6 +119,9 @@ def _table(summary: Any) -> Table:
     grid.add_row("time at rest (quieter than a hand)", f"{summary.at_rest:.0%}")
     if summary.accepted is not None:
         grid.add_row("displacements accepted", f"{summary.accepted:.0%}")
+    for use in summary.sensors:
+        share = "left out" if use.accepted is None else f"{use.accepted:.0%} used"
+        grid.add_row(f"{use.sensor}, {use.rows} rows", share)
     for name in [metric for metric in ERRORS if metric in summary.errors]:
         column = tabulate.column(name)
         text = tabulate.number(summary.errors.get(name), column.digits)

@@ -230,6 +230,13 @@ class AugmentConfig:
     """Half-widths of a window's uniform scale errors of gyro and accelerometer (ours)."""
     rest_share: Annotated[Probability, FILE_ONLY] = 0.0
     """Share of the windows that are replaced by windows of a phone at rest (ours)."""
+    mirror_share: Annotated[Share, FILE_ONLY] = 0.0
+    """Share of the windows or segments that are mirrored, so that the left hand carries what the
+    right one carried (ours)."""
+    rocking_share: Annotated[Share, FILE_ONLY] = 0.0
+    """Share of the windows or segments in which the phone rocks otherwise in the hand: its rate of
+    turn about horizontal axes is turned about the vertical by any angle and scaled by a factor from
+    0 to 1.25 (ours)."""
     walkway_share: Annotated[Share, FILE_ONLY] = 0.0
     """Share of the segments that are walked on a moving walkway: the same gait at another speed
     (`training.walkway`; ours)."""
@@ -238,12 +245,21 @@ class AugmentConfig:
     alternating_gain: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
     """Smallest and largest factor of the fast part of position and acceleration, for segments: of
     the gait without the mean motion (ours)."""
+    vertical_gain: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
+    """Smallest and largest further factor of the vertical fast part: how much of the body's bounce
+    reaches the phone (ours)."""
     time_stretch: Annotated[tuple[Factor, Factor], FILE_ONLY] = (1.0, 1.0)
     """Smallest and largest factor of the pace at which a segment is played (ours)."""
 
     def check(self, location: Location) -> None:
         """Check that no range has its ends in the wrong order."""
-        for name in ("low_pass_hertz", "walkway", "alternating_gain", "time_stretch"):
+        for name in (
+            "low_pass_hertz",
+            "walkway",
+            "alternating_gain",
+            "vertical_gain",
+            "time_stretch",
+        ):
             low, high = getattr(self, name)
             if low > high:
                 location.child(name).refuse(
@@ -270,7 +286,8 @@ class ModelConfig:
     all prototypes receive the same attention."""
     head: Literal["gated", "linear", "bins"] | None = None
     """Displacement as scale × gate, or a plain linear layer (gnio: gated, networks with memory:
-    linear), or a distribution over bins with its own uncertainty (gnio, trunk; VeloBins)."""
+    linear), or a distribution over bins with its own uncertainty (gnio, trunk, networks with
+    memory; VeloBins)."""
     reach: Positive | None = None
     """Largest displacement of the bins, m (3). Take 1.1 times the largest of the training
     windows."""
@@ -474,6 +491,9 @@ class ConsideredStd(NamedTuple):
 class FilterOptions:
     """The options of the filter, which are fixed when it is compiled. The defaults are TLIO's."""
 
+    measures: Literal["displacement", "velocity"] = "displacement"
+    """What the filter measures of the network: the displacement over its window, or for a network
+    that predicts one (airio) its velocity in the body at the window's end, in metres per window."""
     mahalanobis_fail_scale: NonNegative = 0.0
     """0 skips a rejected measurement; above 0 it is applied with its covariance multiplied by
     this."""
@@ -535,6 +555,10 @@ class FilterSettings(FilterOptions):
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
     for weights trained that way."""
+    corrector: str | None = None
+    """Network with model.corrector (the folder of a run, a package or a name), whose corrector
+    comes before network and filter: both get corrected samples, and the filter takes the variances
+    that it predicts in the place of the densities in `noise` (AirIMU)."""
     raw_gyro_bias: NonNegative | None = None
     """Standard deviation of the first gyro bias for phones that subtract no bias, rad/s (ours):
     recordings with `imu_compensated: no`. By default it is that of `start`. Evaluation and tracking
@@ -643,8 +667,8 @@ class TrainConfig:
         """Check the sections together. Several datasets must differ, be in their usual folders and
         have a weight each, or none. Four headings are averaged only if training shows windows of
         every heading. Training through the filter needs weights to start from, and segments of
-        whole strides that are longer than a window and its context. A network that predicts every
-        sample takes no context."""
+        whole strides that are longer than a window and its context. What the network itself asks
+        for is checked with it (`models.from_experiment`)."""
         names, weights = self.datasets, self.data.weights
         for name in ("data_root", "workdir", "init_from"):
             if "\0" in (getattr(self, name) or ""):
@@ -658,13 +682,6 @@ class TrainConfig:
         if weights and len(weights) != len(names):
             problem = f"has {len(weights)} values for {len(names)} datasets"
             location.child("data.weights").refuse(problem, "give one for each, or none")
-        if self.data.context and self.model.name in ("ctin", "airio"):
-            remedy = "it predicts every sample it sees: set it to 0"
-            location.child("data.context_seconds").refuse(f"is not for {self.model.name}", remedy)
-        in_body = self.model.name in ("ai_imu", "airio") or self.model.corrector != "none"
-        if in_body and self.data.window_rotation != "body_axes":
-            problem = "must be body_axes for ai_imu, airio and a corrector, which see the body"
-            location.child("data.window_rotation").refuse(problem)
         if self.model.equivariance == "four_headings" and not self.augment.yaw:
             problem = "is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"
@@ -686,7 +703,7 @@ class TrainConfig:
         if data.context_seconds or data.window_rotation != "per_sample":
             problem = "are for networks whose windows have no context and rotate every sample"
             location.child("segments").refuse(problem)
-        if self.loss.name != "weighted_sum":
+        if self.loss.name not in ("weighted_sum", "bins"):
             location.child("segments").refuse(f"have no loss '{self.loss.name}'")
 
     def _check_through_filter(self, location: Location) -> None:
@@ -705,6 +722,9 @@ class TrainConfig:
         if self.filter.mahalanobis_fail_scale > 0:
             problem = "makes no sense beside the soft gate of training through the filter"
             location.child("filter.mahalanobis_fail_scale").refuse(problem, "set it to 0")
+        if self.filter.corrector is not None:
+            problem = "is not for training through the filter, which has no variances of samples"
+            location.child("filter.corrector").refuse(problem, "train first, and set it after that")
         input_seconds = self.data.context_seconds + self.data.window_seconds
         if through.piece_seconds < input_seconds + 2 * self.data.stride_seconds:
             problem = f"must be longer than the {input_seconds:g} s that the network sees"

@@ -19,6 +19,7 @@ from gnio_jax.data.parsing.stamps import check_seconds, in_order, rounded_rate
 from gnio_jax.data.reference import Poses as Poses
 from gnio_jax.data.reference import Reference, reference_at
 from gnio_jax.data.resampling import interpolate_attitudes, is_uniform, resample_imu, uniform_clock
+from gnio_jax.data.sensors import readings_within
 from gnio_jax.data.validation import (
     FARTHEST,
     FEWEST_WAYPOINTS,
@@ -29,7 +30,7 @@ from gnio_jax.data.validation import (
 )
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import spans, stretches
-from gnio_jax.types import Sequence, Waypoints
+from gnio_jax.types import Readings, Sequence, Waypoints
 
 RECORDED_RATE = "recorded_rate"
 """Attribute of every assembled sequence: the rate of the faster sensor, Hz, independent of the
@@ -67,6 +68,8 @@ class Streams(NamedTuple):
     """The horizontal positions (n, 2) of a recording without poses, m."""
     device: Samples | None = None
     """The device's own attitude, wxyz."""
+    readings: dict[str, Readings] = {}
+    """The readings of other sensors, their stamps in s since `start`."""
 
     @classmethod
     def of_imu(
@@ -249,6 +252,7 @@ def _sequence_on_clock(
         device_orientation=device and interpolate_attitudes(device.time, device.values, clock),
         imu_valid=None if measured.all() else measured,
         waypoints=waypoints,
+        readings=readings_within(streams.readings, first, last),
         attributes=streams.attributes | {"start_time": streams.start + first},
     )
 

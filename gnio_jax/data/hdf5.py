@@ -24,12 +24,14 @@ from gnio_jax.data.parsing.tables import hdf5_field, hdf5_node, parsed_as, short
 from gnio_jax.data.validation import validate
 from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
-from gnio_jax.types import Sequence, Waypoints
+from gnio_jax.types import Readings, Sequence, Waypoints
 
 _FORMAT = "gnio-jax sequence 1"
 _OPTIONAL_FIELDS = ("device_orientation", "imu_valid")
 _FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")
 _WAYPOINTS = tuple(f"waypoints/{field}" for field in Waypoints._fields)
+_READINGS = "readings"
+"""Group with a group for each sensor beside the IMU."""
 _BLOCK = 1 << 20
 """Bytes by which a file in memory grows."""
 _NUMBERS = {"start_time": -math.inf, "recorded_rate": 0.0, "accel_clipped": -1e-9}
@@ -45,8 +47,8 @@ def write_hdf5(path: str | os.PathLike[str], sequence: Sequence) -> None:
 
     The file holds one dataset for each field (contiguous, so that it can be memory-mapped), `name`
     and `format` as attributes, and the sequence's attributes on the group `attributes`. Waypoints
-    are the group `waypoints`. Raises `InputError` for an attribute that is not a text, number or
-    boolean.
+    are the group `waypoints`, and the readings of a sensor the group `readings/SENSOR`. Raises
+    `InputError` for an attribute that is not a text, number or boolean.
     """
     with _in_memory() as file:
         _write(file, sequence, path)
@@ -90,6 +92,9 @@ def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
     if sequence.waypoints is not None:
         for field, values in sequence.waypoints._asdict().items():
             group.create_dataset(f"waypoints/{field}", data=values)
+    for sensor, readings in sequence.readings.items():
+        for field, values in readings._asdict().items():
+            group.create_dataset(f"{_READINGS}/{sensor}/{field}", data=values)
     attributes = group.create_group("attributes").attrs
     for key, value in sequence.attributes.items():
         remedy = "attributes are text, numbers or booleans"
@@ -108,11 +113,19 @@ _StoredGroup = tuple[dict[str, Any], dict[str, np.ndarray | None], dict[str, Any
 
 def _read_group(group: h5py.Group, path: Path) -> _StoredGroup:
     """Read a group, and check only its size: a failure here is due to the file."""
-    header, names = dict(group.attrs), (*_FIELDS, *_OPTIONAL_FIELDS, *_WAYPOINTS)
+    sensors = hdf5_node(group, _READINGS, path)
+    sensors = sorted(sensors) if isinstance(sensors, h5py.Group) else []
+    of_sensors = [name for sensor in sensors for name in _fields_of(sensor)]
+    header, names = dict(group.attrs), (*_FIELDS, *_OPTIONAL_FIELDS, *_WAYPOINTS, *of_sensors)
     is_ours = header.get("format") == _FORMAT
     fields = {name: hdf5_field(group, name, path) for name in names if is_ours}
     inner = hdf5_node(group, "attributes", path)
     return header, fields, {} if inner is None else dict(inner.attrs)
+
+
+def _fields_of(sensor: str) -> list[str]:
+    """The datasets of a sensor's readings."""
+    return [f"{_READINGS}/{sensor}/{field}" for field in Readings._fields]
 
 
 def _stored_sequence(stored: _StoredGroup, path: Path) -> Sequence:
@@ -137,6 +150,9 @@ def _stored_sequence(stored: _StoredGroup, path: Path) -> Sequence:
     }
     if present.intersection(_WAYPOINTS):
         optional["waypoints"] = Waypoints(*map(field_values, _WAYPOINTS))
+    sensors = dict.fromkeys(f.split("/")[1] for f in fields if f.startswith(f"{_READINGS}/"))
+    if sensors:
+        optional[_READINGS] = {s: Readings(*map(field_values, _fields_of(s))) for s in sensors}
     name = str(header.get("name", path.stem))
     plain = {key: _plain(key, value, path) for key, value in attributes.items()}
     required = map(field_values, _FIELDS)

@@ -76,7 +76,8 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
     A sequence on such a clock is unchanged. The IMU is resampled by `resample_imu`, position and
     velocity by splines, and attitudes by slerp along the shorter arc. `valid` is False between
     samples of which one is invalid, and in gaps of the IMU, where `imu_valid` is also False. A
-    reference value next to a NaN is NaN. Waypoints have stamps of their own and do not change.
+    reference value next to a NaN is NaN. Waypoints and the readings of other sensors have stamps of
+    their own and do not change.
     """
     time, valid = sequence.time, sequence.valid
     if is_uniform(time, rate):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gnio_jax.data.sensors import check_readings
 from gnio_jax.errors import InputError
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
@@ -46,6 +47,8 @@ def validate(sequence: Sequence, source: object) -> Sequence:
             _refuse(bad, field, "is NaN or Inf", source, "mark these rows invalid")
     _check_motion(sequence, source)
     _check_waypoints(sequence, source)
+    for sensor, readings in sequence.readings.items():
+        check_readings(sensor, readings, sequence.time, source)
     orientation = check_unit_norm(sequence.orientation, sequence.valid, "orientation", source)
     device = sequence.device_orientation
     if device is not None:

@@ -39,6 +39,7 @@ from gnio_jax.filtering import (
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION, explain_failure
 from gnio_jax.filtering.state import gyro_bias_covariance
+from gnio_jax.filtering.update import Measurement, Outcome
 from gnio_jax.models import Network
 from gnio_jax.numerics import (
     filled_up,
@@ -94,6 +95,9 @@ class SequenceEstimate(NamedTuple):
     """Notes for a reader of the result."""
     waypoints: Waypoints | None = None
     """The reference of a sequence without poses, in a frame of their own."""
+    accepted: dict[str, Float[np.ndarray, "n"]] = {}
+    """For each of `PreparedRecording.measurements` by name: 1 where it was used, 0 where it was
+    refused, NaN where there was none."""
 
 
 def estimate(
@@ -155,7 +159,8 @@ def perfect(ekf: Filter) -> Filter:
     network."""
     noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), measurement_scale=1.0, correlation=None)
     considered = ekf.considered and ekf.considered._replace(scale=0.0, heading=0.0, slope=0.0)
-    return dataclasses.replace(ekf, noise=noise, considered=considered)
+    config = dataclasses.replace(ekf.config, measures="displacement")
+    return dataclasses.replace(ekf, config=config, noise=noise, considered=considered)
 
 
 def in_one_frame(
@@ -195,6 +200,10 @@ class BatchInputs(NamedTuple):
     """(b, K·n); None: every sample was measured."""
     displacements: Displacements | None
     """(b, K, 3); None where the network is in the filter."""
+    variance: Array | None = None
+    """(b, K·n, 6) variances of [accel, gyro] by a corrector; None: there is none."""
+    measurements: tuple[Measurement, ...] = ()
+    """Those of the recordings, (b, K, ...)."""
 
 
 def _batches(strides: list[int], batch_size: int) -> list[Batch]:
@@ -228,12 +237,26 @@ def filter_inputs(
             covariance = filled_up(np.where(finite, covariance, np.eye(3)), strides)
             rows.append(Displacements(filled_up(value, strides, np.nan), covariance))
         stacked = _stack(rows)
+    variance = None
+    if all(recording.variance is not None for recording in recordings):
+        variance = np.stack([_padded(recording.variance, samples) for recording in recordings])
+    measurements = (
+        jax.tree.map(lambda part: filled_up(part, strides, np.nan), recording.measurements)
+        for recording in recordings
+    )
     return BatchInputs(
         _stack([recording.start for recording in recordings]),
         *padded_signals(((recording.gyro, recording.accel) for recording in recordings), samples),
         padded_masks((recording.imu_valid for recording in recordings), samples),
         stacked,
+        variance,
+        _stack([*measurements]),
     )
+
+
+def _padded(rows: Float[np.ndarray, "t 6"], count: int) -> Float[np.ndarray, "n 6"]:
+    """The first `count` rows, with the last one repeated behind them."""
+    return np.pad(rows[:count], ((0, max(count - len(rows), 0)), (0, 0)), "edge")
 
 
 @functools.partial(jax.jit, static_argnames="apply")
@@ -245,16 +268,22 @@ def _run(
 
     def run(inputs: BatchInputs) -> FilterHistory:
         signals, valid = (inputs.gyro, inputs.accel), inputs.imu_valid
+        others: dict[str, Any] = {
+            "measurements": inputs.measurements,
+            "variance": inputs.variance,
+        }
         state = inputs.start.state(ekf)
         if apply is None:
             assert inputs.displacements is not None
-            frame, displacement = "given", inputs.displacements.value
+            frame = "body" if ekf.config.measures == "velocity" else "given"
+            displacement = inputs.displacements.value
             covariance = inputs.displacements.covariance
-            history = run_filter(ekf, state, *signals, displacement, covariance, valid)[1]
+            rows = displacement, covariance, valid, frame
+            history = run_filter(ekf, state, *signals, *rows, **others)[1]
         else:
             frame = ekf.config.displacement_frame
             predict = Network(apply, variables).predict(keep)
-            history = run_odometry(predict, ekf, state, *signals, valid)[1]
+            history = run_odometry(predict, ekf, state, *signals, valid, **others)[1]
         covariances = history.covariance
         assert covariances is not None
         if ekf.considered is not None:
@@ -262,9 +291,10 @@ def _run(
 
             def repeat_run(state: FilterState, displacement: Array) -> FilterHistory:
                 rows = displacement, covariance, valid, frame
-                return run_filter(ekf, state, *signals, *rows)[1]
+                return run_filter(ekf, state, *signals, *rows, **others)[1]
 
-            derivatives = sensitivity(repeat_run, state, displacement)
+            rotation = history.rotation if ekf.config.measures == "velocity" else None
+            derivatives = sensitivity(repeat_run, state, displacement, rotation)
             axis = jnp.tile(inputs.start.raw_axis[None], (len(derivatives), 1))
             added = considered_covariance(derivatives, ekf.considered, axis)
             covariances = with_considered(covariances, added, ekf.config)
@@ -319,7 +349,16 @@ def _convert_history(
         ),
         notes=notes,
         waypoints=recording.waypoints,
+        accepted={
+            measurement.name: _prepend(np.nan, _accepted(history.outcomes[measurement.name]))
+            for measurement in recording.measurements
+        },
     )
+
+
+def _accepted(outcome: Outcome) -> Float[np.ndarray, "k"]:
+    """1 where a measurement was used, 0 where it was refused, NaN where there was none."""
+    return np.where(outcome.present, np.asarray(outcome.accepted, float), np.nan)
 
 
 def _prepend(first: Any, rows: Any) -> np.ndarray:

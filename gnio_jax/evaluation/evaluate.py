@@ -39,7 +39,7 @@ from gnio_jax.evaluation.report import DEFINITIONS, Report
 from gnio_jax.evaluation.trajectory import Alignment, Undefined, pair, read_tum
 from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
-from gnio_jax.networks import TrainedNetwork, find_network, newest_run, read_network
+from gnio_jax.networks import TrainedNetwork, find_network, load_corrector, newest_run, read_network
 from gnio_jax.networks.folder import evaluations_folder, training_recordings
 from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
@@ -128,6 +128,7 @@ def evaluate(
         init=config.init,
         gyro_bias=config.gyro_bias,
         orientation=config.orientation if _infers(config) else None,
+        corrector=load_corrector(config.filter, windows.rate, trained),
     )
     if not recordings:
         name, reason = next(iter(left_out.items()))
@@ -136,8 +137,11 @@ def evaluate(
 
     network = Network.of(trained.model, trained.variables)
     if _infers(config):
-        least_std = math.exp(ekf.config.log_std_min) if config.estimator == "ekf" else 0.0
-        source = infer(network, recordings, windows, stage("inferring"), least_std=least_std)
+        options: dict[str, Any] = {}
+        if config.estimator == "ekf":
+            options["least_std"] = math.exp(ekf.config.log_std_min)
+            options["measures"] = ekf.config.measures
+        source = infer(network, recordings, windows, stage("inferring"), **options)
     elif config.estimator == "imu_only":
         source = [no_displacements(recording) for recording in recordings]
     else:
@@ -203,6 +207,7 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
     `InputError` for an unknown dataset, missing data and impossible settings."""
     changed = dataclasses.replace(run, filter=config.filter or run.filter)
     changed = configuration.validate(configuration.assign(changed, config.set), "command line")
+    models.check_experiment(models.from_config(changed.model), changed, "command line")
     dataset, root = config.dataset or run.datasets[0], None
     if config.dataset is None and len(run.datasets) > 1:
         remedy = f"give --dataset, e.g. {dataset}"
@@ -264,6 +269,7 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
             if (value := chosen.get(name)) != trained.get(name):
                 numbers = value if isinstance(value, tuple) else (value,)
                 text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
+                text = text.replace("/", "-")  # the folder of a corrector
                 parts.append(f"{name}-{text}")
     return "_".join(map(str, parts))
 

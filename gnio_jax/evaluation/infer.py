@@ -16,11 +16,11 @@ from gnio_jax.evaluation.infer_memory import remembered_displacements
 from gnio_jax.evaluation.prepare import PreparedRecording
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Array, Prediction
+from gnio_jax.types import Array, Prediction, Quantity
 from gnio_jax.windows import align_recording, cut_windows, window_starts, without_any
 
 WINDOWS_PER_CALL = 512
-DIAGNOSTICS = ("gate", "scale", "body_velocity", "body_velocity_log_std", "nonholonomic_log_factor")
+DIAGNOSTICS = ("gate", "scale", "nonholonomic_log_factor")
 """Diagnostics of the network that are stored for every window. Attention is too large."""
 
 
@@ -29,7 +29,8 @@ class Displacements(NamedTuple):
     the window that ends with the stride. NaN where there is none."""
 
     value: Float[Array, "k 3"]
-    """m, expressed in the yaw frame of the window's start."""
+    """m, expressed in the yaw frame of the window's start. For a filter that measures velocities,
+    the velocity in the body, in metres per window."""
     covariance: Float[Array, "k 3 3"]
     """m²."""
     diagnostics: dict[str, Float[Array, "k ..."]] = {}
@@ -58,6 +59,7 @@ def infer(
     progress: Progress = silent,
     diagnostics: tuple[str, ...] = DIAGNOSTICS,
     least_std: float = 0.0,
+    measures: Quantity = "displacement",
 ) -> list[Displacements]:
     """The network's predictions for every window of the recordings, in large batches over all of
     them. They are float64 on the host. A window that touches a sample which was not measured has no
@@ -71,6 +73,7 @@ def infer(
         diagnostics: Names of the diagnostics that are stored, if the network has them.
         least_std: Smallest standard deviation that the estimator uses, m
             (`FilterConfig.log_std_min` is its logarithm).
+        measures: What the estimator measures of the network (`FilterConfig.measures`).
     """
     if network.has_memory:
         select = functools.partial(keep, names=diagnostics)
@@ -102,6 +105,7 @@ def infer(
         batch = np.minimum(np.arange(begin, begin + size), total - 1)
         arguments = network.variables, samples, start[batch], turn[batch]
         fixed = {"apply": network.apply, "length": windows.seen, "diagnostics": diagnostics}
+        fixed["measures"] = measures
         predictions.append(jax.device_get(_predict(*arguments, **fixed)))
         progress(min(1.0, (begin + size) / total))
     prediction = jax.tree.map(
@@ -119,7 +123,7 @@ def infer(
     ]
 
 
-@functools.partial(jax.jit, static_argnames=("apply", "length", "diagnostics"))
+@functools.partial(jax.jit, static_argnames=("apply", "length", "diagnostics", "measures"))
 def _predict(
     variables: Any,
     samples: Float[Array, "t c"],
@@ -129,8 +133,10 @@ def _predict(
     apply: Callable,
     length: int,
     diagnostics: tuple[str, ...],
+    measures: Quantity,
 ) -> Prediction:
-    return keep(apply(variables, cut_windows(samples, start, turn, length)), diagnostics)
+    prediction = apply(variables, cut_windows(samples, start, turn, length))
+    return keep(prediction.measured(measures), diagnostics)
 
 
 def keep(prediction: Prediction, names: tuple[str, ...] = DIAGNOSTICS) -> Prediction:

@@ -24,6 +24,8 @@ from gnio_jax.filtering import (
     make_filter,
 )
 from gnio_jax.filtering.start import rest_at_start
+from gnio_jax.filtering.update import Measurement
+from gnio_jax.models.airimu import Corrector
 from gnio_jax.numerics import (
     cumulative_rotation,
     finite_rows,
@@ -32,7 +34,7 @@ from gnio_jax.numerics import (
     rotations,
     yaw_rotation,
 )
-from gnio_jax.types import Array, Sequence, Waypoints
+from gnio_jax.types import Array, Quantity, Sequence, Waypoints
 from gnio_jax.windows import true_displacement, window_starts
 
 REFERENCE_BIAS_SECONDS = 10.0
@@ -107,15 +109,27 @@ class PreparedRecording(NamedTuple):
     displacement: Float[np.ndarray, "m 3"]
     """Displacement of the reference over each window, with a stride between windows, m, expressed
     in the yaw frame of the window's start; NaN where the reference cannot be trusted."""
+    velocity: Float[np.ndarray, "m 3"]
+    """Velocity of the reference at the end of each window, in metres per window, expressed in the
+    body; NaN where the reference cannot be trusted."""
     notes: tuple[str, ...]
     """Notes for a reader of the result."""
     waypoints: Waypoints | None = None
     """The reference of a sequence without poses."""
+    variance: Float[np.ndarray, "t 6"] | None = None
+    """Variances of [accel, gyro] by a corrector, (m/s²)² and (rad/s)²; None: there is none."""
+    measurements: tuple[Measurement, ...] = ()
+    """Measurements of other sensors with a row for each stride, in addition to those of the filter.
+    Recordings that are estimated together have the same ones."""
 
     @property
     def strides(self) -> int:
         """K."""
         return len(self.time) - 1
+
+    def truth(self, measures: Quantity) -> Float[np.ndarray, "m 3"]:
+        """The true value for each window of what a filter measures of its network."""
+        return self.displacement if measures == "displacement" else self.velocity
 
 
 def prepare(
@@ -127,6 +141,7 @@ def prepare(
     gyro_bias: BiasSource = "zero",
     orientation: Orientation | None = None,
     from_first: bool = False,
+    corrector: Corrector | None = None,
 ) -> tuple[list[PreparedRecording], dict[str, str]]:
     """Recordings to estimate, and the names of the sequences that are left out with the reason.
 
@@ -147,6 +162,7 @@ def prepare(
             "reference".
         orientation: The source of `PreparedRecording.attitude`; None: there is none.
         from_first: Whether recordings begin at their first sample, whatever the reference.
+        corrector: It corrects the samples of a recording before everything else.
 
     Raises:
         InputError: A sequence lacks what these choices need.
@@ -155,12 +171,18 @@ def prepare(
     recordings, left_out = [], {}
     for sequence in sequences:
         sequence = data.resample(sequence, windows.rate)
+        variance = None
+        if corrector is not None:
+            accel, gyro, variance = corrector.correct(sequence.accel, sequence.gyro)
+            sequence = sequence._replace(accel=accel, gyro=gyro)
         posed = finite_rows(sequence.position) & finite_rows(sequence.orientation)
         sequence = sequence._replace(valid=sequence.valid & posed)
         _check(sequence, init, gyro_bias, orientation)
         first = 0 if from_first else int(np.argmax(sequence.valid))
         strides = (len(sequence.time) - 1 - first) // windows.stride
         whole = _cut(sequence, slice(first, first + strides * windows.stride + 1))
+        if variance is not None:
+            variance = variance[first : first + strides * windows.stride]
         measured = whole.measured_rows
         if strides <= windows.seen // windows.stride or len(measured) < windows.seen:
             seconds = len(_cut(sequence, slice(first, None)).measured_rows) / windows.rate
@@ -180,6 +202,7 @@ def prepare(
             level = ekf.raw_gyro_bias
         start = Start(rotation, velocity, position, bias, std, level, raw)
         trusted, mask = whole.valid[:, None], whole.imu_valid
+        starts = window_starts(len(whole.time), windows.window, windows.stride)
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
         placement = str(sequence.attributes.get("placement", "unknown"))
@@ -198,14 +221,26 @@ def prepare(
                 displacement=true_displacement(
                     poses[1],
                     poses[0],
-                    window_starts(len(whole.time), windows.window, windows.stride),
+                    starts,
                     windows.window,
                 ),
+                velocity=windows.window_seconds * _velocity_in_body(whole, starts + windows.window),
                 notes=tuple(filter(None, (reference_note, bias_note, start_note))),
                 waypoints=whole.waypoints,
+                variance=variance,
             )
         )
     return recordings, left_out
+
+
+def _velocity_in_body(sequence: Sequence, rows: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m 3"]:
+    """The velocity of the reference at these rows, m/s, expressed in the body; NaN where the
+    reference cannot be trusted."""
+    valid = sequence.valid[rows, None]
+    velocity, orientation = (
+        np.where(valid, part[rows], np.nan) for part in (sequence.velocity, sequence.orientation)
+    )
+    return np.einsum("mji,mj->mi", matrix_from_quaternion(orientation), velocity)
 
 
 def _check(

@@ -13,7 +13,12 @@ from gnio_jax.filtering.displacement import displacements
 from gnio_jax.filtering.filter import Filter, make_filter
 from gnio_jax.filtering.fix import Fix, fixes_on_intervals
 from gnio_jax.filtering.history import FilterHistory, explain_failure
-from gnio_jax.filtering.magnetometer import Magnetometer, magnetometer_on_intervals
+from gnio_jax.filtering.magnetometer import (
+    FieldFit,
+    Magnetometer,
+    fit_field,
+    magnetometer_on_intervals,
+)
 from gnio_jax.filtering.measurements import register
 from gnio_jax.filtering.mounting import Mounting, find_mounting
 from gnio_jax.filtering.nonholonomic import NonHolonomic
@@ -32,6 +37,7 @@ __all__ = [
     "Barometer",
     "ConsideredStd",
     "CorrelatedError",
+    "FieldFit",
     "Filter",
     "FilterConfig",
     "FilterHistory",
@@ -59,6 +65,7 @@ __all__ = [
     "displacements",
     "explain_failure",
     "find_mounting",
+    "fit_field",
     "fixes_on_intervals",
     "initial_state",
     "level_state",

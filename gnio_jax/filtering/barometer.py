@@ -33,6 +33,8 @@ SCALE, EXPONENT = 288.15 / 0.0065, 287.053 * 0.0065 / 9.80665
 """T_0/L, m, and R L/g of the standard atmosphere (ISO 2533)."""
 PRESSURES = 3.0e4, 1.1e5
 """Pressures on the earth's surface, Pa."""
+LONGEST_STEP = 3.0
+"""Time between pressures beyond which none is interpolated, s: iPhones give one a second."""
 FIRST_SECONDS = 2.0
 """Time over which p_0 is the median, s."""
 
@@ -94,7 +96,7 @@ def barometer_on_intervals(
         raise InputError("barometer", problem, "pass one pressure for each stamp")
     time, pressure = finite_readings("barometer", time, pressure)
     ends = interval_ends(intervals, config, start)
-    at_ends = scalars_at("barometer", ends, time, pressure, start)
+    at_ends = scalars_at("barometer", ends, time, pressure, start, LONGEST_STEP)
     present = np.flatnonzero(np.isfinite(at_ends))
     middle = float(np.median(pressure))
     if not PRESSURES[0] <= middle <= PRESSURES[1]:

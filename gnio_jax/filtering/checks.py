@@ -24,7 +24,7 @@ from gnio_jax.config.schema import Bound
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.fix import THRESHOLDS, Fix, improper_covariances
-from gnio_jax.filtering.settings import FilterConfig, YawFrame
+from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
 from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_error
 from gnio_jax.numerics import finite_rows
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
@@ -43,6 +43,8 @@ class FilterInputs(NamedTuple):
     """(K·n,) booleans: which samples are present; None: the stream is complete."""
     measurements: tuple[Any, ...]
     """Trees of arrays whose leading axis is K."""
+    variance: Array | None = None
+    """(K·n, 6) variances of [accel, gyro]; None: the filter's densities hold."""
 
 
 # One argument
@@ -119,9 +121,9 @@ def check_covariance(name: str, value: jax.Array, kinds: Int[np.ndarray, " n"]) 
 
 
 def check_frame(frame: Any) -> None:
-    """Refuse a name that is no `YawFrame`."""
-    if frame not in get_args(YawFrame):
-        names = " or ".join(map(repr, get_args(YawFrame)))
+    """Refuse a name that is no `DisplacementFrame`."""
+    if frame not in get_args(DisplacementFrame):
+        names = " or ".join(map(repr, get_args(DisplacementFrame)))
         raise ValueError(f"frame: must be {names}, found {frame!r}")
 
 
@@ -159,6 +161,7 @@ def checked_inputs(
     accel: Any,
     imu_valid: Any,
     measurements: tuple[Any, ...],
+    variance: Any = None,
 ) -> FilterInputs:
     """The arguments that every run takes, checked and in the state's precision. The values of
     measurements are not checked, because a NaN means that there is none; only those of a `Fix`
@@ -199,8 +202,11 @@ def checked_inputs(
     for number, measurement in enumerate(measurements):
         if isinstance(measurement, Fix):
             check_fix(f"measurements[{number}]", measurement)
+    if variance is not None:
+        variance = checked_array("variance", variance, (samples, 6), config).astype(dtype)
+        check_rows("variance", variance, lambda rows: (rows <= 0).any(1), "are not above 0")
     ekf = converted_filter(ekf, dtype)
-    return FilterInputs(ekf, state, gyro, accel, imu_valid, measurements)
+    return FilterInputs(ekf, state, gyro, accel, imu_valid, measurements, variance)
 
 
 def check_measurements(argument: str, measurements: Any, others: tuple[Any, ...] = ()) -> None:

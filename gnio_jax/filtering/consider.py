@@ -90,8 +90,16 @@ def with_considered(
     return total + arc_covariance(total) - arc_covariance(covariance)
 
 
-def disturb(displacement: Float[Array, "k 3"], c: Float[Array, "6"]) -> Float[jax.Array, "k 3"]:
-    """d of the displacements u = `displacement`, m; NaN stays NaN."""
+def disturb(
+    displacement: Float[Array, "k 3"],
+    c: Float[Array, "6"],
+    rotation: Float[Array, "k 3 3"] | None = None,
+) -> Float[jax.Array, "k 3"]:
+    """d of the displacements u = `displacement`, m; NaN stays NaN. `rotation` is body → world of
+    each row if the rows are velocities in the body: they are disturbed in the world."""
+    if rotation is not None:
+        world = jnp.einsum("kij,kj->ki", rotation, displacement)
+        return jnp.einsum("kji,kj->ki", rotation, disturb(world, c))
     displacement, c = jnp.asarray(displacement), jnp.asarray(c)
     turn = geometry.rotation_z(c[OF_HEADING])
     length = jnp.sqrt(jnp.sum(displacement[:, :2] ** 2, axis=1) + STILL**2)
@@ -103,18 +111,20 @@ def sensitivity(
     run: Callable[[FilterState, Array], FilterHistory | SmoothedHistory],
     state: FilterState,
     displacement: Float[Array, "k 3"],
+    rotation: Float[Array, "k 3 3"] | None = None,
 ) -> Float[jax.Array, "k 15 6"]:
     """S of θ, v, p, b_g, b_a after each clone interval of `run(state, displacement)`. `run` is a
     function from the start and the displacements, m, to the history of `run_filter` or `smooth`.
 
-    For a run of `run_odometry` the displacements are those of its history. The network is not
+    For a run of `run_odometry` the displacements are those of its history, and if they are
+    velocities in the body, `rotation` is body → world of each row (`disturb`). The network is not
     called again, and the small effect of other biases on its windows is neglected. `run` must not
     cut its gradient (`FilterConfig.truncate_every`), because S is the derivative of the whole run.
     """
 
     def run_disturbed(c: Float[Array, "6"]) -> tuple[Mean, Array]:
         start = state._replace(gyro_bias=state.gyro_bias + c[OF_BIAS])
-        history = run(start, disturb(displacement, c))
+        history = run(start, disturb(displacement, c, rotation))
         return Mean(*(getattr(history, name) for name in Mean._fields)), history.rotation
 
     nothing = jnp.zeros(ENTRIES, state.offset.dtype)
@@ -168,7 +178,9 @@ def step_with_tangents(
     ) -> tuple[Tangents, tuple[FilterState, T]]:
         def measure_disturbed(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
             measured, diagnostics = measure(jax.lax.stop_gradient(state), oldest)
-            displacement = disturb(measured.displacement[None], c)[0]
+            in_body = measured.frame == "body"
+            rotation = jax.lax.stop_gradient(state.rotation)[None] if in_body else None
+            displacement = disturb(measured.displacement[None], c, rotation)[0]
             return dataclasses.replace(measured, displacement=displacement), diagnostics
 
         whole = jax.tree.map(

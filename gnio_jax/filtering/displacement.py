@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float
 
 from gnio_jax import geometry, numerics
 from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.settings import FilterConfig, YawFrame
+from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
 from gnio_jax.filtering.state import FilterState, GateState
 from gnio_jax.filtering.update import (
     Correction,
@@ -55,7 +55,8 @@ expressed in a given frame is not used."""
 @dataclass(frozen=True)
 class Displacement:
     """Displacement from the oldest to the newest clone, expressed in the yaw frame of the oldest,
-    or K of them. The numbers are finite even where there is none."""
+    or the velocity at the newest in metres per window, expressed in the body; or K of them. The
+    numbers are finite even where there is none."""
 
     displacement: Float[Array, "*k 3"]
     """m"""
@@ -63,9 +64,9 @@ class Displacement:
     """Covariance after scaling, m²; positive definite even where there is no displacement."""
     present: Bool[Array, "*k"]
     """Whether there is a displacement."""
-    frame: YawFrame = field(metadata={"static": True})
-    """The yaw frame: by the filter's own attitude of the oldest clone, or by another one
-    (`YawFrame`)."""
+    frame: DisplacementFrame = field(metadata={"static": True})
+    """The yaw frame by the filter's own attitude of the oldest clone, or by another one, or the
+    body (`DisplacementFrame`)."""
     name: ClassVar[str] = "displacement"
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
@@ -98,7 +99,7 @@ def scaled_displacement(
     displacement: Float[Array, "*k 3"],
     covariance: Float[Array, "*k 3 3"],
     noise: NoiseModel,
-    frame: YawFrame,
+    frame: DisplacementFrame,
 ) -> Displacement:
     """A displacement, m, with its covariance, m², scaled by `measurement_scale` and `std_factor`,
     or K of them. A NaN in either means that there is no measurement. NaN is kept out of the
@@ -134,24 +135,16 @@ def linearise_displacement(
     turns d and the prediction by the same angle, and only δθ_z remains in r. The yaw is not
     differentiated, so there is no gimbal lock.
 
+    In the body d is the velocity times the length T of the window (AirIO): r = d − T Rᵀ v for the
+    present attitude R and velocity v, H[v] = T Rᵀ, and H[θ] = T Rᵀ hat(v).
+
     With a correlation of share c, the part c L b of the error is predicted, and R = (1 − c²) Σ.
     """
-    rotation = state.clone_rotation[step.oldest]
-    to_yaw_frame = geometry.yaw_rotation(rotation).T
-    moved = to_yaw_frame @ since_oldest(state, step.oldest)
-    zero, one = jnp.zeros_like(moved[0]), jnp.ones_like(moved[0])
-    if measurement.frame == "own":
-        defined, yaw_row = jnp.bool_(True), jnp.stack([zero, zero, one])
+    if measurement.frame == "body":
+        moved, jacobian = _predict_velocity(state, step.config)
+        defined = jnp.bool_(True)
     else:
-        cosine_squared = rotation[0, 0] ** 2 + rotation[1, 0] ** 2
-        defined = cosine_squared >= GIMBAL**2
-        divisor = jnp.where(defined, cosine_squared, 1.0)
-        scale = jnp.where(defined, -rotation[2, 0] / divisor, 0.0)  # tan q / cos q
-        yaw_row = jnp.stack([scale * rotation[0, 0], scale * rotation[1, 0], one])
-    # R_γᵀ hat(p_j − p_i) e_z = (R_γᵀ (p_j − p_i)) × e_z, since the yaw leaves e_z as it is.
-    by_yaw = jnp.stack([moved[1], -moved[0], zero])
-    jacobian = {"since_oldest": to_yaw_frame, "oldest_rotation": by_yaw[:, None] * yaw_row[None]}
-
+        moved, jacobian, defined = _predict_displacement(measurement.frame, state, step.oldest)
     residual, covariance = measurement.displacement - moved, measurement.covariance
     correlation = step.noise.correlation
     if correlation is not None:
@@ -162,6 +155,41 @@ def linearise_displacement(
         predicted = jnp.where(jnp.isnan(predicted), 0.0, predicted)
         residual, covariance = residual - predicted, (1 - correlation.share**2) * covariance
     return linearise(state, residual, covariance, **jacobian), defined
+
+
+def _predict_velocity(
+    state: FilterState, config: FilterConfig
+) -> tuple[Float[Array, "3"], dict[str, Array]]:
+    """T Rᵀ v and its derivatives."""
+    to_body = config.window * config.dt * state.rotation.T
+    moved = geometry.matmul(to_body, state.velocity[:, None])[:, 0]
+    by_turn = geometry.matmul(to_body, geometry.hat(state.velocity))
+    return moved, {"velocity": to_body, "rotation": by_turn}
+
+
+def _predict_displacement(
+    frame: DisplacementFrame, state: FilterState, oldest: Array | int
+) -> tuple[Float[Array, "3"], dict[str, Array], Bool[Array, ""]]:
+    """R_γ(R_i)ᵀ (p_j − p_i), its derivatives, and whether they are defined."""
+    rotation = state.clone_rotation[oldest]
+    to_yaw_frame = geometry.yaw_rotation(rotation).T
+    moved = to_yaw_frame @ since_oldest(state, oldest)
+    zero, one = jnp.zeros_like(moved[0]), jnp.ones_like(moved[0])
+    if frame == "own":
+        defined, yaw_row = jnp.bool_(True), jnp.stack([zero, zero, one])
+    else:
+        cosine_squared = rotation[0, 0] ** 2 + rotation[1, 0] ** 2
+        defined = cosine_squared >= GIMBAL**2
+        divisor = jnp.where(defined, cosine_squared, 1.0)
+        scale = jnp.where(defined, -rotation[2, 0] / divisor, 0.0)  # tan q / cos q
+        yaw_row = jnp.stack([scale * rotation[0, 0], scale * rotation[1, 0], one])
+    # R_γᵀ hat(p_j − p_i) e_z = (R_γᵀ (p_j − p_i)) × e_z, since the yaw leaves e_z as it is.
+    by_yaw = jnp.stack([moved[1], -moved[0], zero])
+    jacobian: dict[str, Array] = {
+        "since_oldest": to_yaw_frame,
+        "oldest_rotation": by_yaw[:, None] * yaw_row[None],
+    }
+    return moved, jacobian, defined
 
 
 def displacements(

@@ -47,6 +47,9 @@ class Imu(NamedTuple):
     """m/s²"""
     gap: Gap | None
     """None where the stream is complete."""
+    variance: Float[Array, "*n 6"] | None = None
+    """Variances of the errors of [accel, gyro] in the place of the filter's densities, (m/s²)² and
+    (rad/s)², of corrected samples; None: the densities hold."""
     output: tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]] | None = None
     """Gyro and accel behind the low-pass of the IMU, where it was undone; else None."""
 

@@ -39,7 +39,8 @@ class FilterHistory(NamedTuple):
     accel_bias: Float[Array, "k 3"]
     """m/s²"""
     displacement: Float[Array, "k 3"]
-    """The measurement, m, in the yaw frame of the oldest clone; NaN where none."""
+    """The measurement, m, in the yaw frame of the oldest clone, or the measured velocity in the
+    body, in metres per window (`FilterConfig.measures`); NaN where none."""
     measurement_covariance: Float[Array, "k 3 3"]
     """Its covariance after scaling by `NoiseModel.measurement_scale` and `std_factor`, m²; NaN
     where none."""
@@ -82,8 +83,8 @@ class FilterHistory(NamedTuple):
 
     def given(self, noise: NoiseModel) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
         """Displacements (K, 3), m, and their covariances (K, 3, 3), m², before the scaling of
-        `noise`, which must be that of the run. With them `run_filter(..., frame="own")` repeats a
-        run of `run_odometry` without its network."""
+        `noise`, which must be that of the run. With them `run_filter` repeats a run of
+        `run_odometry` without its network, with `frame` = `FilterConfig.displacement_frame`."""
         factor = jnp.stack([jnp.asarray(value) for value in noise.std_factor])
         scale = noise.measurement_scale * factor[:, None] * factor[None]
         return jnp.asarray(self.displacement), self.measurement_covariance / scale[None]

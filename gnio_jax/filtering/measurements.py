@@ -17,12 +17,9 @@ from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.filtering.nonholonomic import NonHolonomic
 from gnio_jax.filtering.update import Measurement
-from gnio_jax.filtering.velocity import BodyVelocity
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
 
-_MEASUREMENTS: dict[str, type] = {
-    kind.name: kind for kind in (ZeroVelocity, BodyVelocity, NonHolonomic)
-}
+_MEASUREMENTS: dict[str, type] = {kind.name: kind for kind in (ZeroVelocity, NonHolonomic)}
 _PUBLISHED = frozenset({*_MEASUREMENTS, "displacement"})
 """Names of the measurements of this package; a registered one must have another name."""
 

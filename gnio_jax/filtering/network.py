@@ -73,7 +73,11 @@ def has_memory(predict: Predict | PredictWithMemory) -> TypeGuard[PredictWithMem
 
 def first_memory(predict: PredictWithMemory, ekf: Filter, state: FilterState) -> Memory:
     """The memory at the start of a run: that of the state, or an empty one. Raises `ValueError` if
-    the state has the memory of another network, or if `window_rotation` is not "per_sample"."""
+    the state has the memory of another network, if `window_rotation` is not "per_sample", or if the
+    filter measures something else than displacements."""
+    if ekf.config.measures != "displacement":
+        problem = "a network with memory predicts displacements"
+        raise ValueError(f"ekf.config.measures: {problem}: it must be 'displacement'")
     if ekf.config.window_rotation != "per_sample":
         problem = "a network with memory rotates every sample with its own attitude"
         raise ValueError(f"ekf.config.window_rotation: {problem}: it must be 'per_sample'")
@@ -144,7 +148,8 @@ def recalled_displacement(
 def network_measurement(
     predict: Predict, ekf: Filter
 ) -> Callable[..., tuple[Displacement, dict[str, Array]]]:
-    """The displacement that the network measures, with its diagnostics, as a function
+    """The displacement, or the velocity, that the network measures, with its diagnostics, as a
+    function
 
         measure(has_window, latest, state, oldest)
 
@@ -155,19 +160,15 @@ def network_measurement(
     """
 
     config = ekf.config
-    needs = {name: other for other in ekf.measurements for name in getattr(other, "needs", ())}
     shape = jax.ShapeDtypeStruct((1, config.seen, config.channels), jnp.float32)
 
     def predict_one(window: Float[Array, "1 n c"]) -> Prediction:
         prediction = predict(window)
         _check(prediction)
+        prediction = prediction.measured(config.measures)
         return jax.tree.map(lambda leaf: _make_floating(leaf[0]), prediction)
 
     shapes = jax.eval_shape(predict_one, shape)
-    for name, other in needs.items():
-        if name not in shapes.diagnostics:
-            problem = f"needs the diagnostics '{name}', which this network does not give"
-            raise ValueError(f"filter.measurements: '{other.name}' {problem}")
 
     def predict_nothing() -> Prediction:
         return jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
@@ -183,12 +184,8 @@ def network_measurement(
             window = network_window(state, oldest, imu.gyro, imu.accel, config)
             prediction = predict_one(window)
             whole = imu.gap is None or jnp.all(imu.gap.used > 0)
-            says = prediction.diagnostics
-            measured = {name: jnp.where(whole, says[name], jnp.nan) for name in needs}
-            if needs:  # they are measured in its place
-                whole = jnp.bool_(False)
             displacement = jnp.where(whole, prediction.displacement, jnp.nan)
-            return prediction._replace(displacement=displacement, diagnostics=says | measured)
+            return prediction._replace(displacement=displacement)
 
         prediction = jax.lax.cond(has_window, infer, predict_nothing)
         dtype, frame = state.offset.dtype, config.displacement_frame
@@ -207,6 +204,9 @@ def _check(prediction: Any) -> None:
         raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")
     axes = () if prediction.axes is None else (("axes", prediction.axes, 2),)
     vectors = ("displacement", prediction.displacement, 3), ("log_std", prediction.log_std, 3)
+    if prediction.velocity is not None:
+        value, log_std = prediction.velocity
+        vectors = (*vectors, ("velocity", value, 3), ("velocity.log_std", log_std, 3))
     for name, value, size in (*vectors, *axes):
         if value.shape != (1, size):
             shapes = f"must be (1, {size}) for one window, found {value.shape}"

@@ -109,7 +109,7 @@ def integrate(start: Mean, imu: Imu, noise: NoiseModel, dt: float) -> Interval:
         velocity=start.velocity + sums[:, 0] + gravity * dt * jnp.sum(gap.used),
         position=position + sums[:, n] + gravity * dt * (lever @ gap.used),
         transition=jnp.concatenate([by_theta, by_velocity_position, by_bias[:, :, 0]], axis=1),
-        noise=_interval_noise(effect, by_bias[:, :, 1:], gap, noise, dt),
+        noise=_interval_noise(effect, by_bias[:, :, 1:], gap, imu.variance, noise, dt),
     )
 
 
@@ -117,26 +117,36 @@ def _interval_noise(
     effect: Float[Array, "9 6 n"],
     by_bias: Float[Array, "9 6 n-1"],
     gap: Gap,
+    variance: Float[Array, "n 6"] | None,
     noise: NoiseModel,
     dt: float,
 ) -> Float[Array, "15 15"]:
-    """Q of θ, v, p, b_g, b_a, from N_l and from Φ_m[:, b] for m ≥ 1."""
+    """Q of θ, v, p, b_g, b_a, from N_l and from Φ_m[:, b] for m ≥ 1. `variance` of the samples
+    [accel, gyro] is in the place of the densities."""
     n, dtype = effect.shape[2], effect.dtype
-    gyro_variance = noise.gyro_density**2 / dt + gap.gyro_variance
-    accel_variance = noise.accel_density**2 / dt + gap.accel_variance
+    if variance is None:
+        gyro_variance = (noise.gyro_density**2 / dt + gap.gyro_variance)[None]
+        accel_variance = noise.accel_density**2 / dt + gap.accel_variance
+    else:
+        gyro_variance = variance[:, 3:].T + gap.gyro_variance[None]
+        accel_variance = variance[:, :3].T + gap.accel_variance[None]
     walk = jnp.repeat(jnp.stack([noise.gyro_bias_walk, noise.accel_bias_walk]) ** 2 * dt, 3)
     # The gyro's noise and the walks as one product of 9 rows.
     of_gyro = effect[:, :3]
-    weighted_parts = [of_gyro * gyro_variance[None, None], by_bias * walk[None, :, None]]
+    weighted_parts = [of_gyro * gyro_variance[None], by_bias * walk[None, :, None]]
     effects, weighted = (
         jnp.concatenate([part.reshape(9, -1) for part in parts], axis=1)
         for parts in ([of_gyro, by_bias], weighted_parts)
     )
-    # The accelerometer's noise is isotropic, so its rotations cancel in R Rᵀ: each sample adds one
-    # number for each pair of v and p.
-    gains = np.stack([np.zeros(n), np.ones(n), (n - 0.5 - np.arange(n)) * dt])
-    pairs = dt**2 * np.einsum("il,jl->ijl", gains, gains).astype(dtype)
-    of_accel = jnp.kron(pairs @ accel_variance, np.eye(3, dtype=dtype))
+    if variance is None:
+        # The accelerometer's noise is isotropic, so its rotations cancel in R Rᵀ: each sample adds
+        # one number for each pair of v and p.
+        gains = np.stack([np.zeros(n), np.ones(n), (n - 0.5 - np.arange(n)) * dt])
+        pairs = dt**2 * np.einsum("il,jl->ijl", gains, gains).astype(dtype)
+        of_accel = jnp.kron(pairs @ accel_variance, np.eye(3, dtype=dtype))
+    else:
+        turned = effect[:, 3:]
+        of_accel = turned.reshape(9, -1) @ (turned * accel_variance[None]).reshape(9, -1).T
     motion = effects @ weighted.T + of_accel
     mixed = jnp.sum(by_bias, axis=2) * walk[None]
     motion_rows = jnp.concatenate([motion, mixed], axis=1)

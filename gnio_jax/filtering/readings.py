@@ -36,10 +36,11 @@ def scalars_at(
     time: Float[np.ndarray, "f"],
     values: Float[np.ndarray, "f"],
     start: float,
+    longest: float = LONGEST_STEP,
 ) -> Float[np.ndarray, "k"]:
     """`readings_at` of one number each. Raises `InputError` naming the sensor if none is within the
     recording."""
-    at_ends = readings_at(ends, time, values[:, None])[:, 0]
+    at_ends = readings_at(ends, time, values[:, None], longest)[:, 0]
     if not np.isfinite(at_ends).any():
         problem = f"time: no two stamps are within the {ends[-1] - start:.4g} s of the IMU"
         raise InputError(sensor, problem, "give it stamps on the clock of the IMU")
@@ -47,13 +48,16 @@ def scalars_at(
 
 
 def readings_at(
-    ends: Float[np.ndarray, "k"], time: Float[np.ndarray, "f"], values: Float[np.ndarray, "f w"]
+    ends: Float[np.ndarray, "k"],
+    time: Float[np.ndarray, "f"],
+    values: Float[np.ndarray, "f w"],
+    longest: float = LONGEST_STEP,
 ) -> Float[np.ndarray, "k w"]:
     """Readings between two stamps by lines; NaN outside of them, and where the stamps on both sides
-    are more than `LONGEST_STEP` apart."""
+    are more than `longest` (s) apart."""
     if len(time) < 2:
         return np.full((len(ends), values.shape[1]), np.nan)
     after = np.clip(np.searchsorted(time, ends), 1, len(time) - 1)
-    near = (time[after] - time[after - 1] <= LONGEST_STEP) & (time[0] <= ends) & (ends <= time[-1])
+    near = (time[after] - time[after - 1] <= longest) & (time[0] <= ends) & (ends <= time[-1])
     lines = np.stack([np.interp(ends, time, column) for column in values.T], axis=1)
     return np.where(near[:, None], lines, np.nan)

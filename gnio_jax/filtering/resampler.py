@@ -205,6 +205,11 @@ class Stream:
             self._append(arrival, values)
 
     @property
+    def delay(self) -> float:
+        """Time by which a grid sample is known after its own, at most, s."""
+        return self.grid.delay
+
+    @property
     def ready(self) -> int:
         """Number of the next grid samples that later samples cannot change any more."""
         return self._ended - self.taken

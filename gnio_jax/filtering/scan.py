@@ -39,7 +39,7 @@ from gnio_jax.filtering.propagation import (
     integrate,
     propagate,
 )
-from gnio_jax.filtering.settings import YawFrame
+from gnio_jax.filtering.settings import DisplacementFrame
 from gnio_jax.filtering.state import (
     FilterState,
     core_covariance,
@@ -61,8 +61,9 @@ def run_filter(
     displacement: Any,
     covariance: Any,
     imu_valid: Any = None,
-    frame: YawFrame = "given",
+    frame: DisplacementFrame = "given",
     measurements: tuple[Measurement, ...] = (),
+    variance: Any = None,
 ) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals of n IMU samples with given displacements (paper §III-G).
 
@@ -82,10 +83,13 @@ def run_filter(
             None: the stream is complete.
         frame: The attitude that defines this yaw frame. "given" is another one than the filter's.
             "own" is the filter's, as for the displacements of `FilterHistory.given`, which repeat a
-            run of `run_odometry` without its network.
+            run of `run_odometry` without its network. "body": the rows are velocities in the body
+            at clone k, in metres per window.
         measurements: Measurements with a row for each interval, the leading axis K of their arrays.
             They are taken in their order, after the displacement and after those of `ekf`
             (`update.Measurement`).
+        variance: (K·n, 6) variances of [accel, gyro], (m/s²)² and (rad/s)², in the place of the
+            densities of `ekf.noise`, e.g. those of a corrector. None: the densities hold.
 
     Returns:
         The final state, from which a later call continues (and continues the clone numbers k), and
@@ -97,13 +101,13 @@ def run_filter(
             `FilterHistory.healthy` reports bad ones.
     """
     check_frame(frame)
-    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
+    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements, variance)
     return _run_filter(inputs, *checked_displacements(displacement, covariance, inputs), frame)
 
 
 @functools.partial(jax.jit, static_argnames="frame")
 def _run_filter(
-    inputs: FilterInputs, displacement: Array, covariance: Array, frame: YawFrame
+    inputs: FilterInputs, displacement: Array, covariance: Array, frame: DisplacementFrame
 ) -> tuple[FilterState, FilterHistory]:
     rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)
     return _run(take_row, inputs, rows)
@@ -117,6 +121,7 @@ def run_odometry(
     accel: Any,
     imu_valid: Any = None,
     measurements: tuple[Measurement, ...] = (),
+    variance: Any = None,
 ) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals with the network in the loop (paper fig. 2): its windows are cut
     with the filter's own state.
@@ -147,6 +152,7 @@ def run_odometry(
         imu_valid: (K·n,) booleans, False where an IMU sample is missing, as in `run_filter`; None:
             the stream is complete.
         measurements: Measurements with a row for each interval, as in `run_filter`.
+        variance: (K·n, 6) variances of the samples, as in `run_filter`.
 
     Returns:
         The final state and the history, as `run_filter` does.
@@ -154,7 +160,7 @@ def run_odometry(
     Raises:
         ValueError: As `run_filter`, or `predict` returns something else.
     """
-    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
+    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements, variance)
     config, begun = ekf.config, inputs.state.window is not None
     if has_memory(predict):
         memory = first_memory(predict, inputs.ekf, inputs.state)
@@ -230,6 +236,7 @@ def clone_steps(
     ekf, start, config = inputs.ekf, inputs.state, inputs.ekf.config
     signals = inputs.gyro, inputs.accel, inputs.imu_valid
     stream, age, imu_memory = bridge(*signals, start.imu, config)
+    stream = stream._replace(variance=inputs.variance)
     n = config.samples_per_clone
     by_interval = jax.tree.map(lambda x: x.reshape(-1, n, *x.shape[1:]), stream)
     age = age.reshape(-1, n).max(1)

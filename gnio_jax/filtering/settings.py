@@ -36,9 +36,10 @@ jax.tree_util.register_pytree_with_keys(
     lambda names, values: Entries(dict(zip(names, values, strict=True))),
 )
 
-YawFrame = Literal["own", "given"]
-"""The yaw frame in which a displacement is expressed: that of the filter's own attitude of the
-oldest clone, with which the network's window was cut, or that of another attitude."""
+DisplacementFrame = Literal["own", "given", "body"]
+"""The frame in which a displacement is expressed: the yaw frame of the filter's own attitude of the
+oldest clone, with which the network's window was cut; that of another attitude; or the body at the
+newest clone, for the velocity there in metres per window."""
 
 
 @no_type_check  # The tests' run-time checker would refuse what __post_init__ converts or names.
@@ -135,11 +136,13 @@ class FilterConfig(FilterOptions):
         return self.seen + self.cut.lead
 
     @property
-    def displacement_frame(self) -> YawFrame:
-        """Yaw frame of the network's displacement, as the measurement's Jacobian takes it.
+    def displacement_frame(self) -> DisplacementFrame:
+        """Frame of what the network measures, as the measurement's Jacobian takes it.
 
-        TLIO's Jacobian treats the frame as given, although it is the filter's own.
+        TLIO's Jacobian treats the yaw frame as given, although it is the filter's own.
         """
+        if self.measures == "velocity":
+            return "body"
         return "given" if self.window_rotation == "tlio" else "own"
 
     @property

@@ -48,7 +48,7 @@ from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.history import StepRecord
 from gnio_jax.filtering.propagation import Transition, put
 from gnio_jax.filtering.scan import StepTrace, clone_steps, take_row
-from gnio_jax.filtering.settings import FilterConfig, YawFrame
+from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
 from gnio_jax.filtering.state import (
     CLONE,
     CORE,
@@ -86,8 +86,9 @@ def smooth(
     displacement: Any,
     covariance: Any,
     imu_valid: Any = None,
-    frame: YawFrame = "given",
+    frame: DisplacementFrame = "given",
     measurements: tuple[Measurement, ...] = (),
+    variance: Any = None,
 ) -> SmoothedHistory:
     """Filter K clone intervals as `run_filter` does, then smooth: each row is the estimate given
     all measurements of the K intervals.
@@ -117,12 +118,13 @@ def smooth(
             complete.
         frame: The attitude that defines the frame of the displacements, "given" or "own".
         measurements: Measurements with a row for each interval.
+        variance: (K·n, 6) variances of the samples, as in `run_filter`.
 
     Raises:
         ValueError: As `run_filter`.
     """
     check_frame(frame)
-    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements)
+    inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements, variance)
     return _smooth(inputs, *checked_displacements(displacement, covariance, inputs), frame)
 
 
@@ -142,7 +144,7 @@ class _ForwardStep(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="frame")
 def _smooth(
-    inputs: FilterInputs, displacement: Array, covariance: Array, frame: YawFrame
+    inputs: FilterInputs, displacement: Array, covariance: Array, frame: DisplacementFrame
 ) -> SmoothedHistory:
     config = inputs.ekf.config
     rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)

@@ -35,6 +35,7 @@ from gnio_jax.filtering.consider import (
     step_with_tangents,
     with_considered,
 )
+from gnio_jax.filtering.corrected_stream import CorrectedStream, SampleCorrector
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.gaps import Imu, bridge
@@ -143,6 +144,8 @@ class Tracker:
             band-limited as in `data.resample`, and poses come later by `delay`. The rate could be
             estimated from the stamps, but then there would be no pose before, and the delay would
             depend on jitter.
+        corrector: A corrector of the samples on the grid, before everything else. It needs
+            samples that come later, so poses come later too (`delay`).
 
     Raises:
         ValueError: An argument makes no sense.
@@ -157,14 +160,16 @@ class Tracker:
         rest_seconds: float = 1.0,
         hole: float | None = None,
         imu_rate: float | None = None,
+        corrector: SampleCorrector | None = None,
     ):
         check_filter(ekf)
-        dt = ekf.config.dt
+        self._dt = dt = ekf.config.dt
         check_number("rest_seconds", rest_seconds, 1.5 * dt, "s")
         self._rest, self._failure = round(rest_seconds / dt), ""
         self.hindrance = ""
         """Why the samples before the start were no rest; empty if they were."""
-        self._stream = Stream(create_grid(dt, hole, imu_rate))
+        self._corrector = corrector
+        self._stream = self._open_stream(hole, imu_rate)
         dtype = jax.dtypes.canonicalize_dtype(np.float64) if state is None else state.offset.dtype
         self._ekf = converted_filter(ekf, dtype)
         start = state
@@ -173,13 +178,14 @@ class Tracker:
             start = initial_state(ekf, jnp.eye(3, dtype=dtype), zeros, zeros)
         self._predict = predict
         core = self._start(start)
-        self._advance, self._look_ahead = compile_programs(predict, core, self._ekf)
+        columns = 7 if corrector is None else 13
+        self._advance, self._look_ahead = compile_programs(predict, core, self._ekf, columns)
         if state is None:
             self._core = None
 
     def expect(self, imu_rate: float, hole: float | None = None) -> None:
         """Change `imu_rate` and `hole` before the first sample. Nothing is compiled again."""
-        self._stream = Stream(create_grid(self._ekf.config.dt, hole, imu_rate))
+        self._stream = self._open_stream(hole, imu_rate)
 
     def push(self, time: Any, gyro: Any, accel: Any) -> Pose | None:
         """Take one sample: time s, gyro (3,) rad/s, accel (3,) m/s², raw, in the body frame. A
@@ -234,11 +240,16 @@ class Tracker:
 
     @property
     def delay(self) -> float:
-        """Delay of all poses by the low-pass of a faster IMU, s; 0 without one.
+        """Delay of all poses by the low-pass of a faster IMU and by a corrector, s; 0 without
+        both.
 
         It is a latency: the times of the poses are correct.
         """
-        return self._stream.grid.delay
+        return self._stream.delay
+
+    def _open_stream(self, hole: float | None, imu_rate: float | None) -> Stream | CorrectedStream:
+        stream = Stream(create_grid(self._dt, hole, imu_rate))
+        return stream if self._corrector is None else CorrectedStream(stream, self._corrector)
 
     def _start_from_rest(self) -> None:
         """Start as soon as the next samples make a rest; they are filtered afterwards."""
@@ -315,28 +326,31 @@ def rest_problem(rows: Float[np.ndarray, "n 7"], config: FilterConfig) -> tuple[
 
 
 def compile_programs(
-    predict: Predict | PredictWithMemory, core: Core, ekf: Filter
+    predict: Predict | PredictWithMemory, core: Core, ekf: Filter, columns: int = 7
 ) -> tuple[Callable[..., tuple[Core, DevicePose]], Callable[..., tuple[DevicePose, ImuMemory]]]:
-    """`advance` and `look_ahead`, compiled for cores like this one."""
-    rows = jax.ShapeDtypeStruct((ekf.config.samples_per_clone, 7), core.window.dtype)
+    """`advance` and `look_ahead`, compiled for cores like this one, and for grid samples with so
+    many columns: 7, or 13 with the variances of a corrector."""
+    rows = jax.ShapeDtypeStruct((ekf.config.samples_per_clone, columns), core.window.dtype)
     step = functools.partial(advance, predict=predict, ekf=ekf)
     advancing = jax.jit(step, donate_argnums=0).lower(core, rows)
-    ahead, row = functools.partial(look_ahead, ekf=ekf), rows.update(shape=(7,))
+    ahead, row = functools.partial(look_ahead, ekf=ekf), rows.update(shape=(columns,))
     looking = jax.jit(ahead).lower(advancing.out_info[1], core.filter.imu, row)
     return advancing.compile(), looking.compile()
 
 
 def advance(
     core: Core,
-    rows: Float[Array, "n 7"],
+    rows: Float[Array, "n k"],
     predict: Predict | PredictWithMemory,
     ekf: Filter,
 ) -> tuple[Core, DevicePose]:
-    """One clone step, as `run_odometry` makes it, from the n grid samples (gyro, accel, valid) of
-    its interval. The network is not called if the window is no measurement."""
+    """One clone step, as `run_odometry` makes it, from the n grid samples (gyro, accel, valid, and
+    the variances of a corrector) of its interval. The network is not called if the window is no
+    measurement."""
     config, valid = ekf.config, rows[:, VALID] > 0
     signals = rows[:, GYRO], rows[:, ACCEL], valid
     imu, age, imu_memory = bridge(*signals, core.filter.imu, config)
+    imu = imu._replace(variance=_variance(rows))
     assert imu.gap is not None
     newest = jnp.concatenate([imu.gyro, imu.accel, imu.gap.used[:, None]], axis=1)
     window = jnp.concatenate([core.window[config.samples_per_clone :], newest])
@@ -372,6 +386,11 @@ def advance(
     return Core(state, window, core.intervals + 1, tangents, memory), estimate
 
 
+def _variance(rows: Float[Array, "n k"]) -> Float[Array, "n 6"] | None:
+    """The variances of grid samples that a corrector has corrected."""
+    return rows[:, 7:] if rows.shape[1] > 7 else None
+
+
 def advance_filter(
     ekf: Filter,
     state: FilterState,
@@ -390,7 +409,7 @@ def advance_filter(
 def look_ahead(
     estimate: DevicePose,
     memory: ImuMemory,
-    row: Float[Array, "7"],
+    row: Float[Array, "k"],
     ekf: Filter,
 ) -> tuple[DevicePose, ImuMemory]:
     """The estimate and the memory of the IMU after one more grid sample, by integration alone.
@@ -400,6 +419,7 @@ def look_ahead(
     mean, covariance, flags = estimate
     config = ekf.config
     imu, _, memory = bridge(row[None, GYRO], row[None, ACCEL], row[None, VALID] > 0, memory, config)
+    imu = imu._replace(variance=_variance(row[None]))
     ahead = integrate(mean, imu, ekf.noise, config.dt)
     transition = jnp.concatenate([ahead.transition, jnp.eye(15, dtype=row.dtype)[BIASES]])
     covariance = transition @ covariance @ transition.T + ahead.noise

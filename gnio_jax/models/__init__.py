@@ -4,12 +4,17 @@ from one clone interval to the next (`models.memory`)."""
 from gnio_jax.models.inference import Inference, InferenceVariables, Network, inference_variables
 from gnio_jax.models.registry import (
     channels,
+    check_experiment,
     create,
     from_config,
+    from_experiment,
     initialise,
+    innermost,
     names,
     predicts_displacement,
+    quantities,
     register,
+    trained_by,
     variable_shapes,
 )
 
@@ -18,12 +23,17 @@ __all__ = [
     "InferenceVariables",
     "Network",
     "channels",
+    "check_experiment",
     "create",
     "from_config",
+    "from_experiment",
     "inference_variables",
     "initialise",
+    "innermost",
     "names",
     "predicts_displacement",
+    "quantities",
     "register",
+    "trained_by",
     "variable_shapes",
 ]

@@ -1,17 +1,18 @@
 """AirIMU (Qiu et al., "AirIMU: Learning Uncertainty Propagation for Inertial Odometry", 2023): a
 corrector of the IMU, which comes before any network (`model.corrector: airimu`) and before the
-filter (`correct_recording`). It learns from its preintegration (`preintegration_loss`).
+filter (`Corrector`). It learns from its preintegration (`preintegration_loss`).
 """
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from gnio_jax import geometry
 from gnio_jax.models.airio import (
@@ -48,6 +49,15 @@ class Corrections(NamedTuple):
     """Variances of the corrected samples, (m/s²)² and (rad/s)²."""
 
 
+class BlockMemory(NamedTuple):
+    """What a corrector carries from one block of samples to the next."""
+
+    states: tuple[Float[Array, "b u"], Float[Array, "b w"]]
+    """Outputs of both layers of GRU."""
+    block: Int[Array, ""]
+    """Number of the next block."""
+
+
 class AirIMU(nn.Module):
     """Samples [accel, gyro] of the body to their corrections and variances: an encoder of two
     strided convolutions, two layers of GRU forwards in time, four decoders (520,044 parameters).
@@ -60,14 +70,31 @@ class AirIMU(nn.Module):
     width: int = 64
     dropout: float = 0.5
 
-    @nn.compact
     def __call__(self, imu: Float[Array, "b n 6"], train: bool = False) -> Corrections:
+        return self.advance(imu, None, train)[1]
+
+    def begin(self, batch: int) -> BlockMemory:
+        """The memory before the first block."""
+        units = 2 * self.width, 4 * self.width
+        states = tuple(jnp.zeros((batch, count), jnp.float32) for count in units)
+        return BlockMemory(states, jnp.int32(0))
+
+    @nn.compact
+    def advance(
+        self, imu: Float[Array, "b n 6"], memory: BlockMemory | None, train: bool = False
+    ) -> tuple[BlockMemory | None, Corrections]:
+        """All corrections of a whole signal, or with a memory those of the next block of 9 samples
+        alone: its 25 samples are the 12 before its first sample, that sample, and 12 after it,
+        zeros before the start."""
         samples = imu.shape[1]
-        x = StridedEncoder(self.width, self.dropout, True, name="encoder")(
-            imu.astype(jnp.float32), train
-        )
-        for layer, units in (("gru1", 2 * self.width), ("gru2", 4 * self.width)):
-            x, _ = Recurrence(units, "gru", name=layer)(x)
+        output, starts = (None, (None, None)) if memory is None else (memory.block, memory.states)
+        encoder = StridedEncoder(self.width, self.dropout, True, name="encoder")
+        x = encoder(imu.astype(jnp.float32), train, output)
+        states = []
+        units = 2 * self.width, 4 * self.width
+        for layer, count, start in zip(("gru1", "gru2"), units, starts, strict=True):
+            x, state = Recurrence(count, "gru", name=layer)(x, start)
+            states.append(state)
         parts = ("accel", "gyro", "accel_log_variance", "gyro_log_variance")
         accel, gyro, *log_variances = (Decoder(2 * self.width, name=name)(x) for name in parts)
         correction = jnp.concatenate([ACCEL_UNIT * accel, jnp.float32(GYRO_UNIT) * gyro], axis=-1)
@@ -75,8 +102,12 @@ class AirIMU(nn.Module):
         correction, variance = (
             jnp.repeat(y, STRIDE, axis=1)[:, :samples] for y in (correction, variance)
         )
-        corrected = jnp.arange(samples)[None, :, None] >= STRIDE
-        return Corrections(jnp.where(corrected, correction, 0.0), variance)
+        first = jnp.int32(0) if memory is None else STRIDE * memory.block
+        corrected = (first + jnp.arange(correction.shape[1]))[None, :, None] >= STRIDE
+        corrections = Corrections(jnp.where(corrected, correction, 0.0), variance)
+        if memory is None:
+            return None, corrections
+        return BlockMemory((states[0], states[1]), memory.block + 1), corrections
 
 
 class Corrected(nn.Module):
@@ -118,15 +149,54 @@ class Corrected(nn.Module):
         return constants(variables) if constants else {}
 
 
-def correct_recording(
-    variables: Any, accel: Float[np.ndarray, "n 3"], gyro: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """The corrected acceleration (m/s²) and rate (rad/s) of a recording at the corrector's rate,
-    for the filter. `variables` are those of a network after a corrector."""
-    corrector = {name: tree["corrector"] for name, tree in variables.items()}
-    imu = jnp.asarray(np.concatenate([accel, gyro], axis=1)[None], jnp.float32)
-    correction = np.asarray(jax.jit(AirIMU().apply)(corrector, imu).imu[0], float)
-    return accel + correction[:, :3], gyro + correction[:, 3:]
+class CorrectedSamples(NamedTuple):
+    """Samples of the body after a corrector."""
+
+    accel: Float[np.ndarray, "n 3"]
+    """m/s²."""
+    gyro: Float[np.ndarray, "n 3"]
+    """rad/s."""
+    variance: Float[np.ndarray, "n 6"]
+    """Variances of [accel, gyro], (m/s²)² and (rad/s)²."""
+
+
+class Corrector:
+    """A trained corrector before the filter and the network, for whole recordings (`correct`) and
+    while samples come (`begin`, `step`), at the rate at which it was trained.
+
+    `variables` are those of `AirIMU`.
+    """
+
+    block, before, after = STRIDE, 12, 12
+
+    def __init__(self, variables: Any):
+        self.variables = variables
+
+    def correct(
+        self, accel: Float[np.ndarray, "n 3"], gyro: Float[np.ndarray, "n 3"]
+    ) -> CorrectedSamples:
+        """The corrected samples of a recording, m/s² and rad/s."""
+        imu = jnp.asarray(np.concatenate([accel, gyro], axis=1)[None], jnp.float32)
+        corrections = jax.device_get(_correct(self.variables, imu))
+        added, variance = (np.asarray(part[0], float) for part in corrections)
+        return CorrectedSamples(accel + added[:, :3], gyro + added[:, 3:], variance)
+
+    def begin(self) -> BlockMemory:
+        """The memory before the first block."""
+        return AirIMU().begin(1)
+
+    def step(
+        self, memory: BlockMemory, samples: Float[np.ndarray, "25 6"]
+    ) -> tuple[BlockMemory, Float[np.ndarray, "9 6"], Float[np.ndarray, "9 6"]]:
+        """The memory after the next block, what is added to its samples, and their variances."""
+        imu = jnp.asarray(samples[None], jnp.float32)
+        memory, corrections = _correct_block(self.variables, imu, memory)
+        added, variance = (np.asarray(part[0], float) for part in corrections)
+        return memory, added, variance
+
+
+_correct = jax.jit(AirIMU().apply)
+_correct_block = jax.jit(functools.partial(AirIMU().apply, method="advance"))
 
 
 # Preintegration

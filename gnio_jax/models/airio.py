@@ -2,8 +2,7 @@
 IEEE RA-L 2025), and the encoder that it shares with AirIMU.
 
 The network sees the samples in the body's frame, with gravity, and the attitude as an input of its
-own. It predicts the velocity in the body, which the filter may measure
-(`filtering.velocity.BodyVelocity`).
+own. It predicts the velocity in the body, which the filter may measure (`filter.measures`).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from gnio_jax.config.schema import Count, Probability
 from gnio_jax.models.bidirectional import Bidirectional
 from gnio_jax.models.convolution import convolve, convolve_forward
 from gnio_jax.models.layers import EPSILON, FLOAT32, MOMENTUM, linear
-from gnio_jax.types import Prediction
+from gnio_jax.types import Prediction, Velocity
 
 STRIDE = 9
 """Samples from one output to the next: two convolutions of stride 3."""
@@ -47,6 +46,8 @@ class AirIO(nn.Module):
     width: Count = 64
     dropout: Probability = 0.5
     channels = 12
+    takes_context = False
+    quantities = ("displacement", "velocity")
 
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 12"], train: bool = False) -> Prediction:
@@ -72,7 +73,8 @@ class AirIO(nn.Module):
         displacement = jnp.einsum("bnij,bnj->bi", to_window, velocity) / len(rows)
         variance = jnp.einsum("bnij,bnj->bi", to_window**2, jnp.exp(2 * log_std)) / len(rows)
         diagnostics = {"body_velocity": velocity, "body_velocity_log_std": log_std}
-        return Prediction(displacement, 0.5 * jnp.log(variance), diagnostics)
+        last = Velocity(velocity[:, -1], log_std[:, -1])
+        return Prediction(displacement, 0.5 * jnp.log(variance), diagnostics, velocity=last)
 
 
 class StridedEncoder(nn.Module):
@@ -84,18 +86,26 @@ class StridedEncoder(nn.Module):
     within: bool = False
 
     @nn.compact
-    def __call__(self, x: Float[Array, "b n c"], train: bool) -> Float[Array, "b m d"]:
+    def __call__(
+        self, x: Float[Array, "b n c"], train: bool, output: Int[Array, ""] | None = None
+    ) -> Float[Array, "b m d"]:
+        """With the number of an `output`, x has only the 25 samples on which it depends, and the
+        result is this output alone."""
+        padding = (0, 0) if output is not None else (3, 3)
         for layer, features in (("1", max(self.width // 2, 1)), ("2", self.width)):
             x = nn.Conv(
                 features,
                 (7,),
                 (3,),
-                [(3, 3)],
+                [padding],
                 conv_general_dilated=convolve if train else convolve_forward,
                 name=f"filter{layer}",
                 **FLOAT32,
             )(x)
             x = nn.gelu(norm(f"norm{layer}", train)(x), approximate=False)
+            if output is not None and layer == "1":  # the second convolution's padding at the start
+                rows = STRIDE // 3 * output - 3 + jnp.arange(x.shape[1])
+                x = jnp.where((rows >= 0)[None, :, None], x, 0.0)
             if self.within:
                 x = nn.Dropout(self.dropout, deterministic=not train)(x)
         return x

@@ -26,15 +26,17 @@ class Recurrence(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: Float[Array, "b n c"]
+        self, x: Float[Array, "b n c"], start: Float[Array, "b u"] | None = None
     ) -> tuple[Float[Array, "b n u"], Float[Array, "b u"]]:
+        """A GRU may continue from the output `start`."""
         gates = {"gru": 3, "lstm": 4}[self.cell] * self.units
-        start = _uniform(self.units)
-        inputs = linear(gates, "input", kernel_init=start, bias_init=start)(x)
-        kernel = self.param("recurrent_kernel", start, (self.units, gates), jnp.float32)
-        bias = self.param("recurrent_bias", start, (gates,), jnp.float32)
+        draw = _uniform(self.units)
+        inputs = linear(gates, "input", kernel_init=draw, bias_init=draw)(x)
+        kernel = self.param("recurrent_kernel", draw, (self.units, gates), jnp.float32)
+        bias = self.param("recurrent_bias", draw, (gates,), jnp.float32)
 
         zeros = jnp.zeros((x.shape[0], self.units), jnp.float32)
+        zeros = zeros if start is None else start
         step, state = (gru_unit, zeros) if self.cell == "gru" else (lstm_unit, (zeros, zeros))
         unit = functools.partial(step, kernel=kernel, bias=bias)
         inputs = inputs[:, ::-1] if self.reverse else inputs

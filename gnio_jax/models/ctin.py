@@ -68,6 +68,7 @@ class CTIN(nn.Module):
     encoder_dropout: Probability = 0.5
     decoder_dropout: Probability = 0.05
     output_dim: Literal[2, 3] = 3
+    takes_context = False
 
     def __post_init__(self) -> None:
         if self.width % 2 or self.width % self.heads:

@@ -26,6 +26,7 @@ Corrected biases hold from the next sample on, and the memory keeps what it has 
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -35,6 +36,7 @@ from jaxtyping import Array, Float
 
 from gnio_jax import geometry
 from gnio_jax.config.schema import NonNegativeCount, Positive
+from gnio_jax.models.bins import BinHead
 from gnio_jax.models.heads import UNCERTAINTIES, GatedHead, LinearHead
 from gnio_jax.models.layers import checked_windows
 from gnio_jax.models.motion_bank import MotionBank
@@ -51,15 +53,17 @@ class NetworkWithMemory(nn.Module):
     with an empty memory at each window's start.
 
     `bank_size = 0` leaves the bank out. Training needs the random stream `dropout` if the network
-    has dropout.
+    has dropout. The head "bins" has the uncertainty of its distribution over bins from −`reach` to
+    `reach` m, in the place of `uncertainty`.
     """
 
     bank_size: NonNegativeCount = 0
     bank_std: Positive = 1.0
-    head: Literal["gated", "linear"] = "linear"
+    head: Literal["gated", "linear", "bins"] = "linear"
     gate: Literal["tanh", "sigmoid"] = "tanh"
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
     uncertainty: Literal["head", "calibrated", "constant"] = "head"
+    reach: Positive = 3.0
 
     def begin(self, batch: int) -> Any:
         """The state before the first sample: a tree of float32 arrays with `batch` rows."""
@@ -115,7 +119,10 @@ class NetworkWithMemory(nn.Module):
             context, diagnostics["attention"] = self._bank(name="bank")(h, bank)
             h = h + context
         displacement, head_diagnostics = self.displacement_head()(h)
-        log_std = self.uncertainty_head()(h, train)
+        if "log_std" in head_diagnostics:
+            log_std = head_diagnostics.pop("log_std")
+        else:
+            log_std = self.uncertainty_head()(h, train)
         prediction = Prediction(displacement, log_std, diagnostics | head_diagnostics)
         return state, jax.tree.map(
             lambda leaf: leaf.reshape(batch, intervals, *leaf.shape[1:]), prediction
@@ -124,9 +131,8 @@ class NetworkWithMemory(nn.Module):
     @nn.nowrap
     def displacement_head(self) -> nn.Module:
         """As in GNIO: a module named "head"."""
-        if self.head == "gated":
-            return GatedHead(self.gate, self.scale, name="head")
-        return LinearHead(name="head")
+        gated, bins = partial(GatedHead, self.gate, self.scale), partial(BinHead, reach=self.reach)
+        return {"gated": gated, "linear": LinearHead, "bins": bins}[self.head](name="head")
 
     @nn.nowrap
     def uncertainty_head(self) -> nn.Module:

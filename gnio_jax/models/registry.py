@@ -17,7 +17,7 @@ from flax import linen as nn
 from jaxtyping import PRNGKeyArray
 
 from gnio_jax import plugins
-from gnio_jax.config import ModelConfig
+from gnio_jax.config import ModelConfig, TrainConfig
 from gnio_jax.config.files import check_value
 from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError, did_you_mean
@@ -42,6 +42,7 @@ from gnio_jax.models.ronin_temporal import RoNINLSTM, RoNINTCN
 from gnio_jax.models.state_space import StateSpaceNetwork
 from gnio_jax.models.tlio import TLIO
 from gnio_jax.models.trunk import Trunk
+from gnio_jax.types import Quantity
 
 _MODELS: dict[str, type[nn.Module]] = {
     "ai_imu": AIIMU,
@@ -114,6 +115,57 @@ def from_config(config: ModelConfig) -> nn.Module:
     return create(**{option: value for option, value in values.items() if value is not None})
 
 
+def from_experiment(config: TrainConfig, source: str = "config") -> nn.Module:
+    """The network of an experiment. Raises `InputError` naming `source` for options that it does
+    not have, and for windows and measurements that it does not take."""
+    model = from_config(config.model)
+    check_experiment(model, config, source)
+    return model
+
+
+def check_experiment(model: nn.Module, config: TrainConfig, source: str = "config") -> None:
+    """Check that a network can see the windows of an experiment, and that the filter measures what
+    the network predicts. Raises `InputError` naming `source` and the field."""
+    location, name = Location(source), config.model.name
+    network = innermost(model)
+    if config.data.context and not getattr(network, "takes_context", True):
+        remedy = "it predicts every sample it sees: set it to 0"
+        location.child("data.context_seconds").refuse(f"is not for {name}", remedy)
+    rotation = location.child("data.window_rotation")
+    in_filter = location.child("filter.window_rotation")
+    if channels(model) == 12:
+        if config.data.window_rotation != "body_axes":
+            rotation.refuse(f"must be body_axes: {name} or its corrector sees the body")
+        if config.filter.window_rotation not in (None, "body_axes"):
+            in_filter.refuse(f"must be null: {name} or its corrector sees the body")
+    elif config.data.window_rotation == "body_axes":
+        rotation.refuse(f"is body_axes, which {name} does not see", "leave it out")
+    elif config.filter.window_rotation == "body_axes":
+        in_filter.refuse(f"is body_axes, which {name} does not see", "leave it out")
+    if config.filter.measures not in quantities(model):
+        problem = f"is {config.filter.measures}, which {name} does not predict"
+        location.child("filter.measures").refuse(problem, f"known: {', '.join(quantities(model))}")
+
+
+def innermost(model: nn.Module) -> nn.Module:
+    """The network inside an equivariant construction or behind a corrector, or the network
+    itself."""
+    while isinstance(inner := getattr(model, "network", None), nn.Module):
+        model = inner
+    return model
+
+
+def quantities(model: nn.Module) -> tuple[Quantity, ...]:
+    """What a filter can measure of a network, by its attribute `quantities`."""
+    return getattr(innermost(model), "quantities", ("displacement",))
+
+
+def trained_by(model: nn.Module) -> str:
+    """How a network is trained, by its attribute `trained_by`: "gradient", or the name of a method
+    of its own (`training.loop.METHODS`)."""
+    return getattr(innermost(model), "trained_by", "gradient")
+
+
 def create(name: str, **values: Any) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a
     `Prediction`.
@@ -160,7 +212,7 @@ def channels(model: nn.Module) -> int:
 def predicts_displacement(model: nn.Module) -> bool:
     """Whether a network predicts a displacement. One that does not can be trained and run in the
     filter's loop alone, and needs no weights from training on windows."""
-    return getattr(model, "predicts_displacement", True)
+    return getattr(innermost(model), "predicts_displacement", True)
 
 
 def _check_word(

@@ -36,6 +36,7 @@ class RIDI(nn.Module):
     supports: Count = 1000
     class_supports: Count = 1
     output_dim = 2
+    trained_by = "support_vectors"
 
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 6"], train: bool = False) -> Prediction:

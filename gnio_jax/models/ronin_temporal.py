@@ -39,13 +39,13 @@ class RoNINTemporal(NetworkWithMemory):
     output_dim: Literal[2, 3] = 3
 
     def __post_init__(self) -> None:
-        if self.output_dim == 2 and self.head == "gated":
-            raise ValueError("output_dim must be 3 with a gated head, found 2")
+        if self.output_dim == 2 and self.head != "linear":
+            raise ValueError(f"output_dim must be 3 with the head {self.head}, found 2")
         super().__post_init__()
 
     @nn.nowrap
     def displacement_head(self) -> nn.Module:
-        if self.head == "gated":
+        if self.head != "linear":
             return super().displacement_head()
         return LinearHead(self.output_dim, name="head")
 

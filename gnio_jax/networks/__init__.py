@@ -1,6 +1,13 @@
 """Trained networks: their folder on the disk (`folder`), and where they are found (`find`)."""
 
-from gnio_jax.networks.find import find_network, list_networks, load, newest_run
+from gnio_jax.networks.find import (
+    find_network,
+    list_networks,
+    load,
+    load_corrector,
+    newest_run,
+    with_corrector,
+)
 from gnio_jax.networks.folder import Card, TrainedNetwork, read_network, write_network
 
 __all__ = [
@@ -9,7 +16,9 @@ __all__ = [
     "find_network",
     "list_networks",
     "load",
+    "load_corrector",
     "newest_run",
     "read_network",
+    "with_corrector",
     "write_network",
 ]

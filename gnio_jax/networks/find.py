@@ -6,7 +6,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from gnio_jax.config import FilterSettings
 from gnio_jax.errors import InputError, did_you_mean
+from gnio_jax.models.airimu import Corrector
 from gnio_jax.networks.folder import CONFIG, WEIGHTS, TrainedNetwork, name_of, read_network
 
 SHIPPED = Path(__file__).parents[1] / "weights"
@@ -65,6 +67,38 @@ def load(network: str | Path | None = None) -> TrainedNetwork:
     has the calibrated or trained settings of the filter. Raises `InputError`.
     """
     return read_network(find_network(network))
+
+
+def load_corrector(
+    settings: FilterSettings, rate: float, network: TrainedNetwork | None = None
+) -> Corrector | None:
+    """The corrector that the settings of a filter name; None if they name none.
+
+    If the settings of `network` name the same one and it was written with the network, it is that.
+    Raises `InputError` for a network that does not exist or has no corrector, and for one of
+    another rate than `rate`, Hz.
+    """
+    name = settings.corrector
+    if name is None:
+        return None
+    if network is not None and network.corrector is not None:
+        if network.config.filter.corrector == name:
+            return Corrector(network.corrector)
+    trained = load(name)
+    if trained.config.model.corrector == "none":
+        problem = f"names '{name}', a network without a corrector"
+        raise InputError("filter.corrector", problem, "name one with model.corrector: airimu")
+    if trained.config.data.rate != rate:
+        problem = f"names '{name}', whose corrector works at {trained.config.data.rate:g} Hz"
+        raise InputError("filter.corrector", problem, f"name one of {rate:g} Hz, as data.rate")
+    parts = {kind: tree["corrector"] for kind, tree in trained.variables.items()}
+    return Corrector(parts)
+
+
+def with_corrector(network: TrainedNetwork) -> TrainedNetwork:
+    """The network with the variables of its corrector, as it is written for other people."""
+    corrector = load_corrector(network.config.filter, network.config.data.rate, network)
+    return network if corrector is None else network._replace(corrector=corrector.variables)
 
 
 def newest_run(folder: str | Path = "runs") -> Path:

@@ -11,6 +11,7 @@ unpacked to the disk, and nothing is executed. docs/weights.md has the format.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import zipfile
@@ -32,6 +33,7 @@ from gnio_jax import models
 from gnio_jax.config import FilterSettings, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import fingerprint, replacing, replacing_folder
+from gnio_jax.models.airimu import AirIMU
 
 CONFIG, WEIGHTS, CARD = "config.yaml", "weights.safetensors", "README.md"
 HEADER = "gnio_jax"
@@ -93,6 +95,8 @@ class TrainedNetwork(NamedTuple):
     """SHA-256 of its weights on the disk."""
     card: Card | None = None
     """None if it is not published."""
+    corrector: Any = None
+    """Variables of the corrector of `filter.corrector`, if they were written with the network."""
 
     @property
     def name(self) -> str:
@@ -134,12 +138,27 @@ def read_network(path: Path) -> TrainedNetwork:
     damaged, and for arrays that are not finite or do not fit the settings.
     """
     settings, weights = _read_files(path)
-    model = models.from_config(settings.config.model)
+    model = models.from_experiment(settings.config, str(path / CONFIG))
     shapes = models.variable_shapes(model, settings.config.data.seen)
     template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
+    if settings.config.filter.corrector is not None and has_corrector(weights):
+        template["corrector"] = corrector_shapes()
     variables = from_bytes(weights, template, path / WEIGHTS)
+    corrector = variables.pop("corrector", None)
     config, epoch, step, digest, card = settings
-    return TrainedNetwork(config, model, variables, epoch, step, path, digest, card)
+    return TrainedNetwork(config, model, variables, epoch, step, path, digest, card, corrector)
+
+
+def has_corrector(weights: bytes) -> bool:
+    """Whether a file of weights holds a corrector beside the network."""
+    length = int.from_bytes(weights[:8], "little")
+    return b'"corrector/params/' in weights[8 : 8 + length]
+
+
+def corrector_shapes() -> Any:
+    """Shapes of a corrector's variables."""
+    windows = jax.ShapeDtypeStruct((1, 25, 6), jnp.float32)
+    return dict(jax.eval_shape(AirIMU().init, jax.random.key(0), windows))
 
 
 def read_settings(path: Path) -> NetworkSettings:
@@ -341,7 +360,14 @@ def recordings_by_name(recordings: Any) -> dict[str, int | None]:
 def write_network(folder: Path, network: TrainedNetwork) -> None:
     """Write settings and weights of a network into an existing folder."""
     configuration.save(folder / CONFIG, network.config)
-    write_weights(folder, network.variables, network.epoch, network.step)
+    write_weights(folder, _all_variables(network), network.epoch, network.step)
+
+
+def _all_variables(network: TrainedNetwork) -> Any:
+    """The variables of a network and of its corrector, so that both can go to other people."""
+    if network.corrector is None:
+        return network.variables
+    return {**network.variables, "corrector": network.corrector}
 
 
 def write_weights(
@@ -362,8 +388,14 @@ def write_published(path: Path, network: TrainedNetwork, card: Card, text: str) 
     """Write a published network, a zip if the name ends with .zip, else a folder, and return its
     card, which then describes its files. `text` is the card's Markdown. It is written whole or not
     at all and replaces an earlier one. Its settings contain no folders of this machine."""
-    settings = configuration.to_yaml(configuration.without_paths(network.config)).encode()
-    files = {CONFIG: settings, WEIGHTS: to_bytes(network.variables)}
+    config = configuration.without_paths(network.config)
+    if network.corrector is not None:  # it comes with the network, whatever its folder was
+        name = Path(config.filter.corrector or "corrector").name
+        config = dataclasses.replace(
+            config, filter=dataclasses.replace(config.filter, corrector=name)
+        )
+    settings = configuration.to_yaml(config).encode()
+    files = {CONFIG: settings, WEIGHTS: to_bytes(_all_variables(network))}
     card = card._replace(files={name: fingerprint(content) for name, content in files.items()})
     facts = {"format": FORMAT, "version": VERSION, **card._asdict()}
     facts["sha256"] = _digest(facts)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
+from gnio_jax import models
 from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, TrainConfig
 
 METHODS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "gnio")
 """The networks of table II, and RoNIN's, which it leaves out."""
 
-SCALED = ("gnio", "tlio", "ronin_resnet", "deepils")
+SCALED = ("gnio", "tlio", "ronin_resnet", "deepils", "airio")
 """Networks whose `width` means channels of the first group: an experiment at half the width halves
 all of them."""
 
@@ -77,22 +78,36 @@ class Experiment(NamedTuple):
 
 def method(network: str, base: TrainConfig) -> TrainConfig:
     """`base` with another network, its loss and regularisation: the same recordings, augmentation,
-    equivariance, batches, epochs and learning rate. Losses differ, so every row's checkpoint is the
-    one with the smallest squared error on the validation split."""
+    equivariance, batches, epochs and learning rate. A network that sees the body has its axes in
+    its windows, and the filter measures the velocity of one that predicts it. Losses differ, so
+    every row's checkpoint is the one with the smallest squared error on the validation split."""
     width = base.model.width if network in SCALED else None
     model = ModelConfig(name=network, width=width, equivariance=base.model.equivariance)
     regularisation = REGULARISATION.get(network, {})
     optim = dataclasses.replace(base.optim, best_by="squared_error", **regularisation)
-    return dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)
+    config = dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)
+    built = models.from_config(model)
+    if models.channels(built) == 12:
+        rotated = dataclasses.replace(base.data, window_rotation="body_axes")
+        config = dataclasses.replace(config, data=rotated)
+    if "velocity" in models.quantities(built):
+        settings = dataclasses.replace(base.filter, measures="velocity")
+        config = dataclasses.replace(config, filter=settings)
+    return config
 
 
 def loss(network: str, base: TrainConfig) -> LossConfig:
-    """The published loss of a network; GNIO's is that of the experiment, and so is the bound on
+    """The published loss of a network; GNIO's is that of the experiment, as is that of networks of
+    ours, and so is the bound on
     outliers of every likelihood."""
     bound = base.loss.outlier_sigmas
     match network:
-        case "gnio":
+        case "gnio" | "gru" | "state_space" | "experts" | "trunk":  # the others are ours
             return base.loss
+        case "ionet":
+            return LossConfig(name="polar")
+        case "airio":
+            return LossConfig(name="body_velocity")
         case "tlio":
             fixed = {"log_std_from_epoch": held_epochs(base.optim), "log_std_floor": -6.907755}
             return LossConfig(mse_weight=0.0, nll_weight=1.0, outlier_sigmas=bound, **fixed)

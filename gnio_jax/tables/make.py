@@ -26,6 +26,7 @@ from gnio_jax.evaluation.statistics import Cell, MetricSummary
 from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments
+from gnio_jax.tables.duration import announce
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.runs import RowResult, run_row
 
@@ -62,6 +63,8 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
         experiment = experiments.comparison(base, options.split, networks(options))
     if options.table == "trajectories":
         options = dataclasses.replace(options, seeds=1)
+    if options.table == "comparison":
+        announce(experiment.rows, Path(options.out), options.seeds, reporter)
     results = [run_row(row, options, reporter, workers) for row in experiment.rows]
     name = f"{options.table}_{options.split}_{options.estimator}"
     path = Path(options.out) / (f"{name}_calibrated" if options.calibrate else name)
@@ -92,8 +95,8 @@ def base_config(options: TablesConfig) -> TrainConfig:
 
 
 def networks(options: TablesConfig) -> tuple[str, ...]:
-    """The networks named by --methods."""
-    names = _words(options.methods)
+    """The networks named by --methods; "all" stands for those of this package."""
+    names = NETWORKS if options.methods == "all" else _words(options.methods)
     unknown = [f"no network '{name}'" for name in names if name not in models.names()]
     if unknown or not names:
         problem = unknown[0] if unknown else "names no network"

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from gnio_jax import calibration, data
+from gnio_jax import calibration, data, models
 from gnio_jax import config as configuration
 from gnio_jax.config import CalibrateConfig, EvaluateConfig, TablesConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import reuse
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Scores
-from gnio_jax.networks.folder import read_settings
+from gnio_jax.networks.folder import WEIGHTS, read_settings
 from gnio_jax.reporting import Reporter
 from gnio_jax.tables.experiments import TableRow
 from gnio_jax.training import loop, run_folder
@@ -73,7 +73,7 @@ def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers
     already."""
     states: dict[str, list[int]] = {"begun": [], "new": [], "finished": []}
     for seed_config in configuration.with_seeds(config, seeds):
-        states[_state(seed_config)].append(seed_config.seed)
+        states[run_state(seed_config)].append(seed_config.seed)
     for state in ("begun", "new"):
         if not states[state]:
             continue
@@ -85,7 +85,7 @@ def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers
             raise Interrupted(outcomes[-1].stopped_by)
 
 
-def _state(config: TrainConfig) -> str:
+def run_state(config: TrainConfig) -> str:
     """State of the run of `config`: new, begun or finished. Raises `InputError` if its folder has a
     run with other settings or of other recordings."""
     workdir = Path(config.workdir or "")
@@ -102,6 +102,8 @@ def _state(config: TrainConfig) -> str:
         ):  # otherwise the folder has moved
             problem = f"was trained on the recordings of {trained_root}, not of {root}"
             raise InputError(file, problem, "give another --out")
+    if models.trained_by(models.from_experiment(config)) != "gradient":  # has no epochs
+        return "finished" if (workdir / WEIGHTS).exists() else "new"
     log = workdir / "metrics.jsonl"
     rows = log.read_text(encoding="utf-8").count("\n") if log.exists() else 0
     return "finished" if rows >= config.optim.epochs else "begun"

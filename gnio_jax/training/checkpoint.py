@@ -124,7 +124,7 @@ def load_latest(workdir: Path) -> TrainedNetwork:
     _refuse_missing(workdir)
     file = workdir / "config.yaml"
     config = configuration.validate(configuration.load(file), str(file))
-    model = models.from_config(config.model)
+    model = models.from_experiment(config, str(file))
     template = {"batch_stats": {}, **models.variable_shapes(model, config.data.seen)}
     if numbers := filter_numbers(config):
         template["filter"] = numbers

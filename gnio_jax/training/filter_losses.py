@@ -99,7 +99,11 @@ def filter_losses(
     # so the position's own covariance is that of the displacement from the start (ours).
     covariance = history.covariance[:, VELOCITY_POSITION, VELOCITY_POSITION]
     state = gaussian_nll(error[1:], covariance)
-    window = window_error(history.displacement, estimate, truth, config.clones_per_window)
+    if config.measures == "velocity":
+        seconds = config.window * config.dt
+        window = velocity_error(history.displacement, truth, seconds)
+    else:
+        window = window_error(history.displacement, estimate, truth, config.clones_per_window)
     translation = relative_translation(estimate, truth, max(1, round(1 / config.clone_seconds)))
     waypoints = waypoint_error(estimate.position, segment.waypoint)
     posed = (
@@ -264,6 +268,20 @@ def _eliminate(
         error = error[:, 1:] - column * error[:, :1]
         covariance = covariance[:, 1:, 1:] - column[:, :, None] * covariance[:, :1, 1:]
     return jnp.stack(variances, axis=1), jnp.stack(remainders, axis=1)
+
+
+def velocity_error(
+    velocity: Float[Array, "k 3"], truth: MotionPath, seconds: float
+) -> Float[jax.Array, ""]:
+    """Squared error of the measured velocities in the body, in metres per window of this length,
+    summed over the axes, mean over the windows; rows of NaN are no measurements.
+
+    The true velocity is expressed in the true body, which has no yaw error.
+    """
+    true_velocity = jnp.einsum("kji,kj->ki", truth.rotation[1:], truth.velocity[1:])
+    present = jnp.all(jnp.isfinite(velocity), axis=1)
+    error = jnp.where(present[:, None], velocity - seconds * true_velocity, 0.0)
+    return jnp.sum(error**2) / jnp.maximum(jnp.sum(present), 1)
 
 
 def window_error(

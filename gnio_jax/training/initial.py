@@ -41,9 +41,7 @@ def load_initial_network(config: TrainConfig) -> TrainedNetwork | None:
 def _describe_network(config: TrainConfig) -> dict[str, Any]:
     """What two experiments share if they have the same network: its name and options, and its
     windows."""
-    model: Any = models.from_config(config.model)
-    while hasattr(model, "network"):  # inside an equivariant construction or behind a corrector
-        model = model.network
+    model: Any = models.innermost(models.from_config(config.model))
     fields = (field.name for field in dataclasses.fields(model))
     options = {name: getattr(model, name) for name in fields if name not in ("parent", "name")}
     # Any network can be averaged over headings, which adds no parameters.

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -38,6 +38,12 @@ DISPATCH_SECONDS = 0.5
 and a quick stop."""
 CHECKPOINT_SECONDS = 600.0
 """Longest time between checkpoints within an epoch, s; every epoch also ends with one."""
+METHODS: dict[str, Callable[[TrainConfig, Path, Reporter, int], float]] = {
+    "support_vectors": support_vectors.train
+}
+"""Training without steps, by what a network says in its attribute `trained_by`: functions of the
+experiment, the work folder, the reporter and the number of processes that read. They write the run
+and return its loss on the validation split."""
 NO_GRADIENT = 1e-9
 """Norm of a gradient, mean over an epoch, below which Adam, whose ε is 1e-8, makes almost no
 step."""
@@ -103,9 +109,10 @@ def train_all(
         run_folder.refuse_other_run(configuration.validate(config), resume)
         for config, resume in zip(configs, resumes, strict=True)
     ]
-    if configs[0].model.name == "ridi":  # without steps
+    method = METHODS.get(models.trained_by(models.from_experiment(configs[0])))
+    if method is not None:  # without steps
         losses = [
-            support_vectors.train(config, workdir, reporter, workers)
+            method(config, workdir, reporter, workers)
             for config, workdir in zip(configs, workdirs, strict=True)
         ]
         return [TrainingResult(*run, None) for run in zip(workdirs, losses, strict=True)]
@@ -136,7 +143,7 @@ def train_all(
 def choose_task(config: TrainConfig) -> type[Task]:
     """The task of an experiment. Raises `InputError` for segments without a network with memory,
     and for strides that do not fit such a network."""
-    model = models.from_config(config.model)
+    model = models.from_experiment(config)
     remembers = isinstance(model, NetworkWithMemory)
     if config.segments.seconds and not remembers:
         problem = f"is for a network with memory, and '{config.model.name}' has none"

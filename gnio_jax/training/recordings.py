@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 from gnio_jax import config as configuration
-from gnio_jax import data, models, parallel
+from gnio_jax import data, models, networks, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Reporter
@@ -51,7 +51,7 @@ def set_up(
     are too short, a batch that is larger than the split, and one that the devices cannot share
     evenly. `workers` processes read recordings that are slow to read, and make smoothed poses.
     """
-    model = models.from_config(config.model)  # finds mistakes in its options before reading data
+    model = models.from_experiment(config)  # finds mistakes in its options before reading data
     size, devices = config.optim.batch_size, parallel.count()
     if size % devices:
         problem = f"is {size}, which {devices} devices cannot share evenly"
@@ -119,6 +119,7 @@ def read_split(
     sequences: Iterable[Sequence] = data.load_each(
         dataset, config.data_root, split, workers, progress, left_out
     )
+    corrector = networks.load_corrector(config.filter, config.data.rate)
     if pose_network is not None:
         sequences = add_smoothed_poses(sequences, pose_network, split, reporter, workers)
     for sequence in sequences:
@@ -129,5 +130,8 @@ def read_split(
             except InputError as error:
                 reporter.line(f"warning: {error}")
                 continue
+        if corrector is not None:
+            accel, gyro, _ = corrector.correct(resampled.accel, resampled.gyro)
+            resampled = resampled._replace(accel=accel, gyro=gyro)
         samples[resampled.name] = len(resampled.time)
         yield resampled

@@ -112,7 +112,7 @@ class SegmentTask(Task):
     ) -> dict[str, Float[jax.Array, ""]]:
         """The losses of the displacements of single windows (`losses.losses`), and of their sums
         over longer times."""
-        rows = jax.tree.map(lambda leaf: leaf.reshape(-1, 3), prediction._replace(diagnostics={}))
+        rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), prediction)
         truth = segments.displacement.reshape(-1, 3)
         windows = Windows(jnp.zeros((len(truth), 0, 6)), truth, jnp.zeros((len(truth), 0, 3)))
         values = losses(rows, windows, self.config.loss, stage, predicted_axes(self.model))
@@ -150,7 +150,7 @@ class SegmentTask(Task):
                 statistics = changed.get("batch_stats", {})
             memory, prediction = result
             memory = jax.lax.stop_gradient(memory)
-            parts.append(prediction._replace(diagnostics={}))
+            parts.append(_with_bins(prediction))
         joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
         return jax.tree.map(lambda leaf: leaf[:, grid.window - 1 :], joined), statistics
 
@@ -198,6 +198,14 @@ class SegmentTask(Task):
             f"{row[f'val_rmse/{name}']:.3f} ({row[f'val_ratio/{name}']:.2f})" for name in names
         )
         return f"mse {row['mse']:.4g} nll {row['nll']:.4g}  bands {' '.join(bands)}  "
+
+
+def _with_bins(prediction: Prediction) -> Prediction:
+    """The prediction with the diagnostics of a distribution over bins alone, for its loss."""
+    says = prediction.diagnostics
+    return prediction._replace(
+        diagnostics={name: value for name, value in says.items() if name.startswith("bin_")}
+    )
 
 
 def horizon_error(

@@ -1,7 +1,7 @@
 """RIDI's support vectors, fitted by scikit-learn (`pip install gnio-jax[ridi]`).
 
-`gnio train` comes here for the network `ridi`: there are no steps and no gradients, and the whole
-training split is seen at once.
+`gnio train` comes here for networks that say `trained_by = "support_vectors"`, as `ridi` does.
+There are no steps and no gradients, and the whole training split is seen at once.
 """
 
 from __future__ import annotations

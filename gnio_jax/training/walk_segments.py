@@ -22,7 +22,13 @@ from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, spans
 from gnio_jax.training.segments import join_segments, segment_shares
 from gnio_jax.training.walkway import Pace, SlowMotion, change_pace, draw_pace, slow_motion
-from gnio_jax.training.windows import low_pass_margin, random_low_pass
+from gnio_jax.training.windows import (
+    low_pass_margin,
+    mirror_channels,
+    random_low_pass,
+    random_mirror,
+    random_rocking,
+)
 from gnio_jax.types import GRAVITY, Array, Sequence
 from gnio_jax.windows import rotate_channels, rotate_vectors
 
@@ -152,6 +158,7 @@ def cut_walks(
     inner = slice(margin, margin + samples)
     ends = slice(margin, margin + samples + 1, grid.stride)
     drift = jnp.zeros((len(rows), grid.intervals + 1), jnp.float32)
+    mirror = jnp.ones((len(rows), 3), jnp.float32)
     if config is None:
         x, y = jax.vmap(geometry.yaw_direction)(rotation[:, margin])
         turn = jax.vmap(lambda x, y: geometry.heading_rotation(x, -y))(x, y)
@@ -160,6 +167,11 @@ def cut_walks(
         pass_key, error_key, yaw_key, rest_key = jax.random.split(key, 4)
         if margin:
             imu = random_low_pass(pass_key, imu, config, grid.rate)
+        imu = random_rocking(jax.random.fold_in(key, 4), imu, config.rocking_share)
+        if config.mirror_share:
+            mirror = random_mirror(jax.random.fold_in(key, 5), len(rows), config.mirror_share)
+            imu = mirror_channels(mirror, imu)
+            rotation = mirror[:, None, :, None] * rotation * mirror[:, None, None, :]
         imu, rates = with_errors(error_key, imu, rotation, config)
         drift = jnp.cumsum(rates[:, inner], axis=1)[:, grid.stride - 1 :: grid.stride] / grid.rate
         drift = jnp.pad(drift, ((0, 0), (1, 0)))
@@ -173,6 +185,7 @@ def cut_walks(
     length = jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0)))
     moved = length[:, grid.window :] - length[:, : -grid.window]
     displacement = position[:, grid.window :] - position[:, : -grid.window]
+    displacement = displacement * mirror[:, None]
     displacement = rotate_vectors(turn, displacement[:, :, None])[:, :, 0]
     displacement = turn_rows(displacement, drift[:, : -grid.window])
     signals = rotate_channels(turn, imu[:, inner])

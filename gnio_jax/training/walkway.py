@@ -76,19 +76,21 @@ class Pace(NamedTuple):
     """k: horizontal slow motion."""
     gain: Float[Array, "b"]
     """Alternating part."""
+    vertical_gain: Float[Array, "b"]
+    """Vertical alternating part, times `gain`."""
     stretch: Float[Array, "b"]
     """τ: speed at which the walk is played."""
 
 
 def unchanged(count: int) -> Pace:
     """The pace of `count` segments as they were walked."""
-    return Pace(*jnp.ones((3, count), jnp.float32))
+    return Pace(*jnp.ones((4, count), jnp.float32))
 
 
 def draw_pace(key: PRNGKeyArray, count: int, config: AugmentConfig) -> Pace:
     """Factors that are uniform in their logarithms, and 1 where a change is switched off; the
     walkway moves in a share of the segments."""
-    keys = jax.random.split(key, 4)
+    keys = jax.random.split(key, 5)
 
     def factors(key: PRNGKeyArray, bounds: tuple[float, float]) -> jax.Array:
         low, high = (jnp.float32(np.log(bound)) for bound in bounds)
@@ -98,6 +100,7 @@ def draw_pace(key: PRNGKeyArray, count: int, config: AugmentConfig) -> Pace:
     return Pace(
         jnp.where(moves, factors(keys[0], config.walkway), 1.0),
         factors(keys[1], config.alternating_gain),
+        factors(keys[4], config.vertical_gain),
         factors(keys[2], config.time_stretch),
     )
 
@@ -111,7 +114,8 @@ def change_pace(
     """Specific force and position in the world after walkway and gain. Jittable."""
     ones = jnp.ones_like(pace.walkway)
     walkway = jnp.stack([pace.walkway, pace.walkway, ones], axis=1)[:, None]
-    gain = pace.gain[:, None, None]
+    gain = pace.gain[:, None] * jnp.stack([ones, ones, pace.vertical_gain], axis=1)
+    gain = gain[:, None]
     gravity = jnp.array([[[0, 0, GRAVITY]]], accel.dtype)
     alternating = accel - gravity - slow.accel
     return (

@@ -41,6 +41,9 @@ def load_pose_network(config: TrainConfig, reporter: Reporter) -> PoseNetwork | 
     if name is None:
         return None
     network = networks.load(name)
+    if network.config.filter.corrector is not None:
+        problem = "names a network with a corrector before its filter, which makes no poses"
+        raise InputError("data.poses_by", problem, "name one without filter.corrector")
     rate = network.config.data.rate
     if rate < config.data.rate:
         problem = f"names a network of {rate:g} Hz, slower than data.rate"

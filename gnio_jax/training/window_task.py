@@ -19,7 +19,7 @@ import optax
 from flax import linen as nn
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from gnio_jax import parallel
+from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.models.layers import MOMENTUM
 from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
@@ -169,9 +169,7 @@ def apply_training(
 
 def predicted_axes(model: nn.Module) -> int:
     """How many axes of the displacement a network predicts: 2 where the vertical is always 0."""
-    while hasattr(model, "network"):  # inside an equivariant construction or behind a corrector
-        model = model.network
-    return getattr(model, "output_dim", 3)
+    return getattr(models.innermost(model), "output_dim", 3)
 
 
 # The statistics of batch normalisation

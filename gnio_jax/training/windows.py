@@ -32,6 +32,9 @@ from gnio_jax.windows import (
     without_any,
 )
 
+STRONGEST_ROCKING = 1.25
+"""Largest factor of `random_rocking`."""
+
 
 class WindowSource(NamedTuple):
     """All recordings of a split, end to end, and where windows may start in them. float32."""
@@ -213,6 +216,51 @@ def random_low_pass(
     return jnp.concatenate([smooth, imu[..., 6:]], axis=-1)
 
 
+def random_mirror(key: PRNGKeyArray, count: int, share: float) -> Float[jax.Array, "b 3"]:
+    """Factors of the three components of a vector in a frame with gravity on z: −1 for y in a
+    random share of the signals, otherwise 1."""
+    mirrored = _uniform(key, (count,), 0.0, 1.0) < share
+    ones = jnp.ones(count, jnp.float32)
+    return jnp.stack([ones, jnp.where(mirrored, -1.0, ones), ones], axis=1)
+
+
+def mirror_channels(
+    mirror: Float[jax.Array, "b 3"], imu: Float[jax.Array, "b n c"]
+) -> Float[jax.Array, "b n c"]:
+    """Signals behind a mirror (ours). A specific force changes its sign across the mirror, an
+    angular rate along it, because a rate is an axial vector. The mirrored body has its y axis on
+    the other side, so that its axes are right-handed again."""
+    axial = mirror * mirror[:, 1:2]
+    factors = jnp.concatenate([mirror, axial, mirror, mirror * mirror[:, 1:2]], axis=1)
+    return imu * factors[:, None, : imu.shape[-1]]
+
+
+def random_rocking(
+    key: PRNGKeyArray, imu: Float[jax.Array, "b n c"], share: float
+) -> Float[jax.Array, "b n c"]:
+    """Signals in a frame with gravity on z, of which a random share is of a phone that rocks
+    otherwise in the hand (ours).
+
+    The angular rate about horizontal axes is turned about the vertical by a uniform angle and
+    scaled by a uniform factor from 0 to `STRONGEST_ROCKING`. This is exact: the specific force in
+    the world is that of the place of the IMU, however the phone turns about this place. How a hand
+    lets a phone nod with each step differs between people, even in its sign, while the relation of
+    the accelerations to the direction of travel is that of the gait.
+    """
+    if not share:
+        return imu
+    share_key, angle_key, factor_key = jax.random.split(key, 3)
+    count = len(imu)
+    chosen = _uniform(share_key, (count,), 0.0, 1.0) < share
+    angle = _uniform(angle_key, (count,), 0.0, 2 * math.pi)
+    factor = _uniform(factor_key, (count,), 0.0, STRONGEST_ROCKING)
+    cosine = jnp.where(chosen, factor * jnp.cos(angle), 1.0)[:, None]
+    sine = jnp.where(chosen, factor * jnp.sin(angle), 0.0)[:, None]
+    x, y = imu[..., 3], imu[..., 4]
+    turned = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+    return jnp.concatenate([imu[..., :3], turned, imu[..., 5:]], axis=-1)
+
+
 def low_pass_margin(config: AugmentConfig, rate: float) -> int:
     """Number of samples on either side that `random_low_pass` needs: 0.25 s, beyond which
     there are at most 2.4 % of the impulse response (of its absolute values) from 4 Hz on, and 6.6 %
@@ -235,6 +283,15 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
     if config.rest_share:
         windows = _at_rest(jax.random.fold_in(key, 5), windows, config.rest_share)
     imu, count = windows.imu, len(windows.imu)
+    imu = random_rocking(jax.random.fold_in(key, 6), imu, config.rocking_share)
+    if config.mirror_share:
+        mirror = random_mirror(jax.random.fold_in(key, 8), count, config.mirror_share)
+        imu = mirror_channels(mirror, imu)
+        windows = windows._replace(
+            displacement=windows.displacement * mirror, steps=windows.steps * mirror[:, None]
+        )
+    if config.vertical_gain != (1.0, 1.0):
+        imu = _with_bounce(jax.random.fold_in(key, 7), imu, config.vertical_gain)
     if any(config.scale):
         error = _uniform(jax.random.fold_in(key, 4), (count, 1, 2), -1.0, 1.0)
         imu = _on_samples(
@@ -263,6 +320,23 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
         noise = noise * _channels(*config.noise)
         windows = windows._replace(imu=_on_samples(windows.imu, lambda x: x + noise))
     return windows
+
+
+def _with_bounce(
+    key: PRNGKeyArray, imu: Float[jax.Array, "b n c"], bounds: tuple[float, float]
+) -> Float[jax.Array, "b n c"]:
+    """The windows, with the vertical acceleration about its mean times a factor, which is uniform
+    in its logarithm.
+
+    The displacement remains. A height h(t) is the sum of a part with constant acceleration, which
+    is the mean, and an alternating part, whose velocity may be chosen so that it has the same value
+    at both ends of the window. The factor multiplies the second part.
+    """
+    low, high = map(math.log, bounds)
+    factor = jnp.exp(_uniform(key, (len(imu), 1), low, high))
+    vertical = imu[..., 2]
+    mean = jnp.mean(vertical, axis=1, keepdims=True)
+    return imu.at[..., 2].set(mean + factor * (vertical - mean))
 
 
 def _at_rest(key: PRNGKeyArray, windows: Windows, share: float) -> Windows:

@@ -29,7 +29,7 @@ def recording(name, time, position, rotation, gyro, accel, start):
     reference = Trajectory(time, position, quaternion)
     nothing = np.full((1, 3), np.nan)
     return PreparedRecording(
-        name, name, "", time, gyro, accel, None, start, None, reference, nothing, ()
+        name, name, "", time, gyro, accel, None, start, None, reference, nothing, nothing, ()
     )
 
 

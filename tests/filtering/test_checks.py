@@ -84,8 +84,8 @@ def wrong():
     ):
         wrong_state = state._replace(clone_covariance=covariance)
         yield f"state.clone_covariance: is not {problem}", {"state": wrong_state}
-    yield "frame: must be 'own' or 'given', found 'onw'", {"frame": "onw"}
-    yield "frame: must be 'own' or 'given', found None", {"frame": None}
+    yield "frame: must be 'own' or 'given' or 'body', found 'onw'", {"frame": "onw"}
+    yield "frame: must be 'own' or 'given' or 'body', found None", {"frame": None}
     position = np.zeros((INTERVALS, 2))
     covariance = np.tile(np.eye(2), (INTERVALS, 1, 1))
     fix = filtering.Fix(position, covariance, *np.ones((3, INTERVALS)))

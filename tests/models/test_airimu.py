@@ -140,8 +140,30 @@ def test_the_network_sees_the_corrected_samples_in_its_frame():
     }
     wanted = quick(plain.apply)(inner, jnp.asarray(seen))
     np.testing.assert_allclose(found.displacement, wanted.displacement, atol=1e-5)
-    accel, gyro = airimu.correct_recording(variables, smooth[:, :3], smooth[:, 3:])
+    # So does the filter, with the variances.
+    parts = {kind: tree["corrector"] for kind, tree in variables.items()}
+    accel, gyro, variance = airimu.Corrector(parts).correct(smooth[:, :3], smooth[:, 3:])
     np.testing.assert_allclose(np.hstack([accel, gyro]), body.reshape(-1, 6), atol=1e-4)
+    of_windows = found.diagnostics["corrected_variance"][0]
+    np.testing.assert_allclose(variance, of_windows, rtol=1e-3)
+
+
+def test_block_by_block_a_corrector_adds_what_it_adds_to_the_whole_recording():
+    network, samples = airimu.AirIMU(), 66
+    windows = jax.ShapeDtypeStruct((1, samples, 6), jnp.float32)
+    shapes = jax.eval_shape(network.init, jax.random.key(0), windows)
+    corrector = airimu.Corrector(drawn(dict(shapes)))
+    imu = np.cumsum(RNG.normal(0, 0.1, (samples, 6)), axis=0)
+    accel, gyro, variance = corrector.correct(imu[:, :3], imu[:, 3:])
+    added = np.hstack([accel, gyro]) - imu
+    assert np.abs(added[9:]).max() > 1e-3 and not added[:9].any()
+    memory, padded = corrector.begin(), np.concatenate([np.zeros((corrector.before, 6)), imu])
+    for first in range(0, samples - corrector.after, corrector.block):
+        width = corrector.before + 1 + corrector.after
+        memory, of_block, spread = corrector.step(memory, padded[first : first + width])
+        rows = slice(first, first + corrector.block)
+        np.testing.assert_allclose(of_block, added[rows], atol=2e-6)
+        np.testing.assert_allclose(spread, variance[rows], rtol=1e-4)
 
 
 def test_a_corrector_is_refused_where_it_cannot_be():

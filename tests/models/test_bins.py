@@ -3,16 +3,17 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.optimize import brentq
 from scipy.stats import norm
 
 from gnio_jax import models
 from gnio_jax.config import LossConfig
-from gnio_jax.models.bins import BinHead
+from gnio_jax.models.bins import BinHead, centres_of
 from gnio_jax.training.losses import loss_stage, losses
 from gnio_jax.types import Prediction, Windows
 from tests.support.compiling import quick
-from tests.support.networks import count, drawn
+from tests.support.networks import SMALL, count, drawn
 from tests.support.numpy_layers import linear, softmax
 
 RNG = np.random.default_rng(7)
@@ -43,6 +44,29 @@ def test_mean_and_variance_are_those_of_the_bins():
         variance = shares @ CENTRES**2 - wanted**2 + 1 / 12  # uniform within a bin of 1 m
         np.testing.assert_allclose(mean, wanted, atol=1e-5)
         np.testing.assert_allclose(np.exp(2 * log_std), variance, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["gru", "ronin_tcn"])
+def test_networks_with_memory_have_the_head_too(name):
+    """With the same prediction for a window as step by step, and the uncertainty of the bins."""
+    model = models.create(name, **SMALL[name], head="bins", reach=2.0)
+    variables = drawn({"batch_stats": {}, **models.variable_shapes(model, 40)})
+    assert "uncertainty" not in variables["params"]
+    windows = jnp.asarray(RNG.standard_normal((2, 40, 6)), jnp.float32)
+    whole = quick(model.apply)(variables, windows)
+    state, parts = model.begin(2), []
+    for first in (0, 20):
+        state, part = model.apply(
+            variables, state, windows[:, first : first + 20], 20, method="advance"
+        )
+        parts.append(part)
+    np.testing.assert_allclose(parts[1].displacement[:, 0], whole.displacement, atol=1e-5)
+    shares = softmax(np.asarray(whole.diagnostics["bin_logits"], float))
+    centres = np.asarray(centres_of(jnp.float32(2.0), 512), float)
+    mean = shares @ centres
+    variance = shares @ centres**2 - mean**2 + (4 / 512) ** 2 / 12
+    np.testing.assert_allclose(whole.displacement, mean, atol=1e-4)
+    np.testing.assert_allclose(whole.log_std, 0.5 * np.log(variance), atol=1e-4)
 
 
 def label_of(truth, std):

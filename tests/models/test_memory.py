@@ -171,7 +171,7 @@ def test_intervals_that_do_not_fit_the_strides_are_refused():
 def test_equivariance_around_a_memory_is_refused():
     with pytest.raises(InputError, match="turns with the world already, by its memory's frame"):
         models.create("gru", equivariance="four_headings")
-    with pytest.raises(InputError, match="output_dim must be 3 with a gated head, found 2"):
+    with pytest.raises(InputError, match="output_dim must be 3 with the head gated, found 2"):
         models.create("ronin_lstm", head="gated", output_dim=2)
 
 

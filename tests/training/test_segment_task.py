@@ -135,6 +135,42 @@ def test_a_frame_drifts_as_its_gyro_says():
         np.testing.assert_allclose(drifted.signals[0, samples, :3], forces, atol=1e-4)
 
 
+def test_a_mirrored_segment_is_that_of_a_mirrored_walk():
+    """The walk behind the mirror y → −y, cut as any other."""
+    sequence, config = walk(), dataclasses.replace(OFF, mirror_share=1.0)
+    w, x, y, z = sequence.orientation.T
+    behind = sequence._replace(
+        accel=sequence.accel * [1, -1, 1],
+        gyro=sequence.gyro * [-1, 1, -1],
+        orientation=np.stack([w, -x, y, -z], axis=1),
+        position=sequence.position * [1, -1, 1],
+    )
+    grid = SegmentGrid(N, 20, W, RATE)
+    source, expected = (
+        jax.device_put(walk_source([walked], experiment(None, "unused"), training=False))
+        for walked in (sequence, behind)
+    )
+    row = source.earliest[:1]
+    mirrored = jax.device_get(draw_walks(jax.random.key(2), source, row, grid, config))
+    plain = jax.device_get(draw_walks(jax.random.key(2), expected, row, grid, OFF))
+    np.testing.assert_allclose(mirrored.signals, plain.signals, atol=1e-4)
+    np.testing.assert_allclose(mirrored.displacement, plain.displacement, atol=1e-5)
+    np.testing.assert_allclose(mirrored.moved, plain.moved, atol=1e-5)
+
+
+def test_a_segment_of_a_phone_that_rocks_otherwise_has_the_same_forces():
+    source = jax.device_put(walk_source([walk()], experiment(None, "unused"), training=False))
+    row, grid = source.earliest[:1], SegmentGrid(N, 20, W, RATE)
+    plain, rocked = (
+        jax.device_get(draw_walks(jax.random.key(2), source, row, grid, augment)).signals
+        for augment in (OFF, dataclasses.replace(OFF, rocking_share=1.0))
+    )
+    np.testing.assert_allclose(rocked[..., [0, 1, 2, 5]], plain[..., [0, 1, 2, 5]], atol=1e-6)
+    factor = (rocked[..., 3] + 1j * rocked[..., 4]) / (plain[..., 3] + 1j * plain[..., 4])
+    np.testing.assert_allclose(factor, np.full_like(factor, factor[0, 0]), rtol=1e-3)
+    assert np.abs(factor[0, 0] - 1) > 0.05
+
+
 def test_biases_are_constant_in_the_body():
     rng = np.random.default_rng(0)
     imu = jnp.asarray(rng.standard_normal((3, 40, 6)), jnp.float32)

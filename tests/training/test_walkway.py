@@ -71,13 +71,15 @@ def test_a_short_stretch_is_no_error():
     assert np.isfinite(slow.position).all() and np.isfinite(slow.accel).all()
 
 
-@pytest.mark.parametrize("walkway, gain", [(1.0, 1.0), (1.7, 1.0), (0.6, 1.3)])
-def test_changed_accelerations_integrate_to_changed_positions(walkway, gain):
+@pytest.mark.parametrize(
+    "walkway, gain, vertical", [(1.0, 1.0, 1.0), (1.7, 1.0, 0.5), (0.6, 1.3, 1.2)]
+)
+def test_changed_accelerations_integrate_to_changed_positions(walkway, gain, vertical):
     position = walk(1500)
     with jax.enable_x64(True):
         slow = slow_motion(position, np.ones(len(position), bool), RATE)
         accel = accelerations(position) + UP
-        pace = Pace(jnp.array([walkway]), jnp.array([gain]), jnp.ones(1))
+        pace = Pace(*(jnp.array([x]) for x in (walkway, gain, vertical, 1.0)))
         arguments = (jnp.asarray(x)[None] for x in (accel, position))
         batch = SlowMotion(*(jnp.asarray(x)[None] for x in slow))
         changed, moved = jax.device_get(jax.jit(change_pace)(*arguments, batch, pace))
@@ -86,10 +88,14 @@ def test_changed_accelerations_integrate_to_changed_positions(walkway, gain):
     speeds = [np.abs(np.diff(x[400:-400:100], axis=0)[:, :2]).mean() for x in (moved[0], position)]
     assert speeds[0] / speeds[1] == pytest.approx(walkway, rel=0.05)
     steps = [
-        np.std((x - slow.position * [k, k, 1])[300:-300, 2])
+        np.std((x - slow.position * [k, k, 1])[300:-300], axis=0)
         for x, k in ((moved[0], walkway), (position, 1.0))
     ]
-    assert steps[0] / steps[1] == pytest.approx(gain, rel=1e-3)
+    expected = np.array([gain, gain, gain * vertical])
+    moves = steps[1] > 1e-6
+    assert moves[2] and steps[0][moves] / steps[1][moves] == pytest.approx(
+        expected[moves], rel=1e-3
+    )
 
 
 def test_factors_are_drawn_within_their_bounds():
@@ -97,6 +103,7 @@ def test_factors_are_drawn_within_their_bounds():
         walkway_share=0.25,
         walkway=(0.5, 2.0),
         alternating_gain=(0.8, 1.25),
+        vertical_gain=(0.3, 1.5),
         time_stretch=(1.0, 1.5),
     )
     pace = jax.device_get(draw_pace(jax.random.key(0), 4000, config))
@@ -105,6 +112,7 @@ def test_factors_are_drawn_within_their_bounds():
     for values, low, high in (
         (pace.walkway[moved], 0.5, 2.0),
         (pace.gain, 0.8, 1.25),
+        (pace.vertical_gain, 0.3, 1.5),
         (pace.stretch, 1.0, 1.5),
     ):
         share = (np.log(values) - np.log(low)) / (np.log(high) - np.log(low))

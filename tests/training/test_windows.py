@@ -195,6 +195,90 @@ def test_a_window_at_rest_has_gravity_alone_and_no_displacement():
         np.testing.assert_array_equal(new[~lies], old[~lies])
 
 
+def simulated_phone(mirrored):
+    """Samples in the world, and positions, of a phone that moves and turns along smooth curves,
+    from finite differences; behind the mirror y → −y if `mirrored`."""
+    dt, time = 1e-4, 1e-4 * np.arange(4000)[:, None]
+    rng = np.random.default_rng(3)
+    size, rate, phase = rng.uniform(0.5, 3, (3, 3, 6))
+    waves = (size[None] * np.sin(rate[None] * 4 * time[:, :, None] + phase[None])).sum(axis=2)
+    position, turns = waves, 0.2 * np.roll(waves, 1, axis=1)
+    attitude = Rotation.from_rotvec(turns).as_matrix()
+    if mirrored:
+        mirror = np.diag([1.0, -1.0, 1.0])
+        position, attitude = position @ mirror, mirror @ attitude @ mirror
+    accel = np.diff(position, 2, axis=0) / dt**2 + [0, 0, 9.81]
+    steps = attitude[1:] @ attitude[:-1].transpose(0, 2, 1)
+    gyro = Rotation.from_matrix(steps).as_rotvec() / dt
+    axes = attitude[:, :, :2].transpose(0, 2, 1).reshape(-1, 6)
+    return np.concatenate([accel, gyro[:-1], axes[:-2]], axis=1), position
+
+
+def test_a_mirrored_window_is_that_of_a_phone_behind_the_mirror():
+    (imu, position), (expected, reflected) = simulated_phone(False), simulated_phone(True)
+    assert np.abs(imu - expected).max() > 1.0
+    moved, moved_behind = position[-1] - position[0], reflected[-1] - reflected[0]
+    count = 400
+    before = Windows(
+        np.broadcast_to(imu[::400].astype(np.float32), (count, 10, 12)),
+        np.broadcast_to(moved.astype(np.float32), (count, 3)),
+        np.zeros((count, 10, 3), np.float32),
+    )
+    after = augmented(before, mirror_share=0.25)
+    mirrored = np.abs(after.displacement - moved).max(axis=1) > 1e-3
+    assert 0.15 < mirrored.mean() < 0.35
+    for which, samples, way in (
+        (mirrored, expected[::400], moved_behind),
+        (~mirrored, imu[::400], moved),
+    ):
+        target = np.broadcast_to(samples, after.imu[which].shape)
+        np.testing.assert_allclose(after.imu[which], target, atol=2e-4)
+        target = np.broadcast_to(way, after.displacement[which].shape)
+        np.testing.assert_allclose(after.displacement[which], target, atol=1e-5)
+
+
+def test_a_phone_that_rocks_otherwise_measures_the_same_forces():
+    """One turn about the vertical and one factor for a window's horizontal rates; nothing else."""
+    before = batch()
+    after = augmented(before, rocking_share=0.75)
+    np.testing.assert_array_equal(after.imu[..., [0, 1, 2, 5]], before.imu[..., [0, 1, 2, 5]])
+    np.testing.assert_array_equal(after.displacement, before.displacement)
+    old, new = (x.imu[..., 3] + 1j * x.imu[..., 4] for x in (before, after))
+    factor = new / old
+    np.testing.assert_allclose(factor, np.broadcast_to(factor[:, :1], factor.shape), rtol=1e-3)
+    changed = np.abs(factor[:, 0] - 1) > 1e-4
+    assert 0.7 < changed.mean() < 0.8
+    size, angle = np.abs(factor[changed, 0]), np.angle(factor[changed, 0])
+    assert stats.kstest(size / 1.25, "uniform").pvalue > 1e-3
+    assert stats.kstest(angle / np.pi, "uniform", (-1, 2)).pvalue > 1e-3
+
+
+def test_another_bounce_moves_a_window_as_far():
+    """With the accelerations of the changed window and some vertical velocity at its start, a
+    double integration gives the same displacement, and the height's swing is the factor's."""
+    before = batch(500, 100)
+    after = augmented(before, vertical_gain=(0.25, 1.5))
+    np.testing.assert_array_equal(after.imu[..., [0, 1, 3, 4, 5]], before.imu[..., [0, 1, 3, 4, 5]])
+    np.testing.assert_array_equal(after.displacement, before.displacement)
+
+    def swing(windows):
+        """Heights about the curve of constant acceleration that ends where they end."""
+        accel = np.asarray(windows.imu, float)[..., 2]
+        time = np.linspace(0, 1, accel.shape[1] + 1)[None]
+        velocity = np.pad(np.cumsum(accel, axis=1), ((0, 0), (1, 0)))
+        height = np.cumsum(velocity, axis=1)
+        curve = accel.mean(axis=1, keepdims=True) * np.cumsum(
+            np.arange(accel.shape[1] + 1, dtype=float)
+        )
+        rest = height - curve
+        return rest - rest[:, -1:] * time
+
+    factor = np.std(swing(after), axis=1) / np.std(swing(before), axis=1)
+    np.testing.assert_allclose(swing(after), factor[:, None] * swing(before), atol=1e-3)
+    share = (np.log(factor) - np.log(0.25)) / np.log(6.0)
+    assert stats.kstest(share, "uniform").pvalue > 1e-3
+
+
 def magnitude(order, cutoff, frequency):
     """Of an analog Butterworth, by SciPy."""
     return abs(signal.freqs(*signal.butter(order, cutoff, analog=True), worN=frequency)[1])

@@ -18,6 +18,7 @@ from jaxtyping import Float, Num
 from gnio_jax.apps.importing import units
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.files import LogFile, files_of, listed, log_file
+from gnio_jax.apps.importing.readings import RawReadings, columns_of, readings_of
 from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.config import ImportOptions
 from gnio_jax.data import labels
@@ -183,6 +184,7 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
         remedy = "known: CSV, Sensor Logger, phyphox, ROS bags, MCAP and EuRoC folders"
         raise InputError(path, problem, f"{remedy}; a CSV of other columns needs --columns")
     notes, sensors, track = list[str](), dict[str, Sensor](), None
+    others = dict[str, RawReadings]()
     for group, (file,) in groups.items():
         log = _opened(file, names, options.where, notes)
         columns = _columns(log, group, names, options, notes)
@@ -201,12 +203,37 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
                 stamps, second = log.stamps(clock)
             row = log.table.row
             sensors[sensor] = Sensor(sensor, file.path, stamps, values, row, second, unit)
+        for sensor, labeled in columns_of(log.table.columns).items():
+            if not set(labeled.values()) & set(columns.values()):
+                new = readings_of(sensor, log.table, stamps, labeled, second)
+                others.setdefault(sensor, new)
         if "gyro" in group:
             try:
                 track = _reference(log.table, names, sensors["gyro"], options.time_unit)
             except InputError as error:
                 notes.append(f"no reference is taken: {error}")
-    return RawRecording(path, sensors["gyro"], sensors["accel"], notes, [], "android", True, track)
+    recording = RawRecording(path, sensors["gyro"], sensors["accel"], notes, [], "android", True)
+    used = {file.name for tables in groups.values() for file in tables}
+    for file in files:
+        if file.name not in used:
+            others = _others_of(file, notes) | others
+    return recording._replace(track=track, others=tuple(others.values()))
+
+
+def _others_of(file: LogFile, notes: list[str]) -> dict[str, RawReadings]:
+    """The sensors beside the IMU in a table of their own; none if it cannot be read, or has no
+    stamps."""
+    columns = columns_of(file.layout.labels)
+    time = labels.resolved(file.layout.labels).get("time")
+    if not columns or time is None:
+        return {}
+    try:
+        log = _opened(file, {}, None, notes)
+        stamps, second = log.stamps(time)
+        return {s: readings_of(s, log.table, stamps, c, second) for s, c in columns.items()}
+    except InputError as error:
+        notes.append(f"{', '.join(columns)} left out: {error}")
+        return {}
 
 
 def _columns(

@@ -11,6 +11,9 @@ Facts of Sensor Logger (Kelvin Choi; Android and iOS), from its documentation
 - `AccelerometerUncalibrated` includes gravity, in m/s² on Android; on iOS in g unless "Standardise
   Units & Frames" is on (UNITS.md). Its magnitude shows the unit.
 - All accelerations of iOS have the other sign, unless that setting is on (CROSSPLATFORM.md).
+- `Magnetometer` and `MagnetometerUncalibrated` are in µT, `pressure` of `Barometer` is in mbar, and
+  `Location` has `latitude`, `longitude` (°), `altitude` (m above the ellipsoid) and accuracies of
+  about one standard deviation (m), negative if there is no fix (UNITS.md).
 - `Metadata.csv` says `platform`, ios or android (seen in exports of releases 1.10 and 1.28), and
   since 1.29 `standardisation`, false where that setting is off (seen), true where it is on
   (assumed). Without the file, `TotalAcceleration` means Android; else the sign must be stated.
@@ -24,6 +27,8 @@ Facts of phyphox (RWTH Aachen; Android and iOS), from its sources (github.com/ph
 - Columns `Time (s)`, `Acceleration x (m/s^2)`, `Linear Acceleration x (m/s^2)`, `Gyroscope x
   (rad/s)`. Earlier releases wrote `X (m/s^2)` and `X (rad/s)` (seen in exports). The app translates
   names, so sensors are recognised by units and axes, and only Linear and Gravity by their names.
+- `Magnetic field x (µT)`, `Pressure (hPa)`; the columns of a place are latitude and longitude (°),
+  height (m), velocity, direction (°), horizontal and vertical accuracy (m) in this order (seen).
 - All sensors share one clock, s since the start. It stops while the experiment is paused
   (ExperimentTimeReference.java); `meta/time.csv`, or the sheet `Metadata Time`, has the times of
   START and PAUSE by the phone's clock too.
@@ -36,7 +41,7 @@ from __future__ import annotations
 import csv
 import itertools
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,9 +50,11 @@ import pandas as pd
 
 from gnio_jax.apps.importing.clocks import Sensor, sensor_of
 from gnio_jax.apps.importing.files import LogFile, listed
+from gnio_jax.apps.importing.readings import ACCURACY, RawReadings, readings_of
 from gnio_jax.apps.importing.recording import RawRecording
 from gnio_jax.data.labels import unit_of, unit_text
 from gnio_jax.data.parsing.text import open_text
+from gnio_jax.data.sensors import BAROMETER, GNSS, MAGNETOMETER, SENSOR_KINDS
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
 
@@ -62,6 +69,14 @@ SENSORS = {
     "AccelerometerUncalibrated": ("raw", None),
 }
 """Sensor Logger's files: the kind and the unit of each."""
+OTHERS = {
+    "Magnetometer": (MAGNETOMETER, "µT"),
+    "MagnetometerUncalibrated": (MAGNETOMETER, "µT"),
+    "Barometer": (BAROMETER, "hPa"),
+    "Location": (GNSS, None),
+}
+"""Sensor Logger's files of sensors beside the IMU: the sensor and its unit. Of two files of one
+sensor the first one is taken."""
 REMEDY = "record the gyroscope and the accelerometer with gravity"
 REMEDY += " (Sensor Logger: switch on Accelerometer and Gravity)"
 
@@ -126,7 +141,21 @@ def _sensor_logger(path: Path, files: list[LogFile]) -> RawRecording:
     systems = {"android": ("Android", "android"), "ios": ("iOS", standard)}
     platform = str(row.get("platform")).strip().lower()
     system, sign = systems.get(platform, ("unknown system", None))
-    return _recording(path, f"Sensor Logger ({system})", files, sets, sign)
+    recording = _recording(path, f"Sensor Logger ({system})", files, sets, sign)
+    return _with_others(recording, _logger_columns(files, folders))
+
+
+def _logger_columns(files: list[LogFile], folders: list[str]) -> Iterator[_OtherTable]:
+    """The tables of other sensors of Sensor Logger."""
+    tables = {file.location.stem: file for file in files if str(file.location.parent) in folders}
+    for name, (sensor, unit) in OTHERS.items():
+        labels = tables[name].layout.labels if name in tables else ()
+        names = {axis: axis for axis in SENSOR_KINDS[sensor].columns if axis in labels}
+        accuracy = dict(zip(ACCURACY, ("horizontalAccuracy", "verticalAccuracy"), strict=True))
+        names |= {ours: theirs for ours, theirs in accuracy.items() if theirs in labels}
+        clock, second = ("time", "ns") if "time" in labels else ("seconds_elapsed", "s")
+        if name in tables:
+            yield _OtherTable(sensor, tables[name], clock, second, names, unit)
 
 
 # --- phyphox
@@ -147,7 +176,35 @@ def _phyphox(path: Path, files: list[LogFile]) -> RawRecording:
             match = re.search(r"(?:^|\n)(linear|gravity)", f"{name}\n{file.location.stem.lower()}")
             kind = "gyro" if unit in _TURNS else match[1] if match else "accel"
             sets.append(_Set(kind, unit, file, str(time), axes))
-    return _recording(path, "phyphox", files, sets, "android")
+    recording = _recording(path, "phyphox", files, sets, "android")
+    return _with_others(recording, _phyphox_columns(files))
+
+
+def _phyphox_columns(files: list[LogFile]) -> Iterator[_OtherTable]:
+    """The tables of other sensors of phyphox, by the units and the order of their columns."""
+    for file in files:
+        labels = file.layout.labels
+        time = next(filter(_is_time, labels), None)
+        units = {label: (unit_text(label) or "").lower() for label in labels}
+        degrees, metres = ([x for x in labels if units[x] == unit] for unit in ("°", "m"))
+        pressures = [label for label in labels if units[label] in ("hpa", "mbar")]
+        fields = {
+            match[1].lower(): label
+            for label in labels
+            if units[label] in ("µt", "μt", "ut") and (match := _AXIS.search(label))
+        }
+        if time is None:
+            continue
+        if set("xyz") == fields.keys():
+            yield _OtherTable(MAGNETOMETER, file, time, "s", fields, "µT")
+        elif len(pressures) == 1:
+            yield _OtherTable(BAROMETER, file, time, "s", {"pressure": pressures[0]}, "hPa")
+        elif len(degrees) >= 2:
+            names = ("altitude", *ACCURACY)
+            columns = dict(zip(("latitude", "longitude"), degrees, strict=False))
+            yield _OtherTable(
+                GNSS, file, time, "s", columns | dict(zip(names, metres, strict=False))
+            )
 
 
 def _is_time(label: str) -> bool:
@@ -183,6 +240,42 @@ def _check_pauses(file: LogFile, path: Path) -> None:
 
 
 # --- both
+
+
+class _OtherTable(NamedTuple):
+    """The table of a sensor beside the IMU."""
+
+    sensor: str
+    file: LogFile
+    clock: str
+    """Column of the stamps."""
+    second: str
+    """Unit of the stamps."""
+    columns: dict[str, str]
+    """Our name of a column → the file's."""
+    unit: str | None = None
+
+
+def _with_others(recording: RawRecording, tables: Iterable[_OtherTable]) -> RawRecording:
+    """The recording with the readings of these tables. Empty ones, and those without the columns of
+    their sensor, are left out with a note."""
+    readings = dict[str, RawReadings]()
+    for sensor, file, clock, second, columns, unit in tables:
+        try:
+            table, _ = file.read()
+            is_whole = table.columns[clock].dtype.kind in "iu"
+            stamps = table.stamps(clock) if is_whole else table.take(clock, gaps=True)
+            missing = (
+                set(SENSOR_KINDS[sensor].columns[: SENSOR_KINDS[sensor].required]) - columns.keys()
+            )
+            if missing:
+                problem = f"column '{min(missing)}' is missing"
+                raise InputError(file.path, problem, "export it again")
+            new = readings_of(sensor, table, stamps, columns, second, unit)
+            readings.setdefault(sensor, new)
+        except InputError as error:
+            recording.notes.append(f"{sensor} is left out: {error}")
+    return recording._replace(others=tuple(readings.values()))
 
 
 def _recording(

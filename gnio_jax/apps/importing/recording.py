@@ -12,6 +12,7 @@ from jaxtyping import Bool
 
 from gnio_jax.apps.importing import units
 from gnio_jax.apps.importing.clocks import Clocked, Sensor, clocked
+from gnio_jax.apps.importing.readings import RawReadings, readings_on_clock
 from gnio_jax.config import ImportOptions
 from gnio_jax.data import physics
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
@@ -60,6 +61,8 @@ class RawRecording(NamedTuple):
     track: Track | None = None
     raw_gyro: bool = False
     """Whether it is known that the phone subtracts no bias from the gyro."""
+    others: tuple[RawReadings, ...] = ()
+    """The sensors beside the IMU."""
 
 
 class Imported(NamedTuple):
@@ -93,6 +96,9 @@ def as_sequence(
     attributes |= {"imu_compensated": "no"} if raw.raw_gyro else {}
     samples = [Samples(one.time, one.values, str(one.file)) for one in (gyro, accel)]
     streams = Streams(name, str(raw.path), samples[0], samples[1], attributes, float(gyro.start))
+    clock = gyro.time, notes, raw.warnings
+    readings = readings_on_clock(raw.others, raw.gyro, options.time_unit, gyro.start, *clock)
+    streams = streams._replace(readings=readings)
     sequence = raw.track and _with_track(streams, rate, raw.track, gyro.start, notes)
     if sequence is None:
         (sequence,) = assemble(streams, rate, whole=True)

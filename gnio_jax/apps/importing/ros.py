@@ -19,12 +19,14 @@ from jaxtyping import Float, Int
 
 from gnio_jax.apps.importing.bags import Bag, Topic, opened
 from gnio_jax.apps.importing.clocks import Sensor
+from gnio_jax.apps.importing.readings import RawReadings
 from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.config import ImportOptions
 from gnio_jax.data.parsing.stamps import FEW_SHARE, seconds
 from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.data.readers.euroc import SensorPose, moved_to
 from gnio_jax.data.reference import SHORTEST_RUN, Poses
+from gnio_jax.data.sensors import BAROMETER, GNSS, MAGNETOMETER
 from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, check_unit_norm
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, rotations
@@ -37,6 +39,13 @@ SAME_PACE, DELAY = 0.01, 0.1
 IMU = "sensor_msgs/msg/Imu"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _GEOMETRY = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
+OTHERS = {
+    "sensor_msgs/msg/MagneticField": MAGNETOMETER,
+    "sensor_msgs/msg/FluidPressure": BAROMETER,
+    "sensor_msgs/msg/NavSatFix": GNSS,
+}
+"""Type of a message → the sensor beside the IMU. Fields are in T and pressures in Pa; drivers that
+write other units are recognised by the size."""
 POSES = (*(f"geometry_msgs/msg/{name}" for name in _GEOMETRY), "nav_msgs/msg/Odometry")
 
 
@@ -49,7 +58,9 @@ def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
         imu = _imu_topic(bag, options.imu_topic)
         other = _imu_topic(bag, options.accel_topic) if options.accel_topic else imu
         reference = _reference_topic(bag, options.reference_topic, notes)
-        samples, poses, mounts = _collected(bag, {imu.name, other.name}, reference)
+        topics = _other_topics(bag, notes)
+        content = _collected(bag, {imu.name, other.name}, reference, topics)
+    samples, poses, mounts, rows = content
     of_gyro, of_accel = samples[imu.name], samples[other.name]
     gyro, accel = of_gyro.sensor("gyro", imu.name, path), of_accel.sensor("accel", other.name, path)
     if of_gyro.by_headers != of_accel.by_headers:
@@ -72,10 +83,50 @@ def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
             if options.reference_topic is not None:
                 raise
             notes.append(f"{path.name}: no reference is taken: {error}")
-    return RawRecording(path, gyro, accel, notes, warnings, "android", track=track)
+    recording = RawRecording(path, gyro, accel, notes, warnings, "android", track=track)
+    others = (
+        _other_readings(topic, rows[topic.name], mounts, of_gyro, path, notes)
+        for topic in topics
+        if rows[topic.name]
+    )
+    return recording._replace(others=tuple(others))
 
 
 # --- topics
+
+
+def _other_topics(bag: Bag, notes: list[str]) -> list[Topic]:
+    """The topic of each sensor beside the IMU: the one with the most messages."""
+    topics = []
+    for name, sensor in OTHERS.items():
+        of_type = _topics(bag, None, (name,), sensor)
+        if of_type:
+            topics.append(max(of_type, key=lambda topic: topic.count))
+        if len(of_type) > 1:
+            problem = f"{bag.path.name}: of {len(of_type)} topics of {sensor}"
+            notes.append(f"{problem} the one with the most messages is taken, {topics[-1].name}")
+    return topics
+
+
+def _other_readings(
+    topic: Topic, rows: list[_Row], mounts: _Mounts, imu: _Imu, path: Path, notes: list[str]
+) -> RawReadings:
+    """The readings of a topic of one of `OTHERS`, a field turned to the axes of the IMU."""
+    sensor = OTHERS[topic.type]
+    headers, logged, values, std = (
+        np.array(column) for column in list(zip(*rows, strict=True))[:4]
+    )
+    stamps = headers if imu.by_headers and (headers > 0).all() else logged
+    if sensor == MAGNETOMETER:
+        frame, body = rows[0].frame.lstrip("/"), imu.first.header.frame_id.lstrip("/")
+        mount = _mount(body, frame, mounts)
+        if mount is not None:
+            values = mount.rotation.apply(values)
+        elif frame != body:
+            problem = f"{path.name}: {topic.name} is in '{frame}', the IMU in '{body}', and no"
+            notes.append(f"{problem} static transform joins them: taken as one")
+    file = path / topic.name.strip("/")
+    return RawReadings(sensor, file, stamps, values.astype(float), std.astype(float), "ns")
 
 
 def _imu_topic(bag: Bag, name: str | None) -> Topic:
@@ -175,14 +226,18 @@ _Mounts = dict[tuple[str, str], SensorPose]
 
 
 def _collected(
-    bag: Bag, imus: set[str], reference: Topic | None
-) -> tuple[dict[str, _Imu], list[_Pose], _Mounts]:
-    """The IMU topics, the poses of the reference, and the static transforms."""
+    bag: Bag, imus: set[str], reference: Topic | None, others: list[Topic]
+) -> tuple[dict[str, _Imu], list[_Pose], _Mounts, dict[str, list[_Row]]]:
+    """The IMU topics, the poses of the reference, the static transforms, and the messages of other
+    sensors."""
     static = {name for name in bag.topics if name.endswith("tf_static")}
     of_poses = set() if reference is None else {reference.name}
     first, rows = dict[str, Any](), {name: list[tuple[Any, ...]]() for name in imus}
     poses, mounts = list[_Pose](), _Mounts()
-    for topic, logged, message in bag.messages(imus | static | of_poses):
+    readings = {topic.name: list[_Row]() for topic in others}
+    for topic, logged, message in bag.messages(imus | static | of_poses | readings.keys()):
+        if topic in readings:
+            readings[topic].append(_row(message, logged))
         if topic in imus:
             first.setdefault(topic, message)
             rate, force = message.angular_velocity, message.linear_acceleration
@@ -201,7 +256,35 @@ def _collected(
             raise InputError(bag.path, f"topic {topic} has no messages", "record it anew")
         headers, logged, *values = (np.array(column) for column in zip(*rows[topic], strict=True))
         samples[topic] = _Imu(first[topic], headers, logged, np.stack(values, axis=1).astype(float))
-    return samples, poses, mounts
+    return samples, poses, mounts, readings
+
+
+class _Row(NamedTuple):
+    """A message of a sensor beside the IMU."""
+
+    stamp: int  # of the message, ns; 0 if it has none
+    logged: int  # the bag's, ns
+    values: tuple[float, ...]
+    std: tuple[float, ...]
+    frame: str
+
+
+def _row(message: Any, logged: int) -> _Row:
+    """A message of one of `OTHERS`. A NavSatFix without a fix is NaN, and covariances that are not
+    known (type 0) are no standard deviation (sensor_msgs/NavSatFix.msg)."""
+    std = (np.nan,) * 3
+    if hasattr(message, "magnetic_field"):
+        field = message.magnetic_field
+        values = field.x, field.y, field.z
+    elif hasattr(message, "fluid_pressure"):
+        values, std = (message.fluid_pressure,), (np.nan,)
+    else:
+        values = message.latitude, message.longitude, message.altitude
+        values = values if message.status.status >= 0 else (np.nan,) * 3
+        variances = np.asarray(message.position_covariance, float)[[0, 4, 8]]
+        if message.position_covariance_type > 0:
+            std = tuple(np.sqrt(np.maximum(variances, 0.0)).tolist())
+    return _Row(_stamp(message), logged, values, std, message.header.frame_id)
 
 
 def _stamp(message: Any) -> int:

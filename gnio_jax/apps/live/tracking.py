@@ -13,7 +13,7 @@ from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.filtering import Filter, Tracker, make_filter
 from gnio_jax.filtering.start import level_state
 from gnio_jax.models import Network
-from gnio_jax.networks import TrainedNetwork
+from gnio_jax.networks import TrainedNetwork, load_corrector
 
 VELOCITY = slice(3, 6)
 """Rows of the velocity in a pose's covariance."""
@@ -40,6 +40,7 @@ def create_tracker(
         rest_seconds=rest_seconds,
         hole=longest_interval(run, imu_rate),
         imu_rate=imu_rate or run.config.data.rate,
+        corrector=load_corrector(run.config.filter, run.config.data.rate, run),
     )
 
 

@@ -34,7 +34,7 @@ class Models(NamedTuple):
 class WalkResult(NamedTuple):
     """The results of the models for K clone intervals."""
 
-    windows: Float[np.ndarray, "m n 6"]
+    windows: Float[np.ndarray, "m n c"]
     """Windows that the network saw: none in the first F = `first_measured` intervals, so m = K −
     F."""
     displacement: Float[np.ndarray, "m 3"]
@@ -110,7 +110,7 @@ def walk(
     return WalkResult(np.array(windows), np.array(displacements), position, rotation, covariance)
 
 
-def measure(models: Models, window: Float[np.ndarray, "1 n 6"]) -> dict[str, np.ndarray]:
+def measure(models: Models, window: Float[np.ndarray, "1 n c"]) -> dict[str, np.ndarray]:
     """The prediction of the network for a window, in the form that the filter step takes."""
     prediction = run(models.network, {"window": window})
     log_std = np.maximum(prediction["log_std"][0].astype(float), models.log_std_min)

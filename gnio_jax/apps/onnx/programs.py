@@ -73,14 +73,9 @@ class DeployedState(NamedTuple):
 
 
 def programs(network: Network, ekf: Filter) -> list[Program]:
-    """The four programs of a network and its filter. JAX's x64 must be on. Raises `InputError` for
-    a filter that measures something else of the network than its displacement."""
+    """The four programs of a network and its filter. JAX's x64 must be on. The output
+    `displacement` of the network is what the filter measures (`FilterConfig.measures`)."""
     config, noise = ekf.config, ekf.noise
-    for other in ekf.measurements:
-        if getattr(other, "needs", ()):
-            problem = "is not measured by an exported filter, which takes displacements"
-            remedy = "set it to null: the filter then takes the network's displacement"
-            raise InputError(f"filter.measurements.{other.name}", problem, remedy)
     if config.low_pass_seconds:
         problem = "is not undone by an exported filter"
         raise InputError("filter.low_pass_seconds", problem, "set it to 0")
@@ -94,6 +89,7 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
 
     def infer(arrays: Arrays) -> dict[str, Array]:
         prediction = network.apply(network.variables, arrays["window"])
+        prediction = prediction.measured(config.measures)
         outputs = {"displacement": prediction.displacement, "log_std": prediction.log_std}
         return outputs if prediction.axes is None else {**outputs, "axes": prediction.axes}
 

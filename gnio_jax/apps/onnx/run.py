@@ -41,7 +41,8 @@ CONVENTIONS = (
     "SI units. The world is z-up with gravity (0, 0, -9.81) m/s². Rotations are matrices body → "
     "world. gyro and accel are raw, in the body frame, at `rate`, without holes; accel includes "
     "gravity. A displacement is expressed in the gravity frame of its window's first sample after "
-    "the context, whose yaw is zero. covariance of a measurement: diag(exp(2 max(log_std, "
+    "the context, whose yaw is zero; with `measures` velocity it is the velocity in the body at "
+    "the window's end, in metres per window. covariance of a measurement: diag(exp(2 max(log_std, "
     "log_std_min))), m², turned about z by the angle whose cosine and sine are the output axes, if "
     "there is one; a displacement of NaN is no measurement. Errors of rotations are in the "
     "world frame, left-multiplied."
@@ -89,6 +90,9 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     if network.has_memory:
         problem = f"'{run.config.model.name}' has a memory, which the exported filter cannot carry"
         raise InputError(which, problem, "export a network on windows")
+    if run.config.filter.corrector is not None:
+        problem = "has a corrector before its filter, which is not exported"
+        raise InputError(which, problem, "set filter.corrector to null")
     ekf = make_filter(run.config.data, run.config.filter)
     with replacing_folder(out) as folder, ExitStack() as at_end:
         at_end.callback(logging.disable, logging.root.manager.disable)

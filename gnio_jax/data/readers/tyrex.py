@@ -12,6 +12,8 @@ IMU.
   subtracted, as Android does for programs that read the gyro.
 - iPhone 4S and 5: stamps in s since the phone was booted, the record begins at `BootTime`; each
   sensor at a rate of its own (90 to 107 Hz); the accelerometer in G with Apple's sign.
+- `magnetometer-calibrated.txt`, if it is there, has the field in µT, the phone's axes, without what
+  the system believes to be the phone's own, at 50 Hz (Nexus 5) or at the gyro's rate.
 - Qualisys: 60 Hz, mm, rotations body → world column by column, NaN where the body was lost. Its
   time is the record's plus the number in `timeAlignment.txt`, to 0.03 s.
 
@@ -41,11 +43,12 @@ from gnio_jax.data.alignment.body import with_tracker_poses, without_jumps
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text, shortened, text_of
+from gnio_jax.data.sensors import MAGNETOMETER
 from gnio_jax.data.splits import find_folders
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_in
 from gnio_jax.numerics import finite_rows
-from gnio_jax.types import STANDARD_G, Sequence
+from gnio_jax.types import STANDARD_G, Readings, Sequence
 
 RATE = 100.0
 """Hz."""
@@ -91,7 +94,9 @@ LIMITS = {
     "accel's delay": (0.15, "s"),  # phones filter the accelerometer (0.046)
 }
 
+_MAGNETOMETER = "magnetometer-calibrated.txt"
 _TEXT_FILES = ("accelerometer.txt", "gyroscope.txt", "description.txt", "timeAlignment.txt")
+_TEXT_FILES += (_MAGNETOMETER,)
 _NAME = re.compile(rf"(\w+?)_({'|'.join(DEVICES)})_(Dist|NoDist)_(\w+)")
 
 
@@ -211,7 +216,15 @@ def read_phone(walk: WalkFolder) -> Streams:
     gyro, accel = sensors
     if apple:
         accel = accel._replace(values=-STANDARD_G * accel.values)
-    return Streams(walk.folder.name, str(walk.folder), gyro, accel)
+    path, readings = file_in(walk.folder, _MAGNETOMETER), dict[str, Readings]()
+    if path.is_file():
+        table = read_text(path, separator=" ", header=False, widths=(5,) if apple else (4,))
+        (time, _, rows), field = table.clock(0, "s", start, "dropped"), table.take(1, 2, 3)
+        # An iPhone repeats the last field until there is a new one.
+        changed = np.concatenate([[True], (np.diff(field[rows], axis=0) != 0).any(axis=1)])
+        time, field = time[changed], field[rows][changed]
+        readings[MAGNETOMETER] = Readings(time, field, np.full_like(field, np.nan))
+    return Streams(walk.folder.name, str(walk.folder), gyro, accel, readings=readings)
 
 
 def _boot_time(path: Path) -> float:

@@ -1,0 +1,274 @@
+"""The sensors beside the IMU in logs of every format, and what is wrong with them in one line."""
+
+import numpy as np
+import pytest
+
+from tests.support import bag_files, known_walk, logger_files
+from tests.support.importing import imported
+from tests.support.logger_files import EPOCH, phyphox_sets, phyphox_table, sensor_logger, zipped
+
+NORTH = np.array([20.0, 5.0, -40.0])
+SLOW = np.arange(0.2, 7.5, 1.0)
+
+
+def field(time):
+    """What a magnetometer in the walk's attitude reads, µT."""
+    return known_walk.attitude(time).inv().apply(NORTH)
+
+
+def pressure(time):
+    """Pa."""
+    return 101325.0 - 12.0 * known_walk.position(time)[:, 2]
+
+
+def place(time):
+    return 45.0 + 1e-5 * time, 6.0 + 2e-5 * time, 300.0 + 0.1 * time
+
+
+def logger_table(time, **columns):
+    """A CSV of Sensor Logger."""
+    lines = [",".join(["time", "seconds_elapsed", *columns])]
+    for stamp, *cells in zip(time, *columns.values(), strict=True):
+        numbers = ",".join(f"{cell:.9f}" for cell in cells)
+        lines.append(f"{EPOCH + round(stamp * 1e9)},{stamp:.9f},{numbers}")
+    return "\n".join(lines) + "\n"
+
+
+def location(time, accuracy=4.0, **changes):
+    latitude, longitude, altitude = place(time)
+    columns = {
+        "verticalAccuracy": 0 * time + 6.0,
+        "horizontalAccuracy": 0 * time + accuracy,
+        "speed": 0 * time + 1.0,
+        "altitude": altitude,
+        "longitude": longitude,
+        "latitude": latitude,
+    }
+    return logger_table(time, **(columns | changes))
+
+
+def logger_members(**changes):
+    time = logger_files.clock()
+    members = sensor_logger() | {
+        "Magnetometer.csv": logger_files.sensor_table(time, field(time)),
+        "MagnetometerUncalibrated.csv": logger_files.sensor_table(time, field(time) + 9.0),
+        "Barometer.csv": logger_table(
+            SLOW, relativeAltitude=0 * SLOW, pressure=pressure(SLOW) / 100
+        ),
+        "Location.csv": location(SLOW),
+    }
+    return members | {name.replace("_", "."): text for name, text in changes.items()}
+
+
+def compare(recording, shift=0.01, sensors=("barometer", "gnss", "magnetometer")):
+    """The readings are those of the walk, whose IMU begins `shift` s after its log."""
+    readings = recording.sequence.readings
+    assert sorted(readings) == sorted(sensors)
+    for sensor, (time, values, std) in readings.items():
+        time = time + shift
+        if sensor == "magnetometer":
+            np.testing.assert_allclose(values, field(time), atol=1e-5)
+            assert len(time) > 500
+        elif sensor == "barometer":
+            np.testing.assert_allclose(values[:, 0], pressure(time), atol=1e-3)
+        else:
+            np.testing.assert_allclose(values, np.stack(place(time), axis=1), atol=1e-6)
+            np.testing.assert_allclose(std, np.tile([4.0, 4.0, 6.0], (len(time), 1)))
+        if sensor != "magnetometer":
+            np.testing.assert_allclose(time, SLOW, atol=1e-6)
+
+
+def test_sensor_logger_has_field_pressure_and_place(tmp_path):
+    recording = imported(zipped(tmp_path / "walk.zip", logger_members()))
+    compare(recording)
+    notes = " | ".join(recording.notes)
+    assert "Barometer.csv: barometer with 8 rows (1 a second)" in notes
+    assert "Location.csv: gnss with 8 rows" in notes and recording.warnings == ()
+    alone = logger_members()
+    del alone["Magnetometer.csv"]
+    uncalibrated = imported(zipped(tmp_path / "other.zip", alone)).sequence.readings
+    time = uncalibrated["magnetometer"].time + 0.01
+    np.testing.assert_allclose(uncalibrated["magnetometer"].values, field(time) + 9.0, atol=1e-5)
+
+
+def test_phyphox_has_field_pressure_and_place_by_units_in_any_language(tmp_path):
+    time = logger_files.clock()
+    latitude, longitude, altitude = place(SLOW)
+    of_place = [latitude, longitude, altitude, 1 + 0 * SLOW, 2 + 0 * SLOW]
+    of_place += [4 + 0 * SLOW, 6 + 0 * SLOW]
+    names = ["Breite (°)", "Länge (°)", "Höhe (m)", "Geschw. (m/s)", "Richtung (°)"]
+    names += ["Horizontale Genauigkeit (m)", "Vertikale Genauigkeit (m)"]
+    fields = [f"Magnetfeld {axis} (µT)" for axis in "xyz"]
+    sets = phyphox_sets() | {
+        "Magnetometer": (time, field(time), fields),
+        "Pressure": (SLOW, pressure(SLOW)[:, None] / 100, ["Druck (hPa)"]),
+        "Location": (SLOW, np.stack(of_place, axis=1), names),
+    }
+    recording = imported(zipped(tmp_path / "walk.zip", logger_files.phyphox(sets=sets)))
+    compare(recording)
+    assert recording.warnings == ()
+
+
+def test_a_table_of_any_names_has_them_beside_the_imu_in_rows_of_their_own(tmp_path):
+    """Receiver and barometer have a value in every hundredth row, and are empty in the others."""
+    time = np.arange(800) / 100
+    rows = np.isin(np.round(time, 2), np.round(SLOW, 2))
+    latitude, longitude, altitude = place(time)
+    columns = {
+        "Timestamp": time,
+        **{f"Gyr_{axis}": known_walk.rate(time)[:, k] for k, axis in enumerate("XYZ")},
+        **{f"Acc_{axis}": known_walk.force(time)[:, k] for k, axis in enumerate("XYZ")},
+        **{f"Mag_{axis}": field(time)[:, k] / 100 for k, axis in enumerate("XYZ")},
+        "Baro": np.where(rows, pressure(time) / 100, np.nan),
+        "GPS_LAT": np.where(rows, latitude, np.nan),
+        "GPS_Lon": np.where(rows, longitude, np.nan),
+        "gps_altitude": np.where(rows, altitude, np.nan),
+        "HAcc": np.where(rows, 4.0, np.nan),
+        "vAcc": np.where(rows, 6.0, np.nan),
+    }
+    lines = [",".join(columns)]
+    for cells in zip(*columns.values(), strict=True):
+        lines.append(",".join("" if np.isnan(cell) else f"{cell:.9f}" for cell in cells))
+    (tmp_path / "walk.csv").write_text("\n".join(lines))
+    recording = imported(tmp_path / "walk.csv", gyro_unit="rad/s")
+    compare(recording, 0.0)
+    notes = " | ".join(recording.notes)
+    assert "magnetometer taken as gauss (median 0.45" in notes
+    assert "barometer taken as hPa (median 1013" in notes
+
+
+def test_a_folder_of_tables_has_the_place_in_a_table_of_its_own(tmp_path):
+    time = np.arange(800) / 100
+    for name, values in (("gyro", known_walk.rate(time)), ("accel", known_walk.force(time))):
+        table = np.column_stack([time, values])
+        text = {"header": "time,x,y,z", "comments": "", "delimiter": ","}
+        np.savetxt(tmp_path / f"{name}.csv", table, **text)
+    table = np.column_stack([SLOW, *place(SLOW), 4 + 0 * SLOW, 6 + 0 * SLOW])
+    header = "time,lat,lng,height,accuracy,vertical_accuracy"
+    np.savetxt(tmp_path / "gps.csv", table, header=header, comments="", delimiter=",")
+    compare(imported(tmp_path, gyro_unit="rad/s"), 0.0, ("gnss",))
+
+
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_a_bag_has_them_as_messages_and_a_field_in_the_axes_of_the_imu(tmp_path, kind):
+    """The magnetometer is turned by a quarter about z against the IMU."""
+    from scipy.spatial.transform import Rotation
+
+    make, turn = bag_files.Maker(kind), Rotation.from_euler("z", 90, degrees=True)
+    names = {n: f"sensor_msgs/msg/{n}" for n in ("MagneticField", "FluidPressure", "NavSatFix")}
+
+    def magnetic(time):
+        values = turn.inv().apply(field(np.array([time]))[0]) * 1e-6
+        header = make.header(time, "mag")
+        return make.new(names["MagneticField"], header, make.vector(values), np.zeros(9))
+
+    def fluid(time):
+        header, value = make.header(time, "imu_link"), float(pressure(np.array([time]))[0])
+        return make.new(names["FluidPressure"], header, value, 0.0)
+
+    def fix(time):
+        status = make.new("sensor_msgs/msg/NavSatStatus", 0 if time < 5 else -1, 1)
+        spread = np.diag([16.0, 16.0, 36.0]).ravel()
+        header, values = make.header(time, "gps"), map(float, place(time))
+        return make.new(names["NavSatFix"], header, status, *values, spread, 2)
+
+    entries = bag_files.imu(make, seconds=8.0)
+    static = make.static("imu_link", "mag", turn, [0.0, 0.0, 0.0])
+    entries += bag_files.rows("/tf_static", "tf2_msgs/msg/TFMessage", [0.0], lambda _: static)
+    entries += bag_files.rows("/mag", names["MagneticField"], bag_files.clock(100.0, 8), magnetic)
+    entries += bag_files.rows("/baro", names["FluidPressure"], SLOW, fluid)
+    entries += bag_files.rows("/fix", names["NavSatFix"], SLOW, fix)
+    recording = imported(bag_files.write(tmp_path, kind, entries))
+    readings = recording.sequence.readings
+    assert len(readings["gnss"].time) == 5  # those with a fix
+    without_fix = dict(readings)
+    del without_fix["gnss"]
+    kept = recording._replace(sequence=recording.sequence._replace(readings=without_fix))
+    compare(kept, 0.0, ("barometer", "magnetometer"))
+    np.testing.assert_allclose(readings["gnss"].std[0], [4.0, 4.0, 6.0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "sensor", "words"),
+    [
+        (
+            {"Barometer_csv": logger_table(SLOW, pressure=pressure(SLOW))},
+            "barometer",
+            "Barometer.csv: field 'barometer' has a median of 1.0131e+07, expected 30000 to",
+        ),
+        (
+            {"Magnetometer_csv": logger_files.sensor_table(SLOW, field(SLOW) / 100)},
+            "magnetometer",
+            "Magnetometer.csv: field 'magnetometer' has a median of 0.45",
+        ),
+        (
+            {"Location_csv": location(SLOW, latitude=0 * SLOW + 95.0)},
+            "gnss",
+            "Location.csv: column 'latitude' of field 'gnss' reaches 95, beyond ±90; give it in",
+        ),
+        (
+            {"Location_csv": location(SLOW + 5000.0)},
+            "gnss",
+            "by the clock of the IMU",
+        ),
+        (
+            {"Location_csv": location(SLOW, accuracy=-1.0)},
+            "gnss",
+            "no row of field 'gnss' has a reading; switch the sensor on",
+        ),
+    ],
+)
+def test_a_sensor_that_cannot_be_used_is_left_out_with_a_remedy(tmp_path, changes, sensor, words):
+    recording = imported(zipped(tmp_path / "walk.zip", logger_members(**changes)))
+    (warning,) = recording.warnings
+    assert warning.startswith(f"{sensor}: it is left out: ") and words in warning
+    assert "\n" not in warning and "walk.zip" in warning
+    compare(recording, sensors={"barometer", "gnss", "magnetometer"} - {sensor})
+
+
+def test_missing_late_repeated_and_damaged_rows_are_left_out_and_counted(tmp_path):
+    """A receiver repeats its last fix, writes zeros before its first one, loses the height once,
+    and a row comes late."""
+    latitude, longitude, altitude = (np.array(x) for x in place(SLOW))
+    time = np.concatenate([SLOW, SLOW[5:6] + 0.5, [0.01]])
+    rows = [0, 1, 2, 4, 3, 5, 6, 7]  # two of them exchanged
+
+    def column(values, first):
+        return np.concatenate([values[rows], values[5:6], [first]])
+
+    changed = altitude.copy()
+    changed[2] = np.nan
+    time[:8] = SLOW[rows]
+    text = location(
+        time,
+        latitude=column(latitude, 0.0),
+        longitude=column(longitude, 0.0),
+        altitude=column(changed, 0.0),
+    )
+    recording = imported(zipped(tmp_path / "walk.zip", logger_members(Location_csv=text)))
+    (stamps, values, _), notes = recording.sequence.readings["gnss"], " | ".join(recording.notes)
+    np.testing.assert_allclose(stamps + 0.01, SLOW, atol=1e-6)
+    np.testing.assert_allclose(values[:, 0], latitude, atol=1e-8)
+    assert np.flatnonzero(np.isnan(values[:, 2])).tolist() == [2]
+    assert "1 rows of gnss repeat the one before and are left out" in notes
+
+
+def test_a_log_whose_other_sensors_are_empty_is_read_without_them(tmp_path):
+    members = logger_members(
+        Location_csv="time,seconds_elapsed,latitude,longitude\n",
+        Barometer_csv="time,seconds_elapsed,relativeAltitude\n1,0.1,2.0\n",
+    )
+    recording = imported(zipped(tmp_path / "walk.zip", members))
+    compare(recording, sensors=("magnetometer",))
+    assert recording.warnings == ()
+    notes = [note for note in recording.notes if "left out" in note]
+    assert any("column 'pressure' is missing" in note for note in notes)
+
+
+def test_a_phyphox_table_without_stamps_has_no_readings(tmp_path):
+    sets = phyphox_sets()
+    members = logger_files.phyphox(sets=sets)
+    members["Pressure.csv"] = phyphox_table(SLOW, pressure(SLOW)[:, None], ["p (hPa)"]).replace(
+        "Time (s)", "Index"
+    )
+    assert imported(zipped(tmp_path / "walk.zip", members)).sequence.readings == {}

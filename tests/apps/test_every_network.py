@@ -1,0 +1,95 @@
+"""Every network of the package, and every recipe, from training to a live trajectory."""
+
+import functools
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gnio_jax import config as configuration
+from gnio_jax import models
+from gnio_jax.apps import onnx
+from gnio_jax.evaluation.trajectory import read_tum
+from tests.support import tlio_files
+from tests.support.networks import SMALL
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "walk.csv"
+OTHERS = {
+    "gnio": (),
+    "gru": ("--segments.seconds", "4"),
+    "state_space": ("--segments.seconds", "4"),
+}
+"""Networks without a recipe of their own."""
+RECIPES = sorted(
+    name.removeprefix("baselines/")
+    for name in configuration.experiment_names()
+    if name.startswith("baselines/")
+)
+NAMED = {"airimu": "tlio", "bins": "gnio", "eqnio_ronin": "ronin_resnet", "eqnio_tlio": "tlio"}
+NAMED |= {"rio": "ronin_resnet"}
+"""The networks of recipes that have another name."""
+WITH_MEMORY = {"gru", "state_space", "ronin_lstm", "ronin_tcn"}
+"""Networks that are not exported."""
+IN_CONFIG = {"width", "bank_size", "head", "output_dim"}
+"""Options that have a place of their own in the file."""
+CHANGED = ("--dataset", "tlio", "--data.rate", "100", "--data.stride-seconds", "0.2")
+CHANGED += ("--data.train-stride-seconds", "0.2", "--optim.epochs", "1", "--optim.batch-size", "4")
+CHANGED += ("--optim.statistics-windows", "8", "--optim.warmup-epochs", "0")
+
+
+def smallest(network):
+    """The words of the smallest options of a network."""
+    for option, value in SMALL[network].items():
+        name = option if option in IN_CONFIG else f"options.{option}"
+        yield from ("--set", f"model.{name}={value}")
+
+
+def test_every_network_has_a_row_here():
+    networks = {NAMED.get(name, name) for name in RECIPES} | OTHERS.keys()
+    assert networks == set(models.names())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", [*RECIPES, *OTHERS])
+def test_from_training_to_live(
+    recipe, gnio, mistake, undrawn, tmp_path, tmp_path_factory, monkeypatch
+):
+    """Train, evaluate tight and loose, publish, export and follow a recording live."""
+    if recipe == "ridi":
+        pytest.importorskip("sklearn", reason="needs gnio-jax[ridi]")
+    monkeypatch.chdir(tmp_path)
+    root = tlio_files.write_splits(tmp_path_factory.mktemp("data"))
+    network = NAMED.get(recipe, recipe)
+    words = OTHERS.get(recipe, ("--config", f"baselines/{recipe}"))
+    words = (*words, "--model.name", network, *smallest(network), *CHANGED)
+    if recipe == "ridi":  # which fits as many as it needs
+        words = [word for word in words if "supports" not in word and word != "--set"]
+    gnio("train", *words, "--data-root", root, "--workdir", "run")
+    scores = {}
+    for coupling in ("tight", "loose"):
+        gnio("evaluate", "--network", "run", "--no-plots", "--coupling", coupling)
+        name = "tlio_test_ekf" + "_loose" * (coupling == "loose")
+        scores[coupling] = json.loads((Path("run/eval") / name / "metrics.json").read_text())
+    assert all(np.isfinite(score["mean"]["ate"]) for score in scores.values())
+    # What is measured differs only by the attitude that turns the windows.
+    tight, loose = (scores[coupling]["mean"]["ate"] for coupling in ("tight", "loose"))
+    assert loose == pytest.approx(tight, rel=0.5)
+    gnio("publish", "run", "--out", "named.zip", "--data", "simulated walks", "--license", "CC0")
+    walk = Path("walk.csv")
+    walk.write_text("\n".join(EXAMPLE.read_text().splitlines()[:1002]) + "\n")
+    gnio("live", walk, "--network", "named.zip", "--out", "live.txt")
+    path = read_tum(Path("live.txt"))
+    assert len(path.time) > 20 and np.isfinite(path.position).all()
+    gnio("track", walk, "--network", "named.zip", "--out", "track")
+    track = read_tum(Path("track/trajectory.txt"))
+    assert np.linalg.norm(track.position[-1] - path.position[-1]) < 0.5
+    if not all(map(importlib.util.find_spec, ("jax2onnx", "onnx", "onnxruntime"))):
+        return
+    if recipe in WITH_MEMORY:
+        assert "has a memory" in mistake("export", "named.zip", "--out", "models")
+    else:
+        brief = functools.partial(onnx.export_run, seconds=6.0)
+        monkeypatch.setattr(onnx, "export_run", brief)
+        assert "against gnio-jax" in gnio("export", "named.zip", "--out", "models")

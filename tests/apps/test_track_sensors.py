@@ -1,0 +1,194 @@
+"""`gnio track` with magnetometer, barometer and receiver: what each does for a walk that is known,
+and what wrong readings do not do."""
+
+import json
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+from gnio_jax.apps import sensors
+from gnio_jax.apps.importing import Imported
+from gnio_jax.apps.track import track
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.data.hdf5 import write_hdf5
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import SequenceEstimate
+from gnio_jax.evaluation.trajectory import Trajectory, read_tum
+from gnio_jax.networks import read_network
+from tests.support import drawn_run, phone_walk, tiny_run
+from tests.support.filter_settings import changed
+
+CONSIDERED = {"gyro_bias": 0.003, "scale": 0.1, "heading": 0.1, "raw_gyro_bias": 0.02}
+CONFIG = TrainConfig(
+    data=DataConfig(rate=50.0),
+    model=ModelConfig(name="tiny"),
+    filter=changed(considered=CONSIDERED),
+)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("home") / "runs"
+    with tiny_run.known(phone_walk.Pace):
+        drawn_run.save(folder / "pace", CONFIG, lambda random, kind, shape: np.ones(shape))
+        yield folder
+
+
+@pytest.fixture(autouse=True)
+def _undrawn(monkeypatch):
+    def draw(folder, *_):
+        (folder / "track.png").write_bytes(b"")
+
+    monkeypatch.setattr("gnio_jax.apps.track._draw", draw)
+
+
+def tracked(runs, folder, sequence, *without, formats=()):
+    network = read_network(runs / "pace")
+    recording = Imported(sequence, (), ())
+    return track(recording, network, folder / "track", formats, without=without)
+
+
+def error_of(result):
+    """Horizontal and vertical error at every row, m; without fixes in the world of the walk."""
+    path = result.estimate.trajectory
+    truth = phone_walk.place(path.time)
+    if result.summary.origin is not None:
+        truth = phone_walk.on_map(path.time)
+        # The place of the start by the radii of curvature, as the fixes were made.
+        north, east = np.zeros(3), np.zeros(3)
+        base = phone_walk.degrees(np.array([[0.0, 0, 0], [1000.0, 0, 0], [0, 1000.0, 0]]))
+        east, north = base[1] - base[0], base[2] - base[0]
+        start = np.array(result.summary.origin) - base[0]
+        truth = truth - [1000 * start[1] / east[1], 1000 * start[0] / north[0], 0.0]
+    error = path.position - truth
+    return np.linalg.norm(error[:, :2], axis=1), error[:, 2] - error[0, 2]
+
+
+def share_of(result, sensor):
+    (use,) = (use for use in result.summary.sensors if use.sensor == sensor)
+    return use.accepted
+
+
+def test_field_pressure_and_fixes_mend_heading_height_and_place(runs, tmp_path):
+    """At fixes that the filter does not get, its path is about as good as a fix of the receiver,
+    whose errors (4 m an axis) last for half a minute."""
+    walk = phone_walk.walk()
+    gnss = walk.readings["gnss"]
+    used = np.arange(len(gnss.time)) % 40 < 30  # ten seconds are left out now and then
+    part = gnss._replace(time=gnss.time[used], values=gnss.values[used], std=gnss.std[used])
+    sequence = walk._replace(readings=walk.readings | {"gnss": part})
+    bare, bare_height = error_of(tracked(runs, tmp_path, walk, *sensors.NAMES))
+    assert bare[-1] > 60 and abs(bare_height[-1]) > 3  # the gyro's bias and the hill
+    result = tracked(runs, tmp_path, sequence, formats=("gpx", "geojson"))
+    error, height = error_of(result)
+    left_out = np.searchsorted(result.estimate.trajectory.time, gnss.time[~used])
+    assert np.sqrt((error[left_out] ** 2).mean()) < 1.2 * 4.0 * np.sqrt(2)
+    assert error.max() < bare.max() / 5
+    assert np.abs(height).max() < 2.0
+    shares = {use.sensor: use.accepted for use in result.summary.sensors}
+    assert sorted(shares) == ["barometer", "gnss", "magnetometer"] and min(shares.values()) > 0.9
+    filtered = result.estimate.filtered
+    std = np.sqrt(np.trace(filtered.covariance[:, :2, :2], axis1=1, axis2=2))
+    assert (error < 3 * std)[50:].all() and std[-1] < 8  # it is honest
+    # The exports lie on the map.
+    space = "{http://www.topografix.com/GPX/1/1}"
+    points = list(ElementTree.parse(tmp_path / "track" / "trajectory.gpx").iter(f"{space}trkpt"))
+    content = json.loads((tmp_path / "track" / "trajectory.geojson").read_text())
+    line = np.array(content["features"][0]["geometry"]["coordinates"])
+    last = np.array([float(points[-1].get("lat")), float(points[-1].get("lon"))])
+    np.testing.assert_allclose(line[-1, [1, 0]], last, atol=1e-7)
+    true = phone_walk.degrees(phone_walk.on_map(result.estimate.trajectory.time[-1:]))[0, :2]
+    assert np.abs((last - true) * [111e3, 74e3]).max() < 8.0
+    assert points[-1].find(f"{space}time").text.startswith("2023-11-14T22:1")
+
+
+def test_the_magnetometer_alone_holds_the_heading_of_a_raw_gyro(runs, tmp_path):
+    walk = phone_walk.walk()
+    result = tracked(runs, tmp_path, walk, "barometer", "gnss")
+    error, _ = error_of(result)
+    assert error.max() < 20  # of 312 m: the network's five per cent
+    assert result.summary.origin is None
+    text = result.summary.sensors[0].text
+    assert "turned the heading at the end by" in text and "the gyro's bias is 0.58 °/s" in text
+
+
+@pytest.mark.parametrize("fault", ["jump", "far", "field"])
+def test_wrong_readings_change_nothing_or_are_left_out_with_a_reason(runs, tmp_path, fault):
+    """A fix that jumps by a kilometre, a receiver in another town half the time, and a magnetometer
+    beside a loudspeaker."""
+    walk = phone_walk.walk()
+    gnss, field = walk.readings["gnss"], walk.readings["magnetometer"]
+    readings = dict(walk.readings)
+    if fault == "jump":
+        values = gnss.values.copy()
+        values[[20, 90, 91, 92, 200]] += [0.01, 0.0, 0.0]
+        readings["gnss"] = gnss._replace(values=values)
+    elif fault == "far":
+        random = np.random.default_rng(1)
+        values = gnss.values + random.normal(size=(len(gnss.time), 1)) * [0.02, 0.02, 0.0]
+        readings["gnss"] = gnss._replace(values=values)
+    else:
+        random = np.random.default_rng(1)
+        values = field.values + np.repeat(40 * random.normal(size=(240, 3)), 50, axis=0)
+        readings["magnetometer"] = field._replace(values=values)
+    result = tracked(runs, tmp_path, walk._replace(readings=readings))
+    assert result.estimate.trajectory.known.all()
+    reasons = {u.sensor: u.text for u in result.summary.sensors if u.accepted is None}
+    error, height = error_of(result)
+    assert np.abs(height).max() < 2.0
+    if fault == "jump":
+        assert not reasons and error.max() < 15
+        assert share_of(result, "gnss") == pytest.approx(235 / 240, abs=0.03)
+    elif fault == "far":
+        assert list(reasons) == ["gnss"] and result.summary.origin is None
+        assert any(w.startswith("gnss: left out: ") for w in result.summary.warnings)
+        assert error.max() < 20  # by the magnetometer
+    else:
+        assert list(reasons) == ["magnetometer"]
+        assert result.summary.origin is not None and np.median(error) < 40
+
+
+def test_a_recording_without_other_sensors_has_the_bytes_of_one_that_leaves_them_out(
+    runs, tmp_path
+):
+    walk = phone_walk.walk(seconds=60.0)
+    contents = []
+    for sequence, without in ((walk, tuple(sensors.NAMES)), (walk._replace(readings={}), ())):
+        tracked(runs, tmp_path, sequence, *without)
+        folder = tmp_path / "track"
+        contents.append(
+            [(folder / name).read_bytes() for name in ("trajectory.txt", "summary.json")]
+        )
+    assert contents[0] == contents[1]
+    assert b"sensors" not in contents[0][1] and b"origin" not in contents[0][1]
+
+
+def test_the_screen_says_what_each_sensor_did(gnio, mistake, runs, tmp_path, monkeypatch):
+    monkeypatch.chdir(runs.parent)
+    walk = phone_walk.walk(seconds=60.0)
+    write_hdf5(tmp_path / "walk.h5", walk)
+    words = ("track", tmp_path / "walk.h5", "--network", runs / "pace", "--out", tmp_path / "t")
+    told = gnio(*words, "--without", "gnss", "--without", "magnetometer")
+    assert "barometer, 60 rows" in told and "% used" in told
+    assert "barometer: the end is" in told and "gnss" not in told
+    summary = json.loads((tmp_path / "t" / "summary.json").read_text())
+    assert [use["sensor"] for use in summary["sensors"]] == ["barometer"]
+    assert len(read_tum(tmp_path / "t" / "trajectory.txt").time) > 500
+    assert "nose" in mistake(*words, "--without", "nose")
+    refused = mistake(*words, "--without", "gnss", "--format", "gpx")
+    assert "--format: gpx needs the place of the start" in refused
+
+
+def test_fixes_of_a_phone_that_stands_show_no_heading():
+    walk = phone_walk.walk(seconds=60.0)
+    gnss = walk.readings["gnss"]
+    time = np.arange(0, 60, 0.1)
+    level = np.tile([1.0, 0, 0, 0], (len(time), 1))
+    path = Trajectory(time, np.zeros((len(time), 3)), level)
+    still = SequenceEstimate("still", path, path)
+    with pytest.raises(InputError, match=r"the fixes show the heading to .* only.*walk farther"):
+        sensors.place_on_map(gnss, still, 60.0)
+    with pytest.raises(InputError, match="2 fixes are within the recording, and 4 are needed"):
+        few = gnss._replace(time=gnss.time[:2], values=gnss.values[:2], std=gnss.std[:2])
+        sensors.place_on_map(few, still, 60.0)
