@@ -25,8 +25,8 @@ SAMPLES = 17
 FEATURES = 32
 DECADES = 3.0
 """Largest logarithm to base 10 of the factor of a variance."""
-MEAN = np.float32([0, 0, GRAVITY, 0, 0, 0])
-STD = np.float32([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+MEAN = np.array([0, 0, GRAVITY, 0, 0, 0], np.float32)
+STD = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1], np.float32)
 """What is subtracted from [accel m/s², gyro rad/s], and by what they are divided."""
 
 

@@ -481,7 +481,8 @@ def test_a_network_without_displacements_is_trained_from_random_weights(recordin
     found = trained.config.filter.measurements["nonholonomic"]
     assert all(found[name] != number for name, number in numbers.items())
     with pytest.raises(InputError, match=r"'ai_imu' is trained in the filter's loop alone; name"):
-        loop.train(dataclasses.replace(config, through_filter=ThroughFilter()))
+        elsewhere = str(tmp_path / "elsewhere")
+        loop.train(dataclasses.replace(config, workdir=elsewhere, through_filter=ThroughFilter()))
 
 
 def test_mistakes(recording, tmp_path):
