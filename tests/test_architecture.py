@@ -151,6 +151,14 @@ def test_a_variable_is_a_noun():
             assert name not in REFUSED, f"gnio_jax/{module}: a variable is called '{name}'"
 
 
+def test_a_function_has_at_most_95_lines():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                lines = (node.end_lineno or node.lineno) - node.lineno + 1
+                assert lines <= 95, f"{path}: '{node.name}' has {lines} lines"
+
+
 def test_the_name_of_a_class_has_one_meaning():
     homes = {}
     for path in sorted(PACKAGE.rglob("*.py")):

@@ -98,8 +98,7 @@ def fit_std_factors(
 
     `truths` are the true displacements of the windows, in the yaw frame of the reference at their
     starts, or the true velocities in the body. The displacements of the network are expressed in
-    the filter's own yaw frame. Raises `ValueError` if
-    too few windows have both.
+    the filter's own yaw frame. Raises `ValueError` if too few windows have both.
     """
     errors = []
     for estimate, truth in zip(estimates, truths, strict=True):

@@ -237,9 +237,10 @@ def filter_inputs(
             covariance = filled_up(np.where(finite, covariance, np.eye(3)), strides)
             rows.append(Displacements(filled_up(value, strides, np.nan), covariance))
         stacked = _stack(rows)
+    variances = [recording.variance for recording in recordings if recording.variance is not None]
     variance = None
-    if all(recording.variance is not None for recording in recordings):
-        variance = np.stack([_padded(recording.variance, samples) for recording in recordings])
+    if len(variances) == len(recordings):
+        variance = np.stack([filled_up(rows[:samples], samples) for rows in variances])
     measurements = (
         jax.tree.map(lambda part: filled_up(part, strides, np.nan), recording.measurements)
         for recording in recordings
@@ -252,11 +253,6 @@ def filter_inputs(
         variance,
         _stack([*measurements]),
     )
-
-
-def _padded(rows: Float[np.ndarray, "t 6"], count: int) -> Float[np.ndarray, "n 6"]:
-    """The first `count` rows, with the last one repeated behind them."""
-    return np.pad(rows[:count], ((0, max(count - len(rows), 0)), (0, 0)), "edge")
 
 
 @functools.partial(jax.jit, static_argnames="apply")

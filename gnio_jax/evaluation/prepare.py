@@ -189,18 +189,7 @@ def prepare(
             problem = f"{seconds:.2f} s measured from its first trusted sample on"
             left_out[sequence.name] = f"{problem}, too short for a window and a stride"
             continue
-        bias, bias_note = _estimate_gyro_bias(whole, measured, windows.rate, gyro_bias)
-        raw = sequence.attributes.get("imu_compensated") == "no" and not bias.any()
-        start_init, reference_note = init, ""
-        if whole.waypoints is not None:
-            start_init, reference_note = "static", OF_WAYPOINTS
-        rotation, velocity, position, std, start_note = _find_start(
-            whole, measured, windows, ekf, start_init
-        )
-        level = ekf.start.gyro_bias
-        if raw and ekf.raw_gyro_bias is not None:
-            level = ekf.raw_gyro_bias
-        start = Start(rotation, velocity, position, bias, std, level, raw)
+        start, notes = _find_start(whole, measured, windows, ekf, init, gyro_bias)
         trusted, mask = whole.valid[:, None], whole.imu_valid
         starts = window_starts(len(whole.time), windows.window, windows.stride)
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
@@ -218,14 +207,9 @@ def prepare(
                 start=start,
                 attitude=orientation and _trace_attitude(whole, start, windows.rate, orientation),
                 reference=Trajectory(whole.time[ends], *(part[ends] for part in poses)),
-                displacement=true_displacement(
-                    poses[1],
-                    poses[0],
-                    starts,
-                    windows.window,
-                ),
+                displacement=true_displacement(poses[1], poses[0], starts, windows.window),
                 velocity=windows.window_seconds * _velocity_in_body(whole, starts + windows.window),
-                notes=tuple(filter(None, (reference_note, bias_note, start_note))),
+                notes=notes,
                 waypoints=whole.waypoints,
                 variance=variance,
             )
@@ -271,6 +255,30 @@ def _cut(sequence: Sequence, rows: slice) -> Sequence:
 
 
 def _find_start(
+    sequence: Sequence,
+    measured: Int[np.ndarray, "m"],
+    windows: DataConfig,
+    ekf: Filter,
+    init: Init,
+    gyro_bias: BiasSource,
+) -> tuple[Start, tuple[str, ...]]:
+    """The start of a recording, and notes about its reference, its gyro's bias and its pose."""
+    bias, bias_note = _estimate_gyro_bias(sequence, measured, windows.rate, gyro_bias)
+    raw = sequence.attributes.get("imu_compensated") == "no" and not bias.any()
+    reference_note = ""
+    if sequence.waypoints is not None:
+        init, reference_note = "static", OF_WAYPOINTS
+    rotation, velocity, position, std, start_note = _find_pose(
+        sequence, measured, windows, ekf, init
+    )
+    level = ekf.start.gyro_bias
+    if raw and ekf.raw_gyro_bias is not None:
+        level = ekf.raw_gyro_bias
+    start = Start(rotation, velocity, position, bias, std, level, raw)
+    return start, tuple(filter(None, (reference_note, bias_note, start_note)))
+
+
+def _find_pose(
     sequence: Sequence,
     measured: Int[np.ndarray, "m"],
     windows: DataConfig,

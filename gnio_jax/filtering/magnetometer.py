@@ -210,7 +210,9 @@ def fit_field(
         rows = rows[:: max(len(rows) // FIT_ROWS, 1)]
         seconds = config.clone_seconds * (rows[-1] - rows[0]) / (len(rows) - 1)
         parts = at_ends[rows], rotation[rows], drift[rows]
-        fits = _FieldProblem(*parts, bias_std, seconds).solve(starts)
+        up = parts[1][:, 2].mean(axis=0)
+        up = up / max(float(np.linalg.norm(up)), 1e-9)
+        fits = _FieldProblem(*parts, bias_std, seconds, up).solve(starts)
         fit = fits[0]
         if not bias_std or fit.vertical_std < SURE_BIAS or first.sum() == present.sum():
             break
@@ -226,12 +228,6 @@ def fit_field(
         std * intervals,
     )
     return FieldFit(rows, bias, fit.vertical_std, fit.misfit)
-
-
-def _mean_vertical(rotation: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "3"]:
-    """The mean upward direction in the body, a unit vector."""
-    up = rotation[:, 2].mean(axis=0)
-    return up / max(float(np.linalg.norm(up)), 1e-9)
 
 
 class _Solution(NamedTuple):
@@ -254,6 +250,8 @@ class _FieldProblem(NamedTuple):
     bias_std: float
     seconds: float
     """Time of a row, s."""
+    up: Float[np.ndarray, "3"]
+    """The mean upward direction in the body, a unit vector."""
 
     @property
     def correlated(self) -> float:
@@ -266,7 +264,7 @@ class _FieldProblem(NamedTuple):
         if not self.bias_std:
             return [self._from(np.zeros(3))]
         if biases is None:
-            up = _mean_vertical(self.rotation)
+            up = self.up
             step = 0.5 * np.pi / max(float(np.ptp(self.drift @ up)), 1.0)
             count = int(np.ceil(3 * self.bias_std / step))
             biases = [k * step * up for k in range(-count, count + 1)]
@@ -298,7 +296,7 @@ class _FieldProblem(NamedTuple):
         parts = [robust / np.sqrt(self.correlated), iron / IRON_STD]
         parts += [[(np.linalg.norm(world) - EARTH[0]) / EARTH[1]]]
         if self.bias_std:
-            up = _mean_vertical(self.rotation)
+            up = self.up
             parts += [[up @ bias / self.bias_std], (bias - up * (up @ bias)) / LEVEL_STD]
         return np.concatenate(parts)
 
@@ -321,7 +319,7 @@ class _FieldProblem(NamedTuple):
         prior[3, 3:6] = world / max(float(np.linalg.norm(world)), 1e-9) / EARTH[1]
         parts = [slope[:, None] * rows / np.sqrt(self.correlated), prior]
         if self.bias_std:
-            up = _mean_vertical(self.rotation)
+            up = self.up
             of_bias = np.zeros((4, 9))
             of_bias[0, 6:] = up / self.bias_std
             of_bias[1:, 6:] = (np.eye(3) - np.outer(up, up)) / LEVEL_STD
@@ -337,6 +335,6 @@ class _FieldProblem(NamedTuple):
         x = np.concatenate([fit.x, np.zeros(9 - len(fit.x))])
         misfit = float(np.sqrt((self._errors(x) ** 2).sum(axis=1).mean()))
         spread = np.linalg.pinv(fit.jac.T @ fit.jac)[6:, 6:]
-        up = _mean_vertical(self.rotation)
+        up = self.up
         vertical_std = float(np.sqrt(up @ spread @ up)) if self.bias_std else 0.0
         return _Solution(x, float(fit.cost), vertical_std, misfit)

@@ -148,8 +148,7 @@ def recalled_displacement(
 def network_measurement(
     predict: Predict, ekf: Filter
 ) -> Callable[..., tuple[Displacement, dict[str, Array]]]:
-    """The displacement, or the velocity, that the network measures, with its diagnostics, as a
-    function
+    """The displacement or velocity that the network measures, with its diagnostics, as a function
 
         measure(has_window, latest, state, oldest)
 

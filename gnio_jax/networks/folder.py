@@ -33,7 +33,7 @@ from gnio_jax import models
 from gnio_jax.config import FilterSettings, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import fingerprint, replacing, replacing_folder
-from gnio_jax.models.airimu import AirIMU
+from gnio_jax.models.airimu import AirIMU, Corrector
 
 CONFIG, WEIGHTS, CARD = "config.yaml", "weights.safetensors", "README.md"
 HEADER = "gnio_jax"
@@ -142,7 +142,8 @@ def read_network(path: Path) -> TrainedNetwork:
     shapes = models.variable_shapes(model, settings.config.data.seen)
     template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
     if settings.config.filter.corrector is not None and has_corrector(weights):
-        template["corrector"] = corrector_shapes()
+        samples = Corrector.before + 1 + Corrector.after
+        template["corrector"] = models.variable_shapes(AirIMU(), samples)
     variables = from_bytes(weights, template, path / WEIGHTS)
     corrector = variables.pop("corrector", None)
     config, epoch, step, digest, card = settings
@@ -153,12 +154,6 @@ def has_corrector(weights: bytes) -> bool:
     """Whether a file of weights holds a corrector beside the network."""
     length = int.from_bytes(weights[:8], "little")
     return b'"corrector/params/' in weights[8 : 8 + length]
-
-
-def corrector_shapes() -> Any:
-    """Shapes of a corrector's variables."""
-    windows = jax.ShapeDtypeStruct((1, 25, 6), jnp.float32)
-    return dict(jax.eval_shape(AirIMU().init, jax.random.key(0), windows))
 
 
 def read_settings(path: Path) -> NetworkSettings:

@@ -97,9 +97,8 @@ def method(network: str, base: TrainConfig) -> TrainConfig:
 
 
 def loss(network: str, base: TrainConfig) -> LossConfig:
-    """The published loss of a network; GNIO's is that of the experiment, as is that of networks of
-    ours, and so is the bound on
-    outliers of every likelihood."""
+    """The published loss of a network. GNIO and the networks of ours have that of the experiment,
+    and every likelihood has its bound on outliers."""
     bound = base.loss.outlier_sigmas
     match network:
         case "gnio" | "gru" | "state_space" | "experts" | "trunk":  # the others are ours

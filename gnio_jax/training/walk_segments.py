@@ -164,12 +164,13 @@ def cut_walks(
         turn = jax.vmap(lambda x, y: geometry.heading_rotation(x, -y))(x, y)
     else:
         assert key is not None
-        pass_key, error_key, yaw_key, rest_key = jax.random.split(key, 4)
+        keys = jax.random.split(key, 6)
+        pass_key, error_key, yaw_key, rest_key, rocking_key, mirror_key = keys
         if margin:
             imu = random_low_pass(pass_key, imu, config, grid.rate)
-        imu = random_rocking(jax.random.fold_in(key, 4), imu, config.rocking_share)
+        imu = random_rocking(rocking_key, imu, config.rocking_share)
         if config.mirror_share:
-            mirror = random_mirror(jax.random.fold_in(key, 5), len(rows), config.mirror_share)
+            mirror = random_mirror(mirror_key, len(rows), config.mirror_share)
             imu = mirror_channels(mirror, imu)
             rotation = mirror[:, None, :, None] * rotation * mirror[:, None, None, :]
         imu, rates = with_errors(error_key, imu, rotation, config)

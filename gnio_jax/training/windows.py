@@ -231,7 +231,7 @@ def mirror_channels(
     angular rate along it, because a rate is an axial vector. The mirrored body has its y axis on
     the other side, so that its axes are right-handed again."""
     axial = mirror * mirror[:, 1:2]
-    factors = jnp.concatenate([mirror, axial, mirror, mirror * mirror[:, 1:2]], axis=1)
+    factors = jnp.concatenate([mirror, axial, mirror, axial], axis=1)  # axial: the y axis, too
     return imu * factors[:, None, : imu.shape[-1]]
 
 
@@ -242,10 +242,11 @@ def random_rocking(
     otherwise in the hand (ours).
 
     The angular rate about horizontal axes is turned about the vertical by a uniform angle and
-    scaled by a uniform factor from 0 to `STRONGEST_ROCKING`. This is exact: the specific force in
-    the world is that of the place of the IMU, however the phone turns about this place. How a hand
-    lets a phone nod with each step differs between people, even in its sign, while the relation of
-    the accelerations to the direction of travel is that of the gait.
+    scaled by a uniform factor from 0 to `STRONGEST_ROCKING`. If each sample is rotated with its own
+    attitude, this is exact: the specific force in the world is that of the place of the IMU,
+    however the phone turns about this place. The body's axes remain as they are. How a hand lets a
+    phone nod with each step differs between people, even in its sign, while the relation of the
+    accelerations to the direction of travel is that of the gait.
     """
     if not share:
         return imu

@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from gnio_jax.evaluation.trajectory import read_tum
 from tests.support import tlio_files
 from tests.support.networks import SMALL
 
+NETWORKS = set(models.names())
+"""Those of the package, read before any test registers another one."""
 EXAMPLE = Path(__file__).parents[2] / "examples" / "walk.csv"
 OTHERS = {
     "gnio": (),
@@ -27,6 +30,8 @@ RECIPES = sorted(
     for name in configuration.experiment_names()
     if name.startswith("baselines/")
 )
+ALWAYS = {"airimu", "gru", "ionet"}
+"""A row takes minutes. These run with the slow tests, all of them with GNIO_EVERY_NETWORK=1."""
 NAMED = {"airimu": "tlio", "bins": "gnio", "eqnio_ronin": "ronin_resnet", "eqnio_tlio": "tlio"}
 NAMED |= {"rio": "ronin_resnet"}
 """The networks of recipes that have another name."""
@@ -48,7 +53,7 @@ def smallest(network):
 
 def test_every_network_has_a_row_here():
     networks = {NAMED.get(name, name) for name in RECIPES} | OTHERS.keys()
-    assert networks == set(models.names())
+    assert networks == NETWORKS
 
 
 @pytest.mark.slow
@@ -57,6 +62,8 @@ def test_from_training_to_live(
     recipe, gnio, mistake, undrawn, tmp_path, tmp_path_factory, monkeypatch
 ):
     """Train, evaluate tight and loose, publish, export and follow a recording live."""
+    if recipe not in ALWAYS and not os.environ.get("GNIO_EVERY_NETWORK"):
+        pytest.skip("takes minutes; set GNIO_EVERY_NETWORK=1")
     if recipe == "ridi":
         pytest.importorskip("sklearn", reason="needs gnio-jax[ridi]")
     monkeypatch.chdir(tmp_path)

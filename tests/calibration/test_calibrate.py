@@ -562,6 +562,14 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     additive = dataclasses.replace(options, error="additive")  # whose covariances have no arc
     plain = fitting.compare_positions(walks, truth, DATA, additive)
     assert not plain.yaw_sensitivity.any() and not plain.with_yaw.any()
+    # Variances of the samples, as of a corrector, take the place of the densities.
+    noise = options.noise
+    sizes = np.repeat([noise.accel_density, noise.gyro_density], 3)
+    variance = np.broadcast_to(sizes**2 * DATA.rate, (*walks.gyro.shape[:2], 6))
+    corrected = walks._replace(variance=variance)
+    silent = changed(options, noise={"gyro_density": 1e-9, "accel_density": 1e-9})
+    by_variance = fitting.compare_positions(corrected, truth, DATA, silent)
+    np.testing.assert_allclose(by_variance.covariance, positions.covariance, rtol=1e-6)
     off = fitting.compare_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
     assert nees(off) > 3 * nees(positions)
 

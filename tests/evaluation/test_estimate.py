@@ -206,6 +206,32 @@ def test_the_covariance_has_the_arc_of_a_considered_yaw(walks):
     np.testing.assert_allclose(excess, expected, rtol=2e-2, atol=1e-3 * expected.max())
 
 
+@pytest.mark.parametrize("run", [tight, loose])
+def test_variances_of_a_corrector_take_the_place_of_the_densities(walks, run):
+    """A density of white noise is a variance of the samples times their interval. The recordings of
+    a batch have different lengths, and the consider covariance repeats the run."""
+    gyro, accel = 0.01, 0.2
+    considered = changed(OPTIONS, considered={"gyro_bias": 0.01})
+    denser = changed(considered, noise={"gyro_density": gyro, "accel_density": accel})
+    recordings = ready([walks[0], walks[2]], orientation="reference")
+    variance = RATE * np.repeat([accel**2, gyro**2], 3)
+    corrected = [
+        recording._replace(variance=np.tile(variance, (len(recording.gyro), 1)))
+        for recording in recordings
+    ]
+    estimates, expected, plain = (
+        run(*arguments, batch_size=2)
+        for arguments in (
+            (corrected, NETWORK, CONFIG, considered),
+            (recordings, NETWORK, CONFIG, denser),
+            (recordings, NETWORK, CONFIG, considered),
+        )
+    )
+    for estimate, other, without in zip(estimates, expected, plain, strict=True):
+        same(estimate, other, 1e-5)
+        assert np.nanmax(np.abs(estimate.states.std - without.states.std)) > 0.01
+
+
 def with_gyro_bias(recording, off):
     start = recording.start
     return recording._replace(start=start._replace(gyro_bias=start.gyro_bias + off))

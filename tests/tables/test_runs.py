@@ -38,12 +38,12 @@ def test_a_calibration_is_of_the_best_weights_and_warns(tmp_path, monkeypatch, c
 @pytest.mark.parametrize("rows, state", [(0, "begun"), (39, "begun"), (40, "finished")])
 def test_a_run_is_finished_with_its_last_epoch(tmp_path, rows, state):
     config = dataclasses.replace(BASE, dataset="synthetic", workdir=str(tmp_path / "gnio_s0"))
-    assert BASE.optim.epochs == 40 and runs._state(config) == "new"
+    assert BASE.optim.epochs == 40 and runs.run_state(config) == "new"
     write_run(tmp_path / "gnio_s0")
     configuration.save(tmp_path / "gnio_s0" / "config.yaml", config)
     if rows:
         (tmp_path / "gnio_s0" / "metrics.jsonl").write_text("{}\n" * rows)
-    assert runs._state(config) == state
+    assert runs.run_state(config) == state
 
 
 def test_a_run_of_other_recordings_is_refused(tmp_path, monkeypatch):

@@ -158,6 +158,23 @@ def test_a_mirrored_segment_is_that_of_a_mirrored_walk():
     np.testing.assert_allclose(mirrored.moved, plain.moved, atol=1e-5)
 
 
+def test_a_bias_is_constant_in_the_body_behind_the_mirror():
+    sequence = walk()
+    source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))
+    row, grid = source.earliest[:1], SegmentGrid(N, 20, W, RATE)
+    plain, biased = (
+        np.asarray(draw_walks(jax.random.key(2), source, row, grid, augment).signals, float)
+        for augment in (
+            dataclasses.replace(OFF, mirror_share=1.0, accel_bias=bias) for bias in (0.0, 0.4)
+        )
+    )
+    w, x, y, z = sequence.orientation[int(row[0]) : int(row[0]) + 20 * N].T
+    behind = Rotation.from_quat(np.stack([-x, y, -z, w], axis=1))
+    bias = behind.inv().apply((biased - plain)[0, :, :3])
+    np.testing.assert_allclose(bias, np.tile(bias[:1], (20 * N, 1)), atol=1e-5)
+    assert np.abs(bias[0]).min() > 0.01
+
+
 def test_a_segment_of_a_phone_that_rocks_otherwise_has_the_same_forces():
     source = jax.device_put(walk_source([walk()], experiment(None, "unused"), training=False))
     row, grid = source.earliest[:1], SegmentGrid(N, 20, W, RATE)

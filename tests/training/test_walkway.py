@@ -118,5 +118,7 @@ def test_factors_are_drawn_within_their_bounds():
         share = (np.log(values) - np.log(low)) / (np.log(high) - np.log(low))
         assert -1e-6 < share.min() < 0.01 and 0.99 < share.max() < 1 + 1e-6
         assert share.mean() == pytest.approx(0.5, abs=0.03)
+    factors = np.log([pace.gain, pace.vertical_gain, pace.stretch])
+    assert np.abs(np.corrcoef(factors) - np.eye(3)).max() < 0.06
     plain = jax.device_get(draw_pace(jax.random.key(0), 5, AugmentConfig()))
     jax.tree.map(np.testing.assert_array_equal, plain, unchanged(5))

@@ -222,15 +222,20 @@ def test_a_mirrored_window_is_that_of_a_phone_behind_the_mirror():
     before = Windows(
         np.broadcast_to(imu[::400].astype(np.float32), (count, 10, 12)),
         np.broadcast_to(moved.astype(np.float32), (count, 3)),
-        np.zeros((count, 10, 3), np.float32),
+        np.broadcast_to(
+            np.diff(position[::400], axis=0)[None, :9].astype(np.float32), (count, 9, 3)
+        ),
     )
     after = augmented(before, mirror_share=0.25)
     mirrored = np.abs(after.displacement - moved).max(axis=1) > 1e-3
     assert 0.15 < mirrored.mean() < 0.35
-    for which, samples, way in (
-        (mirrored, expected[::400], moved_behind),
-        (~mirrored, imu[::400], moved),
+    for which, samples, way, path in (
+        (mirrored, expected[::400], moved_behind, reflected),
+        (~mirrored, imu[::400], moved, position),
     ):
+        steps = np.diff(path[::400], axis=0)[:9]
+        target = np.broadcast_to(steps, after.steps[which].shape)
+        np.testing.assert_allclose(after.steps[which], target, atol=1e-5)
         target = np.broadcast_to(samples, after.imu[which].shape)
         np.testing.assert_allclose(after.imu[which], target, atol=2e-4)
         target = np.broadcast_to(way, after.displacement[which].shape)
