@@ -30,13 +30,10 @@ from gnio_jax.config.schema import ABOVE_ZERO, FINITE, Number
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.geometry import hat, matmul
-from gnio_jax.types import Array
+from gnio_jax.types import NONHOLONOMIC_LOG_FACTOR, Array
 
 THRESHOLD = 13.816
 """99.9 % of χ² with two degrees of freedom."""
-LOG_FACTOR = "nonholonomic_log_factor"
-"""The network's diagnostics (2,) that are the logarithms of the factors of both standard
-deviations."""
 
 
 class NonHolonomic(NamedTuple):
@@ -64,8 +61,8 @@ class NonHolonomic(NamedTuple):
         says no factors, as before its first window, the standard deviations are the constants."""
         dtype = state.offset.dtype
         std = jnp.stack([jnp.asarray(number, dtype) for number in self[:2]])
-        if LOG_FACTOR in step.diagnostics:
-            log_factor = step.diagnostics[LOG_FACTOR].astype(dtype)
+        if NONHOLONOMIC_LOG_FACTOR in step.diagnostics:
+            log_factor = step.diagnostics[NONHOLONOMIC_LOG_FACTOR].astype(dtype)
             finite = jnp.isfinite(log_factor).all()
             std = std * jnp.exp(jnp.where(finite, log_factor, 0.0))
         across = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)[1:]

@@ -29,6 +29,8 @@ not computed again at the smoothed ones.
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -89,14 +91,16 @@ def smooth(
     frame: DisplacementFrame = "given",
     measurements: tuple[Measurement, ...] = (),
     variance: Any = None,
+    diagnostics: Mapping[str, Any] = MappingProxyType({}),
 ) -> SmoothedHistory:
     """Filter K clone intervals as `run_filter` does, then smooth: each row is the estimate given
     all measurements of the K intervals.
 
     The updates of `run_filter` are smoothed exactly as they were made. A run of `run_odometry` that
     returned `history` is smoothed without its network by `smooth(ekf, state, gyro, accel,
-    *history.given(ekf.noise), frame=ekf.config.displacement_frame)`. `state` is the prior, and
-    earlier measurements are not smoothed. It works under `jax.jit`, `jax.vmap` and `jax.grad`.
+    *history.given(ekf.noise), frame=ekf.config.displacement_frame,
+    diagnostics=history.diagnostics)`. `state` is the prior, and earlier measurements are not
+    smoothed. It works under `jax.jit`, `jax.vmap` and `jax.grad`.
 
     Smoothing trusts the IMU as far as `ekf.noise` says. Where the IMU is sampled too slowly for the
     motion, as on a swinging leg at 100 Hz, its integration errs by more than that, and the smoothed
@@ -119,13 +123,15 @@ def smooth(
         frame: The attitude that defines the frame of the displacements, "given" or "own".
         measurements: Measurements with a row for each interval.
         variance: (K·n, 6) variances of the samples, as in `run_filter`.
+        diagnostics: A network's diagnostics of every interval, as in `run_filter`.
 
     Raises:
         ValueError: As `run_filter`.
     """
     check_frame(frame)
     inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements, variance)
-    return _smooth(inputs, *checked_displacements(displacement, covariance, inputs), frame)
+    rows = checked_displacements(displacement, covariance, inputs)
+    return _smooth(inputs, *rows, dict(diagnostics), frame)
 
 
 class _ForwardStep(NamedTuple):
@@ -144,7 +150,11 @@ class _ForwardStep(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="frame")
 def _smooth(
-    inputs: FilterInputs, displacement: Array, covariance: Array, frame: DisplacementFrame
+    inputs: FilterInputs,
+    displacement: Array,
+    covariance: Array,
+    diagnostics: dict[str, Array],
+    frame: DisplacementFrame,
 ) -> SmoothedHistory:
     config = inputs.ekf.config
     rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)
@@ -154,7 +164,7 @@ def _smooth(
         cross = additive_core(state, with_position(whole))
         return _ForwardStep(slot, record.mean, first_order_covariance(state), cross, trace)
 
-    state, steps, _ = clone_steps(take_row, inputs, rows, keep)
+    state, steps, _ = clone_steps(take_row, inputs, (rows, diagnostics), keep)
     size, dtype = sum(state.cross_covariance.shape), state.offset.dtype
     nothing = Adjoint(jnp.zeros(size, dtype), jnp.zeros((size, size), dtype))
     backward = functools.partial(_step_back, config=config)

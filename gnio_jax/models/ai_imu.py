@@ -15,10 +15,9 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from gnio_jax.config.schema import Probability
 from gnio_jax.models.airio import body_axes
 from gnio_jax.models.layers import FLOAT32, linear
-from gnio_jax.types import GRAVITY, Prediction
+from gnio_jax.types import GRAVITY, NONHOLONOMIC_LOG_FACTOR, Prediction
 
 SAMPLES = 17
 """Samples on which an output depends: 5, and four more steps of 3."""
@@ -35,8 +34,8 @@ class AIIMU(nn.Module):
     of the standard deviations of a car's velocity to the left and up.
 
     The samples in the body are normalised. Two convolutions of 5 samples follow, the second one
-    with dilation 3, each with ReLU and dropout, then a linear layer and tanh: 6,210 parameters. A
-    variance has the factor 10^(3 tanh), between 1/1000 and 1000.
+    with dilation 3, each with ReLU, then a linear layer and tanh: 6,210 parameters. A variance has
+    the factor 10^(3 tanh), between 1/1000 and 1000.
 
     Published: an output for every sample, at 100 Hz, with edges that are repeated after each
     convolution, 4 samples on both sides. So the output of a sample depends on the 8 samples before
@@ -44,12 +43,10 @@ class AIIMU(nn.Module):
     no padding, so it is causal, and the middle of what it sees is 8 samples before the measurement;
     the normalisation, where the published one has the statistics of the training set; samples
     without the filter's biases; zeros in the linear layer at first, with which the factors are 1
-    (published: a hundredth of PyTorch's start).
-
-    Training needs the random stream `dropout`. Through the filter there is no dropout.
+    (published: a hundredth of PyTorch's start); no dropout (published: 0.5 behind each ReLU),
+    because the network runs in the filter's loop in training as in an evaluation.
     """
 
-    dropout: Probability = 0.5
     channels = 12
     predicts_displacement = False
 
@@ -71,9 +68,9 @@ class AIIMU(nn.Module):
                 name=f"filter{number}",
                 **FLOAT32,
             )(x)
-            x = nn.Dropout(self.dropout, deterministic=not train)(nn.relu(x))
+            x = nn.relu(x)
         last = linear(2, "log_std", kernel_init=nn.initializers.zeros)
         log_factor = 0.5 * math.log(10) * DECADES * jnp.tanh(last(x[:, 0]))
         nothing = jnp.full((len(windows), 3), jnp.nan, jnp.float32)
-        diagnostics: dict[str, jax.Array] = {"nonholonomic_log_factor": log_factor}
+        diagnostics: dict[str, jax.Array] = {NONHOLONOMIC_LOG_FACTOR: log_factor}
         return Prediction(nothing, jnp.zeros_like(nothing), diagnostics)

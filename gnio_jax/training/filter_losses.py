@@ -14,7 +14,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from gnio_jax import geometry
 from gnio_jax.config import ThroughFilter
@@ -52,7 +52,10 @@ class FilterLosses(NamedTuple):
     window: Float[Array, ""]
     """`window_error`, m²."""
     translation: Float[Array, ""]
-    """`relative_translation`."""
+    """`relative_translation`, 0 without a piece."""
+    long_enough: Float[Array, ""]
+    """1 if the path has a piece of 100 m, else 0. Its mean is the share of the segments that count
+    in the mean of `translation`."""
     waypoints: Float[Array, ""]
     """`waypoint_error`; 0 for a segment with fewer than two waypoints."""
     nis: Float[Array, ""]
@@ -104,7 +107,8 @@ def filter_losses(
         window = velocity_error(history.displacement, truth, seconds)
     else:
         window = window_error(history.displacement, estimate, truth, config.clones_per_window)
-    translation = relative_translation(estimate, truth, max(1, round(1 / config.clone_seconds)))
+    every = max(1, round(1 / config.clone_seconds))
+    translation, pieces = relative_translation(estimate, truth, every)
     waypoints = waypoint_error(estimate.position, segment.waypoint)
     posed = (
         weights.displacement_weight * jnp.mean(displacement)
@@ -119,7 +123,8 @@ def filter_losses(
     squares = normalised_squares(error[1:, 3:], of_position)
     nis, healthy = jnp.nanmean(history.nis) / 3, history.healthy[-1] > 0
     return FilterLosses(
-        *(total, displacement, yaw, innovation, state, window, translation, waypoints),
+        *(total, displacement, yaw, innovation, state, window, translation),
+        *(jnp.where(pieces > 0, 1.0, 0.0), waypoints),
         *(nis, jnp.mean(squares) / 3, healthy),
     )
 
@@ -170,9 +175,12 @@ def _squared_distance(position: Float[Array, "k 3"], count: int) -> Float[jax.Ar
     return (walked[count:] - walked[:-count]) ** 2 + DISTANCE_FLOOR**2
 
 
-def relative_translation(estimate: MotionPath, truth: MotionPath, every: int) -> Float[Array, ""]:
+def relative_translation(
+    estimate: MotionPath, truth: MotionPath, every: int
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """‖R̂_iᵀ (p̂_j − p̂_i) − R_iᵀ (p_j − p_i)‖ / ℓ, mean over the pieces of ℓ = 100, 200, … 800 m of
-    the true path that begin at every `every`-th row i; 0 if the path is shorter.
+    the true path that begin at every `every`-th row i, and the number of these pieces. The mean is
+    0 if there is none.
 
     It is the metric `t_rel` over 100. Row j is the first one by which the truth has moved further
     than ℓ. AI-IMU's loss is the sum of the squares. It is the root here, as in the metric, with
@@ -193,7 +201,8 @@ def relative_translation(estimate: MotionPath, truth: MotionPath, every: int) ->
 
     squared = jnp.sum((moved(estimate) - moved(truth)) ** 2, axis=2) / length[None] ** 2
     error = jnp.sqrt(jnp.where(whole, squared, 0.0) + TRANSLATION_FLOOR**2)
-    return jnp.sum(jnp.where(whole, error, 0.0)) / jnp.maximum(jnp.sum(whole), 1)
+    pieces = jnp.sum(whole)
+    return jnp.sum(jnp.where(whole, error, 0.0)) / jnp.maximum(pieces, 1), pieces
 
 
 def waypoint_error(

@@ -182,8 +182,8 @@ class FilterTask(Task):
             row["val_rmse"] = math.sqrt(losses.window)
         if held_out.tapped.any():
             row["val_waypoint_error"] = math.sqrt(losses.waypoints)
-        if self.config.through_filter.translation_weight:
-            row["val_t_rel"] = 100 * float(losses.translation)
+        if self.config.through_filter.translation_weight and losses.long_enough:
+            row["val_t_rel"] = 100 * float(losses.translation / losses.long_enough)
         # Roots of the squared errors of each horizon: relative to the distance, and in rad per
         # metre.
         for name in ("displacement", "yaw"):

@@ -99,11 +99,13 @@ def test_the_relative_translation_is_kittis():
                     for path in (estimate, truth)
                 ]
                 errors.append(np.hypot(np.linalg.norm(moves[0] - moves[1]) / length, 1e-3))
-    relative = quick(jax.value_and_grad(filter_losses.relative_translation), static_argnums=2)
-    value, slope = relative(estimate, truth, every)
+    relative = jax.value_and_grad(filter_losses.relative_translation, has_aux=True)
+    relative = quick(relative, static_argnums=2)
+    (value, pieces), slope = relative(estimate, truth, every)
     assert len(errors) > 20 and value == pytest.approx(np.mean(errors), rel=1e-9)
+    assert pieces == len(errors)
     # A path that is too short has none, and an error of zero has a derivative.
-    assert relative(*paths(), every)[0] == 0
+    assert relative(*paths(), every)[0] == (0, 0)
     for one, other in ((truth, truth), paths()):
         assert np.isfinite(relative(one, other, every)[1].position).all()
     assert np.abs(slope.position).max() > 0

@@ -320,12 +320,25 @@ def test_the_errors_of_the_starts_do_not_depend_on_the_yaws(training):
 def test_the_error_at_waypoints_is_logged_where_walks_have_them(training, start, monkeypatch):
     training, source = training
     horizons = np.ones(3)
-    found = FilterLosses(1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.0, 0.09, 1.0, 1.0, True)
+    found = FilterLosses(1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.0, 0.0, 0.09, 1.0, 1.0, True)
     monkeypatch.setattr(filter_task, "validate", lambda *_, **__: found)
     for tapped in (False, True):
         walks = source._replace(tapped=np.arange(len(source.tapped)) < 7 * tapped)
         row = training.figures_of(begun(training, start), walks, KEY)
         assert row.get("val_waypoint_error") == (pytest.approx(0.3) if tapped else None)
+
+
+def test_segments_that_are_too_short_for_kittis_error_do_not_lower_it(training, start, monkeypatch):
+    """Of which a quarter has pieces of 100 m: the mean over all, 0.005, is a quarter of theirs."""
+    training, source = training
+    weights = dataclasses.replace(training.config.through_filter, translation_weight=1.0)
+    config = dataclasses.replace(training.config, through_filter=weights)
+    training, horizons = dataclasses.replace(training, config=config), np.ones(3)
+    for share, expected in ((0.25, pytest.approx(2.0)), (0.0, None)):
+        means = 1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.02 * share, share, 0.09, 1.0, 1.0, True
+        monkeypatch.setattr(filter_task, "validate", lambda *_, m=means, **__: FilterLosses(*m))
+        row = training.figures_of(begun(training, start), source, KEY)
+        assert row.get("val_t_rel") == expected
 
 
 def test_the_filter_in_training_has_a_slope_at_its_gate_is_cut_and_does_not_call_lapack(
