@@ -122,7 +122,7 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
         elif names[-2:] not in SOFTMAX and (names[-1] != "bias" or names[-2] not in SHIFTS):
             assert trained > 1e-6, path
     dropped = np.abs(one.displacement - other.displacement).max() > 1e-3
-    without = ("experts", "gnio", "gru", "ionext", "ridi", "ronin_lstm", "state_space")
+    without = ("ai_imu", "experts", "gnio", "gru", "ionext", "ridi", "ronin_lstm", "state_space")
     assert dropped == (name not in (*without, "trunk"))
     assert jax.tree.structure(changed) == jax.tree.structure(statistics)
     before = jax.tree.leaves_with_path(statistics)
