@@ -26,6 +26,15 @@ STANDARD_G = 9.80665
 """The unit "G" in which phones report acceleration, m/s²."""
 
 
+KITTI_LENGTHS = tuple(range(100, 900, 100))
+"""Lengths of the pieces of a path over which KITTI's relative errors are taken, m."""
+
+
+NONHOLONOMIC_LOG_FACTOR = "nonholonomic_log_factor"
+"""Name of the diagnostics (2,) of a network that are the logarithms of the factors of both standard
+deviations of the non-holonomic constraint."""
+
+
 class Waypoints(NamedTuple):
     """Known positions at a few moments, instead of a pose at every sample."""
 

@@ -38,8 +38,11 @@ class FoldNetwork(NamedTuple):
 
 def load_network(network: str | Path, config: CalibrateConfig) -> TrainedNetwork:
     """The network that is to be calibrated. Raises `InputError` as `networks.load` and
-    `average_over_headings` do."""
+    `average_over_headings` do, and for a network without displacements."""
     trained = networks.load(network)
+    if not models.predicts_displacement(trained.model):
+        problem = f"'{trained.config.model.name}' predicts no displacement that could be calibrated"
+        raise InputError(str(network), problem, "train the filter's numbers: through_filter.learn")
     if not config.average_headings:
         return trained
     return average_over_headings(trained, f"--average-headings with {network}")

@@ -21,6 +21,7 @@ NETWORKS = {
     "ctin": "a contextual transformer with two branches (Rao et al. 2022)",
     "imot": "an inertial motion transformer (Nguyen et al. 2025)",
     "imot_text": "the same, in those details in which its text differs",
+    "ai_imu": "how far a car's constraint is to be trusted, no displacement (Brossard et al. 2020)",
     "airio": "velocities in the body's axes, with the attitude as an input (Qiu et al. 2025)",
     "ionet": "a bidirectional LSTM for polar displacements (Chen et al. 2018)",
     "ionext": "convolutions that choose between three sizes of kernel (arXiv 2507.17089)",

@@ -138,7 +138,7 @@ class DataConfig:
     window_rotation: Literal["per_sample", "single", "body_axes"] = "per_sample"
     """Rotate each sample with its own attitude, or the whole window with the attitude at its start
     (eq. 1 read literally). body_axes is per_sample with the x and y axes of the body as six more
-    channels, for networks that see the body (airio, and a corrector)."""
+    channels, for networks that see the body (ai_imu, airio, and a corrector)."""
     train_split: str = "train"
     """Split of the dataset for training. train-0of4 leaves out the first of four folds of it, in
     which people and sessions are whole: with a network for each fold, gnio calibrate has walks that
@@ -522,6 +522,9 @@ class FilterOptions:
     its age and reaches this value at `bridge_seconds`."""
     gap_accel_std: NonNegative = 3.0
     """Standard deviation of the acceleration that a gap may hide, m/s²."""
+    low_pass_seconds: NonNegative = 0.0
+    """Time constant τ of a first-order low-pass that the IMU itself has applied to its output, s.
+    The filter undoes it: each sample x becomes x + τ dx/dt (ours). 0: there is none."""
     error: Literal["invariant", "additive"] | None = None
     """The error of velocity and positions. invariant: after an update it is expressed at the new
     estimate, so that no later displacement shows a yaw that nobody measured (right-invariant EKF,
@@ -543,7 +546,7 @@ class FilterSettings(FilterOptions):
     """Standard deviations of the initial state."""
     considered: ConsideredStd = field(default_factory=ConsideredStd)
     """Errors that are not estimated but included in the covariance (Schmidt's consider states)."""
-    measurements: Mapping[str, Mapping[str, float] | None] = field(default_factory=Entries)
+    measurements: Mapping[str, Mapping[str, Number] | None] = field(default_factory=Entries)
     """Measurements besides the displacement, by their names, each with its numbers; they are taken
     after the displacement of a clone interval, in this order. zero_velocity: {std: 0.02} measures a
     velocity of zero with a standard deviation of 0.02 m/s while the IMU rests. `null` takes one
@@ -590,6 +593,9 @@ class ThroughFilter:
     truncate_seconds: NonNegative = 10.0
     """The filter, and the memory of a network that has one, continues without gradient after every
     interval of this length, s; 0: the gradient goes through the whole segment."""
+    start_spread: Annotated[NonNegative, FILE_ONLY] = 1.0
+    """Each segment starts with errors that are drawn from the filter's standard deviations at the
+    start times this factor. 0: at the reference, with biases of zero, as an evaluation does."""
     filter_learning_rate: Positive = 0.03
     """Peak learning rate of the logarithms of the filter's options; the network's is
     optim.learning_rate. Both have its schedule."""
@@ -602,6 +608,9 @@ class ThroughFilter:
     state_weight: NonNegative = 0.1
     """Weight of the negative log-likelihood of the true velocity and position under the filter's
     covariance."""
+    translation_weight: Annotated[NonNegative, FILE_ONLY] = 0.0
+    """Weight of KITTI's relative error of translation, over pieces of 100, 200, ... 800 m of each
+    segment: the metric `t_rel`, for vehicles."""
     window_weight: Annotated[NonNegative, FILE_ONLY] = 100.0
     """Weight of the squared error of each window's displacement."""
 

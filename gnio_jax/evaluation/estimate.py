@@ -287,7 +287,8 @@ def _run(
 
             def repeat_run(state: FilterState, displacement: Array) -> FilterHistory:
                 rows = displacement, covariance, valid, frame
-                return run_filter(ekf, state, *signals, *rows, **others)[1]
+                replayed = others | {"diagnostics": history.diagnostics}
+                return run_filter(ekf, state, *signals, *rows, **replayed)[1]
 
             rotation = history.rotation if ekf.config.measures == "velocity" else None
             derivatives = sensitivity(repeat_run, state, displacement, rotation)

@@ -92,12 +92,7 @@ def evaluate(
     """
     _check(config)
     path = find_network(config.network or newest_run())
-    if config.checkpoint == "latest":
-        from gnio_jax.training.checkpoint import load_latest  # Orbax takes half a second to import
-
-        trained = load_latest(path)
-    else:
-        trained = read_network(path)
+    trained = _load_network(path, config)
     config = resolve(config, trained.config)
     windows, ekf = trained.config.data, make_filter(trained.config.data, config.filter)
 
@@ -222,6 +217,22 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
         filter=changed.filter,
         set=(),
     )
+
+
+def _load_network(path: Path, config: EvaluateConfig) -> TrainedNetwork:
+    """The network of a run's folder. Raises `InputError` if the estimator needs displacements and
+    the network predicts none."""
+    if config.checkpoint == "latest":
+        from gnio_jax.training.checkpoint import load_latest  # Orbax takes half a second to import
+
+        trained = load_latest(path)
+    else:
+        trained = read_network(path)
+    if _infers(config) and not models.predicts_displacement(trained.model):
+        problem = f"needs displacements, and '{trained.config.model.name}' predicts none"
+        choice = "integrate" if config.estimator == "integrate" else "loose"
+        raise InputError(choice, problem, "evaluate it with the filter's tight coupling")
+    return trained
 
 
 def _infers(config: EvaluateConfig) -> bool:

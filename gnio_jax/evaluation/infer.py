@@ -16,11 +16,11 @@ from gnio_jax.evaluation.infer_memory import remembered_displacements
 from gnio_jax.evaluation.prepare import PreparedRecording
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Array, Prediction, Quantity
+from gnio_jax.types import NONHOLONOMIC_LOG_FACTOR, Array, Prediction, Quantity
 from gnio_jax.windows import align_recording, cut_windows, window_starts, without_any
 
 WINDOWS_PER_CALL = 512
-DIAGNOSTICS = ("gate", "scale")
+DIAGNOSTICS = ("gate", "scale", NONHOLONOMIC_LOG_FACTOR)
 """Diagnostics of the network that are stored for every window. Attention is too large."""
 
 

@@ -26,7 +26,7 @@ from gnio_jax.evaluation.trajectory import (
     relative_yaw,
 )
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotation_z, spans
-from gnio_jax.types import Waypoints
+from gnio_jax.types import KITTI_LENGTHS, Waypoints
 
 Positions = Float[np.ndarray, "n d"]
 
@@ -38,8 +38,6 @@ LEAST_PATH = 1.0
 """Length of the reference below which `drift` and `path_length_ratio` are undefined, m."""
 LEAST_LEG = 1.0
 """Length of a leg below which the ratio of lengths is not meaningful, m."""
-KITTI_LENGTHS = tuple(range(100, 900, 100))
-"""Lengths of the pieces of `t_rel` and `r_rel`, m."""
 LEAST_SECONDS = 10.0
 """Time below which `yaw_drift` is undefined, s."""
 

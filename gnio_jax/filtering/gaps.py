@@ -1,10 +1,16 @@
-"""Drop-outs of the IMU: the filter holds the last sample through short ones and coasts through long
-ones, and both increase the covariance.
+"""The stream of the IMU as the filter takes it: without holes, and without the low-pass of the IMU.
+
+The filter holds the last sample through short drop-outs and coasts through long ones, and both
+increase the covariance.
 
 All of this file is ours; the paper and TLIO take a complete stream for granted. The error of a held
 sample grows with its age and keeps its sign over a gap, so it is taken as fully correlated: the
 variances of a gap's samples add up to the square of the summed standard deviations. Beyond
 `bridge_seconds` no sample is held: attitude and velocity stay constant.
+
+Some IMUs pass their output through a low-pass. In a first-order one with the time constant τ the
+output x follows the true signal u by u = x + τ dx/dt. A rate that lags by τ makes the attitude lag
+by τ ω in every turn.
 """
 
 from __future__ import annotations
@@ -33,7 +39,7 @@ class Gap(NamedTuple):
 
 
 class Imu(NamedTuple):
-    """A stream of raw samples without holes."""
+    """A stream of samples without holes, with their biases."""
 
     gyro: Float[Array, "*n 3"]
     """rad/s"""
@@ -44,6 +50,8 @@ class Imu(NamedTuple):
     variance: Float[Array, "*n 6"] | None = None
     """Variances of the errors of [accel, gyro] in the place of the filter's densities, (m/s²)² and
     (rad/s)², of corrected samples; None: the densities hold."""
+    output: tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]] | None = None
+    """Gyro and accel behind the low-pass of the IMU, where it was undone; else None."""
 
 
 def no_gap(n: int, dtype: np.dtype) -> Gap:
@@ -79,13 +87,16 @@ def bridge(
     present), and the memory after it.
 
     A sample is missing where `valid` is False or a value is not finite. Without `valid` the stream
-    is taken to be complete.
+    is taken to be complete. The low-pass of the IMU is undone in the stream and not in the memory,
+    which has raw samples (`FilterConfig.low_pass_seconds`).
     """
     n = gyro.shape[0]
     if valid is None:
         nothing_missing = jnp.zeros_like(memory.missing)
         after = memory._replace(gyro=gyro[-1], accel=accel[-1], missing=nothing_missing)
-        return Imu(gyro, accel, None), jnp.zeros(n, gyro.dtype), after
+        age, begun = jnp.zeros(n, memory.missing.dtype), jnp.ones(n, bool)
+        imu = without_low_pass(Imu(gyro, accel, None), memory, begun, age, config)
+        return imu, jnp.zeros(n, gyro.dtype), after
     valid = valid & jnp.all(jnp.isfinite(gyro), axis=1) & jnp.all(jnp.isfinite(accel), axis=1)
     # The remembered sample is number 0, before the stream; `last` is the number of the last sample
     # that is present.
@@ -109,7 +120,41 @@ def bridge(
         accel=jnp.where(begun[-1], accel[-1], jnp.nan),
         missing=age[-1].astype(memory.missing.dtype),
     )
-    return Imu(gyro, accel, gap), (age * config.dt).astype(gyro.dtype), after
+    imu = without_low_pass(Imu(gyro, accel, gap), memory, begun, age, config)
+    return imu, (age * config.dt).astype(gyro.dtype), after
+
+
+def without_low_pass(
+    imu: Imu,
+    memory: ImuMemory,
+    begun: Bool[Array, "n"],
+    age: Int[Array, "n"],
+    config: FilterConfig,
+) -> Imu:
+    """The samples x of a stream without holes as x + τ dx/dt, with the difference from the sample
+    before.
+
+    Args:
+        imu: The stream.
+        memory: The memory before it.
+        begun: Whether there was a sample at or before each row.
+        age: Age of each row's sample, in samples. The first sample after a hole differs from one
+            that is older than a step, and its difference is divided by that time.
+        config: The filter's settings.
+    """
+    if config.low_pass_seconds == 0:
+        return imu
+    begun = jnp.concatenate([jnp.all(jnp.isfinite(memory.gyro))[None], begun[:-1]])
+    steps = 1 + jnp.concatenate([memory.missing[None], age[:-1]])
+
+    def undone(samples: Float[Array, "n 3"], last: Float[Array, "3"]) -> Float[Array, "n 3"]:
+        last = jnp.where(jnp.isfinite(last), last, 0.0)
+        step = jnp.diff(jnp.concatenate([last[None], samples]), axis=0)
+        slope = jnp.where(begun[:, None], step, 0.0) / (steps * config.dt)[:, None]
+        return samples + config.low_pass_seconds * slope.astype(samples.dtype)
+
+    gyro, accel = undone(imu.gyro, memory.gyro), undone(imu.accel, memory.accel)
+    return Imu(gyro, accel, imu.gap, output=(imu.gyro, imu.accel))
 
 
 def _hold(

@@ -154,8 +154,8 @@ def network_measurement(
 
     where `latest()` gives the last `config.reach` raw samples, and `oldest` is the slot of the
     oldest clone. The network is called where `has_window`. There is no measurement elsewhere, nor
-    from a window in which the filter coasted. Raises `ValueError` if `predict` does not return what
-    the filter needs.
+    from a window in which the filter coasted, and the diagnostics are NaN there. Raises
+    `ValueError` if `predict` does not return what the filter needs.
     """
 
     config = ekf.config
@@ -179,11 +179,15 @@ def network_measurement(
         oldest: Array | int,
     ) -> tuple[Displacement, dict[str, Array]]:
         def infer() -> Prediction:
-            gyro, accel, gap, _ = latest()
-            prediction = predict_one(network_window(state, oldest, gyro, accel, config))
-            whole = gap is None or jnp.all(gap.used > 0)
-            displacement = jnp.where(whole, prediction.displacement, jnp.nan)
-            return prediction._replace(displacement=displacement)
+            imu = latest()
+            window = network_window(state, oldest, imu.gyro, imu.accel, config)
+            prediction = predict_one(window)
+            whole = imu.gap is None or jnp.all(imu.gap.used > 0)
+            displacement, diagnostics = jax.tree.map(
+                lambda leaf: jnp.where(whole, leaf, jnp.nan),
+                (prediction.displacement, prediction.diagnostics),
+            )
+            return prediction._replace(displacement=displacement, diagnostics=diagnostics)
 
         prediction = jax.lax.cond(has_window, infer, predict_nothing)
         dtype, frame = state.offset.dtype, config.displacement_frame

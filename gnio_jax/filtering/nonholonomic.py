@@ -6,6 +6,9 @@ With the rotation C (car ← body) and the lever l from the IMU to the point, in
 
     0 = [C (Rᵀ v + (ω − b_g) × l)]_{left, up} + w,   w ~ N(0, diag(σ_left², σ_up²)).
 
+σ_left and σ_up are constants. A network in the filter's loop may say by which factors they change
+from interval to interval (`models.ai_imu`).
+
 The velocities that remain are some centimetres a second and last for seconds. They come from the
 springs, the slope of the road and an error of C. So the errors of successive intervals are not
 independent, and a σ must be several times their size.
@@ -27,7 +30,7 @@ from gnio_jax.config.schema import ABOVE_ZERO, FINITE, Number
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.geometry import hat, matmul
-from gnio_jax.types import Array
+from gnio_jax.types import NONHOLONOMIC_LOG_FACTOR, Array
 
 THRESHOLD = 13.816
 """99.9 % of χ² with two degrees of freedom."""
@@ -54,8 +57,14 @@ class NonHolonomic(NamedTuple):
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """Where the car slides sideways or jumps, the measurement fails a χ² test of 99.9 % and is
-        refused. There is none where the last sample of the interval is missing."""
+        refused. There is none where the last sample of the interval is missing. Where a network
+        says no factors, as before its first window, the standard deviations are the constants."""
         dtype = state.offset.dtype
+        std = jnp.stack([jnp.asarray(number, dtype) for number in self[:2]])
+        if NONHOLONOMIC_LOG_FACTOR in step.diagnostics:
+            log_factor = step.diagnostics[NONHOLONOMIC_LOG_FACTOR].astype(dtype)
+            finite = jnp.isfinite(log_factor).all()
+            std = std * jnp.exp(jnp.where(finite, log_factor, 0.0))
         across = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)[1:]
         lever = jnp.stack([jnp.asarray(x, dtype) for x in self[-3:]])
         velocity, present = velocity_of_point(state, step, lever)
@@ -63,7 +72,7 @@ class NonHolonomic(NamedTuple):
         linear = linearise(
             state,
             jnp.where(present, -matmul(across, velocity[:, None])[:, 0], jnp.nan),
-            jnp.diag(jnp.stack([jnp.asarray(std, dtype) ** 2 for std in self[:2]])),
+            jnp.diag(std**2),
             velocity=of_velocity,
             rotation=matmul(of_velocity, hat(state.velocity)),
             gyro_bias=matmul(across, hat(lever)),

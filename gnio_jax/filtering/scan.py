@@ -4,7 +4,8 @@ with the network in the loop."""
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -64,6 +65,7 @@ def run_filter(
     frame: DisplacementFrame = "given",
     measurements: tuple[Measurement, ...] = (),
     variance: Any = None,
+    diagnostics: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals of n IMU samples with given displacements (paper §III-G).
 
@@ -91,6 +93,8 @@ def run_filter(
             (`update.Measurement`).
         variance: (K·n, 6) variances of [accel, gyro], (m/s²)² and (rad/s)², in the place of the
             densities of `ekf.noise`, e.g. those of a corrector. None: the densities hold.
+        diagnostics: A network's diagnostics with a row for each interval, for the measurements that
+            read them: `FilterHistory.diagnostics` of the run that is repeated.
 
     Returns:
         The final state, from which a later call continues (and continues the clone numbers k), and
@@ -103,15 +107,20 @@ def run_filter(
     """
     check_frame(frame)
     inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements, variance)
-    return _run_filter(inputs, *checked_displacements(displacement, covariance, inputs), frame)
+    rows = checked_displacements(displacement, covariance, inputs)
+    return _run_filter(inputs, *rows, dict(diagnostics), frame)
 
 
 @functools.partial(jax.jit, static_argnames="frame")
 def _run_filter(
-    inputs: FilterInputs, displacement: Array, covariance: Array, frame: DisplacementFrame
+    inputs: FilterInputs,
+    displacement: Array,
+    covariance: Array,
+    diagnostics: dict[str, Array],
+    frame: DisplacementFrame,
 ) -> tuple[FilterState, FilterHistory]:
     rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)
-    return _run(take_row, inputs, rows)
+    return _run(take_row, inputs, (rows, diagnostics))
 
 
 def run_odometry(
@@ -195,7 +204,7 @@ def _measure_recalled(
 def _run(
     measure: Callable[..., tuple[Displacement, dict]],
     inputs: FilterInputs,
-    displacement: Displacement | None,
+    displacement: tuple[Displacement, dict] | None,
     remember: MemoryStep | None = None,
     memory: Memory | None = None,
 ) -> tuple[FilterState, FilterHistory]:
@@ -209,15 +218,18 @@ def _run(
     return unroll_clones(state, len(age) % config.clones), history
 
 
-def take_row(_: Array, __: Imu, row: Displacement, *___: Any) -> tuple[Displacement, dict]:
-    """`measure` of `clone_steps` where the displacements are known before the run."""
-    return row, {}
+def take_row(
+    _: Array, __: Imu, row: tuple[Displacement, dict], *___: Any
+) -> tuple[Displacement, dict]:
+    """`measure` of `clone_steps` where the displacements and the diagnostics are known before the
+    run."""
+    return row
 
 
 def clone_steps(
     measure: Callable[..., tuple[Displacement, dict]],
     inputs: FilterInputs,
-    displacement: Displacement | None,
+    displacement: tuple[Displacement, dict] | None,
     keep: Callable[[Array, FilterState, StepRecord, StepTrace], T],
     remember: MemoryStep | None = None,
     memory: Memory | None = None,
@@ -303,7 +315,7 @@ def clone_step(
     outcomes: dict[str, Outcome] = {}
     corrections: tuple[Correction, ...] = ()
     for measurement in (displacement, *ekf.measurements, *measurements):
-        step = Step(imu, slot, oldest, config, noise, outcomes)
+        step = Step(imu, slot, oldest, config, noise, outcomes, diagnostics)
         update = jax.checkpoint(
             lambda measurement, state, step=step: measurement.update(state, step),
             policy=_keep,

@@ -201,23 +201,34 @@ which it follows, or with its value and the reason."""
 
 SHARE = "noise.correlation.share"
 """The number that lies between 0 and 1; the others are positive."""
+SIGNED = {
+    **{f"measurements.nonholonomic.{angle}": 0.1 for angle in ("yaw", "pitch", "roll")},
+    **{f"measurements.nonholonomic.lever_{axis}": 1.0 for axis in "xyz"},
+}
+"""Numbers that may have any sign, and 0, with the unit in which they are free, rad and m. A step of
+the optimizer is a share of this unit."""
 LARGEST_SHARE = 0.9999
 """Largest share that is written to a file: rounding must not make it 1."""
 
 
 def free_parameters(settings: FilterSettings, paths: Iterable[str]) -> dict[str, float]:
     """The numbers of some settings as parameters without bounds, which are fitted and trained: the
-    logit of a share, and the logarithm of every other number.
+    logit of a share, the number over its unit if it may have any sign (`SIGNED`), and the logarithm
+    of every other number.
 
-    Each of the `paths` names a number ("noise.gyro_density") or a section of them ("noise"). A
-    number that is 0 is switched off and has no free parameter.
+    Each of the `paths` names a number ("noise.gyro_density") or a section of them ("noise"). Any
+    other number that is 0 is switched off and has no free parameter.
     """
     paths = tuple(paths)
-    return {
-        name: math.log(value) - (math.log1p(-value) if name == SHARE else 0.0)
-        for name, value in _numbers(settings).items()
-        if value > 0 and any(is_below(name, path) for path in paths)
-    }
+    free = {}
+    for name, value in _numbers(settings).items():
+        if not any(is_below(name, path) for path in paths):
+            continue
+        if name in SIGNED:
+            free[name] = value / SIGNED[name]
+        elif value > 0:
+            free[name] = math.log(value) - (math.log1p(-value) if name == SHARE else 0.0)
+    return free
 
 
 def is_below(name: str, path: str) -> bool:
@@ -230,7 +241,10 @@ def with_free_parameters(settings: FilterSettings, free: Mapping[str, Any]) -> F
     names, structure = _numbers(settings), jax.tree.structure(settings)
     for name in names.keys() & free.keys():
         number = jnp.asarray(free[name], jnp.float64)
-        names[name] = jax.nn.sigmoid(number) if name == SHARE else jnp.exp(number)
+        if name in SIGNED:
+            names[name] = SIGNED[name] * number
+        else:
+            names[name] = jax.nn.sigmoid(number) if name == SHARE else jnp.exp(number)
     return jax.tree.unflatten(structure, names.values())
 
 

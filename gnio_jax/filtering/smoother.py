@@ -29,6 +29,8 @@ not computed again at the smoothed ones.
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -89,6 +91,7 @@ def smooth(
     frame: DisplacementFrame = "given",
     measurements: tuple[Measurement, ...] = (),
     variance: Any = None,
+    diagnostics: Mapping[str, Any] = MappingProxyType({}),
 ) -> SmoothedHistory:
     """Filter K clone intervals as `run_filter` does, then smooth: each row is the estimate given
     all measurements of the K intervals.
@@ -97,7 +100,7 @@ def smooth(
     returned `history` is smoothed without its network by
 
         smooth(ekf, state, gyro, accel, *history.unscaled_displacements(ekf.noise),
-               frame=ekf.config.displacement_frame)
+               frame=ekf.config.displacement_frame, diagnostics=history.diagnostics)
 
     `state` is the prior, and earlier measurements are not smoothed. It works under `jax.jit`,
     `jax.vmap` and `jax.grad`.
@@ -123,13 +126,15 @@ def smooth(
         frame: The attitude that defines the frame of the displacements, as in `run_filter`.
         measurements: Measurements with a row for each interval.
         variance: (K·n, 6) variances of the samples, as in `run_filter`.
+        diagnostics: A network's diagnostics of every interval, as in `run_filter`.
 
     Raises:
         ValueError: As `run_filter`.
     """
     check_frame(frame)
     inputs = checked_inputs(ekf, state, gyro, accel, imu_valid, measurements, variance)
-    return _smooth(inputs, *checked_displacements(displacement, covariance, inputs), frame)
+    rows = checked_displacements(displacement, covariance, inputs)
+    return _smooth(inputs, *rows, dict(diagnostics), frame)
 
 
 class _ForwardStep(NamedTuple):
@@ -148,7 +153,11 @@ class _ForwardStep(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="frame")
 def _smooth(
-    inputs: FilterInputs, displacement: Array, covariance: Array, frame: DisplacementFrame
+    inputs: FilterInputs,
+    displacement: Array,
+    covariance: Array,
+    diagnostics: dict[str, Array],
+    frame: DisplacementFrame,
 ) -> SmoothedHistory:
     config = inputs.ekf.config
     rows = scaled_displacement(displacement, covariance, inputs.ekf.noise, frame)
@@ -158,7 +167,7 @@ def _smooth(
         cross = additive_core(state, with_position(whole))
         return _ForwardStep(slot, record.mean, first_order_covariance(state), cross, trace)
 
-    state, steps, _ = clone_steps(take_row, inputs, rows, keep)
+    state, steps, _ = clone_steps(take_row, inputs, (rows, diagnostics), keep)
     size, dtype = sum(state.cross_covariance.shape), state.offset.dtype
     nothing = Adjoint(jnp.zeros(size, dtype), jnp.zeros((size, size), dtype))
     backward = functools.partial(_step_back, config=config)

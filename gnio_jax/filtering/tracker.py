@@ -63,7 +63,7 @@ from gnio_jax.filtering.state import (
     invariant_errors,
     unroll_clones,
 )
-from gnio_jax.filtering.zero_velocity import quiet_samples
+from gnio_jax.filtering.zero_velocity import quiet_samples, unbiased_output
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array, Memory
 
 
@@ -359,7 +359,7 @@ def advance(
         memory, recall = memory_step(predict, ekf)(memory, core.filter, imu)
 
         def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
-            return recalled_displacement(ekf, recall, state, oldest)[0], {}
+            return recalled_displacement(ekf, recall, state, oldest)
 
     else:
         complete = core.filter.step >= config.clones_per_window
@@ -368,7 +368,7 @@ def advance(
         latest = Imu(window[:, GYRO], window[:, ACCEL], None)
 
         def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
-            return measure_window(complete, lambda: latest, state, oldest)[0], {}
+            return measure_window(complete, lambda: latest, state, oldest)
 
     def step(state: FilterState, measure: Measure) -> tuple[FilterState, FilterHistory]:
         slot = core.intervals % config.clones
@@ -379,8 +379,7 @@ def advance(
     else:
         state, history, tangents = step_with_tangents(step, core.filter, core.tangents, measure)
     state = state._replace(imu=imu_memory._replace(quiet=state.imu.quiet))
-    rate, force = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
-    quiet = jnp.all(valid) & jnp.all(quiet_samples(rate, force, config))
+    quiet = jnp.all(valid) & jnp.all(quiet_samples(*unbiased_output(imu, state), config))
     flags = [history.accepted[0], history.nis[0], history.healthy[0]]
     flags = jnp.stack([*flags, quiet.astype(flags[0].dtype)])
     estimate = device_pose(ekf, state, flags, tangents)

@@ -138,6 +138,8 @@ class Step(NamedTuple):
     before: Mapping[str, Outcome] = MappingProxyType({})
     """Outcomes of the measurements of this interval before this one, by their names; the first is
     the displacement."""
+    diagnostics: Mapping[str, Array] = MappingProxyType({})
+    """The network's diagnostics by their names; NaN where it was not called."""
 
 
 @runtime_checkable

@@ -59,13 +59,21 @@ def detect_rest(
 
     An interval is quiet if no sample is missing and all are quiet (`quiet_samples`).
     """
-    rate, force = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
-    quiet = jnp.all(quiet_samples(rate, force, config))
+    quiet = jnp.all(quiet_samples(*unbiased_output(imu, state), config))
     if imu.gap is not None:
         quiet = quiet & jnp.all(imu.gap.gyro_variance == 0)
     count = jnp.where(quiet, state.imu.quiet + 1, 0).astype(state.imu.quiet.dtype)
     enough = int(np.ceil(config.rest_seconds / config.clone_seconds - 1e-6))
     return state._replace(imu=state.imu._replace(quiet=count)), count >= max(enough, 1)
+
+
+def unbiased_output(
+    imu: Imu, state: FilterState
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    """Rate, rad/s, and specific force, m/s², without their biases. Where the low-pass of the IMU
+    was undone, which enlarges its noise, they are those behind it."""
+    gyro, accel = (imu.gyro, imu.accel) if imu.output is None else imu.output
+    return gyro - state.gyro_bias[None], accel - state.accel_bias[None]
 
 
 def quiet_samples(

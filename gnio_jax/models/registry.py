@@ -21,6 +21,7 @@ from gnio_jax.config import ModelConfig, TrainConfig
 from gnio_jax.config.files import check_value
 from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError, did_you_mean
+from gnio_jax.models.ai_imu import AIIMU
 from gnio_jax.models.airimu import Corrected
 from gnio_jax.models.airio import AirIO
 from gnio_jax.models.convolution import winograd_pays
@@ -44,6 +45,7 @@ from gnio_jax.models.trunk import Trunk
 from gnio_jax.types import Quantity
 
 _MODELS: dict[str, type[nn.Module]] = {
+    "ai_imu": AIIMU,
     "airio": AirIO,
     "ctin": CTIN,
     "deepils": DeepILS,
@@ -205,6 +207,12 @@ def create(name: str, **values: Any) -> nn.Module:
 def channels(model: nn.Module) -> int:
     """Channels of the windows of a network: 6, or 12 with the body's axes."""
     return getattr(model, "channels", 6)
+
+
+def predicts_displacement(model: nn.Module) -> bool:
+    """Whether a network predicts a displacement. One that does not can be trained and run in the
+    filter's loop alone, and needs no weights from training on windows."""
+    return getattr(innermost(model), "predicts_displacement", True)
 
 
 def _check_word(

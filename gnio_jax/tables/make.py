@@ -293,7 +293,7 @@ def make_standing(
 BLOCKS = ("rep", "fourier", "wavelet")
 NETWORKS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "imot_text", "gnio")
 NETWORKS += ("ronin_lstm", "ronin_tcn", "gru", "state_space")
-NETWORKS += ("ionet", "airio", "ionext", "experts", "trunk", "ridi")
+NETWORKS += ("ionet", "ai_imu", "airio", "ionext", "experts", "trunk", "ridi")
 VARIANTS: dict[str, dict[str, Any]] = {
     "tlio behind airimu": {"name": "tlio", "corrector": "airimu"},
     "tlio in o2_frame": {"name": "tlio", "equivariance": "o2_frame"},

@@ -13,20 +13,24 @@ from typing import NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float
+import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from gnio_jax import geometry
 from gnio_jax.config import ThroughFilter
 from gnio_jax.filtering import FilterConfig, FilterHistory
 from gnio_jax.filtering.history import POSITION, VELOCITY
 from gnio_jax.training.segments import MotionPath, Segment
-from gnio_jax.types import Array
+from gnio_jax.types import KITTI_LENGTHS, Array
 
 HORIZON_SECONDS = (1.0, 5.0, 10.0, 30.0, 60.0)
 """Times over which relative errors are taken, s, if the segment is long enough."""
 DISTANCE_FLOOR = 1.0
 """Added in quadrature to the distance by which an error is divided, m, so that standing still is no
 singular point (ours)."""
+TRANSLATION_FLOOR = 1e-3
+"""Added in quadrature to a relative error of translation, so that its root has a derivative
+everywhere (ours)."""
 FAR_OFF = 1.5
 """Distance from a waypoint beyond which it counts less and less, m (ours)."""
 VELOCITY_POSITION = slice(VELOCITY.start, POSITION.stop)
@@ -47,6 +51,11 @@ class FilterLosses(NamedTuple):
     """`gaussian_nll` of the true velocity (m/s) and position (m)."""
     window: Float[Array, ""]
     """`window_error`, m²."""
+    translation: Float[Array, ""]
+    """`relative_translation`, 0 without a piece."""
+    long_enough: Float[Array, ""]
+    """1 if the path has a piece of 100 m, else 0. Its mean is the share of the segments that count
+    in the mean of `translation`."""
     waypoints: Float[Array, ""]
     """`waypoint_error`; 0 for a segment with fewer than two waypoints."""
     nis: Float[Array, ""]
@@ -98,12 +107,15 @@ def filter_losses(
         window = velocity_error(history.displacement, truth, seconds)
     else:
         window = window_error(history.displacement, estimate, truth, config.clones_per_window)
+    every = max(1, round(1 / config.clone_seconds))
+    translation, pieces = relative_translation(estimate, truth, every)
     waypoints = waypoint_error(estimate.position, segment.waypoint)
     posed = (
         weights.displacement_weight * jnp.mean(displacement)
         + weights.yaw_weight * jnp.mean(yaw)
         + weights.state_weight * state
         + weights.window_weight * window
+        + weights.translation_weight * translation
     )
     tapped = weights.displacement_weight * waypoints
     total = weights.innovation_weight * innovation + jnp.where(segment.tapped, tapped, posed)
@@ -111,7 +123,8 @@ def filter_losses(
     squares = normalised_squares(error[1:, 3:], of_position)
     nis, healthy = jnp.nanmean(history.nis) / 3, history.healthy[-1] > 0
     return FilterLosses(
-        *(total, displacement, yaw, innovation, state, window, waypoints),
+        *(total, displacement, yaw, innovation, state, window, translation),
+        *(jnp.where(pieces > 0, 1.0, 0.0), waypoints),
         *(nis, jnp.mean(squares) / 3, healthy),
     )
 
@@ -160,6 +173,36 @@ def _squared_distance(position: Float[Array, "k 3"], count: int) -> Float[jax.Ar
     walked = jnp.cumsum(jnp.sqrt(jnp.sum(step**2, axis=1)))
     walked = jnp.concatenate([jnp.zeros_like(walked[:1]), walked])
     return (walked[count:] - walked[:-count]) ** 2 + DISTANCE_FLOOR**2
+
+
+def relative_translation(
+    estimate: MotionPath, truth: MotionPath, every: int
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """‖R̂_iᵀ (p̂_j − p̂_i) − R_iᵀ (p_j − p_i)‖ / ℓ, mean over the pieces of ℓ = 100, 200, … 800 m of
+    the true path that begin at every `every`-th row i, and the number of these pieces. The mean is
+    0 if there is none.
+
+    It is the metric `t_rel` over 100. Row j is the first one by which the truth has moved further
+    than ℓ. AI-IMU's loss is the sum of the squares. It is the root here, as in the metric, with
+    `TRANSLATION_FLOOR` added in quadrature (ours).
+    """
+    step = jnp.diff(truth.position, axis=0)
+    walked = jnp.cumsum(jnp.sqrt(jnp.sum(step**2, axis=1)))
+    walked = jnp.concatenate([jnp.zeros_like(walked[:1]), walked])
+    first = np.arange(0, len(step), every)
+    length = np.array(KITTI_LENGTHS, float)
+    last = jnp.searchsorted(walked, walked[first][:, None] + length[None], side="right")
+    whole = last < len(walked)
+    last = jnp.minimum(last, len(walked) - 1)
+
+    def moved(path: MotionPath) -> Float[Array, "i l 3"]:
+        change = path.position[last] - path.position[first][:, None]
+        return jnp.einsum("iab,ila->ilb", path.rotation[first], change)
+
+    squared = jnp.sum((moved(estimate) - moved(truth)) ** 2, axis=2) / length[None] ** 2
+    error = jnp.sqrt(jnp.where(whole, squared, 0.0) + TRANSLATION_FLOOR**2)
+    pieces = jnp.sum(whole)
+    return jnp.sum(jnp.where(whole, error, 0.0)) / jnp.maximum(pieces, 1), pieces
 
 
 def waypoint_error(

@@ -49,9 +49,6 @@ from gnio_jax.types import Sequence
 
 CHECKPOINT_EVERY = 20
 """Clone intervals between the states that the backward pass keeps."""
-START_SPREAD = 1.0
-"""Each segment starts with errors that are drawn from the filter's initial standard deviations
-times this factor."""
 GATE_SOFTNESS = 2.0
 """Slope of the χ² gate in training (`FilterConfig.gate_softness`); validation has the gate of
 evaluation."""
@@ -61,7 +58,8 @@ class FilterTask(Task):
     """Training through the filter on the segments of a `SegmentSource`."""
 
     unit = "segments"
-    figures = ("loss", "mse", "displacement", "yaw", "innovation", "state", "waypoints")
+    figures = ("loss", "mse", "displacement", "yaw", "innovation", "state", "translation")
+    figures += ("waypoints",)
     skip_above = 1000.0
     join = staticmethod(join_segments)
 
@@ -135,8 +133,8 @@ class FilterTask(Task):
         if turned:
             angles = jax.random.uniform(turn_key, rows.shape, jnp.float64, -jnp.pi, jnp.pi)
             segments = jax.vmap(turn_segment)(segments, angles)
-        std = self.config.filter.start
-        start = jax.vmap(lambda key, truth: draw_start(key, truth, std, START_SPREAD))
+        std, spread = self.config.filter.start, self.config.through_filter.start_spread
+        start = jax.vmap(lambda key, truth: draw_start(key, truth, std, spread))
         return segments, start(jax.random.split(start_key, rows.shape[0]), segments.truth)
 
     def filter_segments(
@@ -179,22 +177,30 @@ class FilterTask(Task):
         row: Row = {
             "val_loss": float(losses.total) if sound else math.inf,
             "val_mse": float(losses.window),
-            "val_rmse": math.sqrt(losses.window),
             "val_innovation": float(losses.innovation),
             "val_state": float(losses.state),
         }
+        if models.predicts_displacement(self.model):
+            row["val_rmse"] = math.sqrt(losses.window)
         if held_out.tapped.any():
             row["val_waypoint_error"] = math.sqrt(losses.waypoints)
+        if self.config.through_filter.translation_weight and losses.long_enough:
+            row["val_t_rel"] = 100 * float(losses.translation / losses.long_enough)
         # Roots of the squared errors of each horizon: relative to the distance, and in rad per
         # metre.
         for name in ("displacement", "yaw"):
             for seconds, square in zip(HORIZON_SECONDS, getattr(losses, name), strict=False):
                 row[f"val_{name}_error/{seconds:g}s"] = math.sqrt(square)
-        return row | {"val_nis": float(losses.nis), "val_nees": float(losses.nees)}
+        if math.isfinite(losses.nis):  # there were displacements
+            row["val_nis"] = float(losses.nis)
+        return row | {"val_nees": float(losses.nees)}
 
     def remark(self, row: Row) -> str:
-        skipped = f"{row['skipped']} skipped  " if row["skipped"] else ""
-        return f"nis/3 {row['val_nis']:.2f}  nees/3 {row['val_nees']:.2f}  {skipped}"
+        parts = [f"t_rel {row['val_t_rel']:.2f} %"] if "val_t_rel" in row else []
+        parts += [f"nis/3 {row['val_nis']:.2f}"] if "val_nis" in row else []
+        parts += [f"nees/3 {row['val_nees']:.2f}"]
+        parts += [f"{row['skipped']} skipped"] if row["skipped"] else []
+        return "".join(f"{part}  " for part in parts)
 
 
 def intervals(config: TrainConfig) -> int:

@@ -15,11 +15,12 @@ def load_initial_network(config: TrainConfig) -> TrainedNetwork | None:
     """The network that `config.init_from` names, if any.
 
     Raises `InputError` for a folder without a network, and for one whose network is not that of
-    `config`; also if training through the filter has none to start from. A plain head and one with
-    a calibrated uncertainty may replace each other, and so may a network with and without an
-    average over headings, since their parameters are the same.
+    `config`; also if training through the filter has none to start from and the network predicts
+    displacements. A plain head and one with a calibrated uncertainty may replace each other, and so
+    may a network with and without an average over headings, since their parameters are the same.
     """
-    if config.init_from is None and config.through_filter.learn:
+    learns_displacement = models.predicts_displacement(models.from_config(config.model))
+    if config.init_from is None and config.through_filter.learn and learns_displacement:
         problem = "needs the weights of a network that has been trained on windows"
         remedy = "name it with --init-from"
         raise InputError("config", f"field 'through_filter.learn' {problem}", remedy)

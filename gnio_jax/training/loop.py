@@ -154,6 +154,9 @@ def choose_task(config: TrainConfig) -> type[Task]:
         raise InputError("data.stride_seconds", problem, remedy)
     if config.through_filter.learn:
         return FilterTask
+    if not models.predicts_displacement(model):
+        problem = f"is empty, and '{config.model.name}' is trained in the filter's loop alone"
+        raise InputError("through_filter.learn", problem, "name the parts, e.g. [all]")
     return SegmentTask if config.segments.seconds else WindowTask
 
 
@@ -330,9 +333,10 @@ def describe_epoch(row: Row, improved: bool, task: Task) -> Iterator[str]:
     warning if a layer of the head no longer learns."""
     names = task.config.datasets
     errors = ", ".join(f"{name} {row[f'val_rmse/{name}']:.4f}" for name in names if len(names) > 1)
+    rmse = f"val rmse {row['val_rmse']:.4f} m  " if "val_rmse" in row else ""
     yield (
         f"epoch {row['epoch'] + 1:4d}/{task.config.optim.epochs}  "
-        f"loss {row['loss']:.4g}  val {row['val_loss']:.4g}  val rmse {row['val_rmse']:.4f} m  "
+        f"loss {row['loss']:.4g}  val {row['val_loss']:.4g}  {rmse}"
         f"{f'({errors})  ' if errors else ''}"
         f"{task.remark(row)}lr {row['learning_rate']:.2e}  "
         f"{_format_speed(task, row[f'{task.unit}_per_second'])}{'  best' if improved else ''}"

@@ -37,11 +37,20 @@ NAMED |= {"rio": "ronin_resnet"}
 """The networks of recipes that have another name."""
 WITH_MEMORY = {"gru", "state_space", "ronin_lstm", "ronin_tcn"}
 """Networks that are not exported."""
+OF_CONSTRAINT = {"ai_imu"}
+"""Networks without displacements, which are trained through the filter and have a test of their
+own."""
 IN_CONFIG = {"width", "bank_size", "head", "output_dim"}
 """Options that have a place of their own in the file."""
 CHANGED = ("--dataset", "tlio", "--data.rate", "100", "--data.stride-seconds", "0.2")
 CHANGED += ("--data.train-stride-seconds", "0.2", "--optim.epochs", "1", "--optim.batch-size", "4")
 CHANGED += ("--optim.statistics-windows", "8", "--optim.warmup-epochs", "0")
+
+SMALL_CAR = ("--data.train-split", "train", "--data.val-split", "val", "--optim.epochs", "1")
+SMALL_CAR += ("--optim.batch-size", "2", "--optim.warmup-epochs", "0")
+SMALL_CAR += ("--through-filter.piece-seconds", "4")
+SMALL_CAR += ("--set", "through_filter.displacement_weight=1.0")
+"""Changes of configs/vehicles.yaml. A walk has no piece of 100 m."""
 
 
 def smallest(network):
@@ -53,7 +62,36 @@ def smallest(network):
 
 def test_every_network_has_a_row_here():
     networks = {NAMED.get(name, name) for name in RECIPES} | OTHERS.keys()
-    assert networks == NETWORKS
+    assert networks | OF_CONSTRAINT == NETWORKS
+
+
+@pytest.mark.slow
+def test_the_network_of_a_cars_constraint_from_training_to_live(
+    gnio, mistake, undrawn, tmp_path, tmp_path_factory, monkeypatch
+):
+    """Train `ai_imu` through the filter, evaluate, publish and follow a recording live. What needs
+    displacements refuses it: the loose coupling, training on windows and the export."""
+    monkeypatch.chdir(tmp_path)
+    root = tlio_files.write_splits(tmp_path_factory.mktemp("data"))
+    words = ("--config", "vehicles", "--dataset", "tlio", "--data-root", root, *SMALL_CAR)
+    gnio("train", *words, "--workdir", "run")
+    gnio("evaluate", "--network", "run", "--no-plots")
+    score = json.loads(Path("run/eval/tlio_test_ekf/metrics.json").read_text())
+    assert np.isfinite(score["mean"]["ate"])
+    loose = mistake("evaluate", "--network", "run", "--no-plots", "--coupling", "loose")
+    assert "needs displacements, and 'ai_imu' predicts none" in loose
+    assert "no displacement that could be calibrated" in mistake("calibrate", "--network", "run")
+    on_windows = (*words, "--workdir", "windows", "--set", "through_filter.learn=[]")
+    assert "is trained in the filter's loop alone" in mistake("train", *on_windows)
+    gnio("publish", "run", "--out", "named.zip", "--data", "simulated walks", "--license", "CC0")
+    walk = Path("walk.csv")
+    walk.write_text("\n".join(EXAMPLE.read_text().splitlines()[:502]) + "\n")
+    gnio("live", walk, "--network", "named.zip", "--out", "live.txt")
+    path = read_tum(Path("live.txt"))
+    assert len(path.time) > 10 and np.isfinite(path.position).all()
+    if all(map(importlib.util.find_spec, ("jax2onnx", "onnx", "onnxruntime"))):
+        lowered = mistake("export", "named.zip", "--out", "models")
+        assert "low_pass_seconds" in lowered or "predicts no displacement" in lowered
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Drop-outs of the IMU: bridged, coasted through, and what they cost."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,6 +97,53 @@ def test_nothing_held_before_the_first_sample():
     assert np.isfinite(after.gyro).all()
     _, _, never = bridge(ones, ones, np.zeros(4, bool), start().imu, CONFIG)
     assert np.isnan(never.gyro).all() and never.missing == 4
+
+
+def undone(gyro, accel, valid, memory, config):
+    """By hand, one sample after the other: x + τ dx/dt, with the last sample that was there."""
+    (last, age), rows = memory, []
+    for g, a, good in zip(gyro, accel, valid, strict=True):
+        if good:
+            sample = np.concatenate([g, a])
+            slope = 0.0 if last is None else (sample - last) / ((1 + age) * config.dt)
+            rows.append(sample + config.low_pass_seconds * slope)
+            last, age = sample, 0
+        else:
+            rows.append(np.zeros(6) if last is None else last)
+            age += 1
+    return np.array(rows)
+
+
+def test_the_low_pass_of_the_imu_is_undone():
+    """Also after a hole, across two streams, and where there was no sample before."""
+    config = dataclasses.replace(CONFIG, low_pass_seconds=0.07)
+    gyro, accel = np.random.default_rng(3).normal(size=(2, 20, 3))
+    valid = np.ones(20, bool)
+    valid[[0, 6, 11, 12]] = False
+    memory = start().imu
+    expected = undone(gyro, accel, valid, (None, 0), config)
+    imu, _, after = bridge(gyro, accel, valid, memory, config)
+    np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), expected, atol=1e-12)
+    np.testing.assert_array_equal(after.gyro, gyro[-1])  # the memory is raw
+    behind, _, _ = bridge(gyro, accel, valid, memory, CONFIG)
+    jax.tree.map(np.testing.assert_array_equal, imu.output, (behind.gyro, behind.accel))
+    first, _, between = bridge(gyro[:12], accel[:12], valid[:12], memory, config)
+    second, _, _ = bridge(gyro[12:], accel[12:], valid[12:], between, config)
+    np.testing.assert_allclose(np.concatenate([first.accel, second.accel]), imu.accel, atol=1e-12)
+    remembered = memory._replace(gyro=jnp.full(3, 5.0), accel=jnp.full(3, 6.0))
+    imu, _, _ = bridge(gyro, accel, None, remembered, config)
+    before = np.repeat([5.0, 6.0], 3), 0
+    expected = undone(gyro, accel, np.ones(20, bool), before, config)
+    np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), expected, atol=1e-12)
+
+
+def test_a_signal_behind_a_low_pass_comes_back():
+    """Of the step response of a first-order low-pass, 1 − exp(−t/τ), the step remains."""
+    config = filtering.FilterConfig(1e-4, 1, 1, low_pass_seconds=0.06)
+    time = 1e-4 * np.arange(1, 3000)[:, None]
+    signal = np.tile(1 - np.exp(-time / 0.06), (1, 3))
+    imu, _, _ = bridge(signal, signal, None, start().imu, config)
+    np.testing.assert_allclose(imu.gyro[1:], 1.0, atol=2e-3)
 
 
 def test_a_short_hole_is_bridged_a_long_one_costs_certainty():

@@ -2,6 +2,7 @@
 rides, a slide, and its singular points."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from gnio_jax import filtering
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.gaps import Gap, Imu
 from gnio_jax.filtering.nonholonomic import THRESHOLD, NonHolonomic, car_axes
+from gnio_jax.types import Prediction
 from tests.support import manifold
 from tests.support.cars import drive
 from tests.support.compiling import optimised, quick
@@ -213,6 +215,110 @@ def test_derivatives_are_finite_at_rest_and_with_the_axis_ahead_upright():
             for variance in (0.0, 1e-6):
                 slopes = gradient(numbers, velocity, variance)
                 assert all(np.isfinite(slope).all() for slope in slopes)
+
+
+def test_a_network_gives_the_factors_of_both_standard_deviations():
+    """Where it says nothing, the constants remain."""
+    gyro = np.random.default_rng(1).normal(size=(N, 3))
+    ekf = filtering.Filter(CONFIG)
+    state = filtering.initial_state(ekf, np.eye(3), np.array([9.0, 0.4, -0.3]), np.zeros(3))
+
+    def updated(constraint, factors=None):
+        says = {} if factors is None else {"nonholonomic_log_factor": jnp.log(jnp.array(factors))}
+        imu = Imu(jnp.asarray(gyro), jnp.zeros((N, 3)), None)
+        step = filtering.Step(imu, 0, 1, CONFIG, NOISE, diagnostics=says)
+        return constraint.update(state, step)[:2]
+
+    wider = MOUNTED._replace(lateral_std=4 * MOUNTED[0], vertical_std=0.5 * MOUNTED[1])
+    for factors, same in (([4.0, 0.5], wider), ([np.nan, 1.0], MOUNTED), ([1.0, 1.0], MOUNTED)):
+        found, expected = updated(MOUNTED, factors), updated(same)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), found, expected)
+    assert abs(updated(wider)[1].nis - updated(MOUNTED)[1].nis) > 0.5
+
+
+def test_the_derivative_by_a_factor_is_finite_at_rest_and_where_there_is_none():
+    ekf = filtering.Filter(CONFIG)
+
+    def loss(log_factor, velocity):
+        state = filtering.initial_state(ekf, jnp.eye(3), velocity, jnp.zeros(3))
+        imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), None)
+        says = {"nonholonomic_log_factor": log_factor}
+        step = filtering.Step(imu, 0, 1, CONFIG, NOISE, diagnostics=says)
+        after, outcome, _ = MOUNTED.update(state, step)
+        return jnp.sum(after.velocity**2) + outcome.volume
+
+    gradient = quick(jax.grad(loss))
+    for velocity in (np.zeros(3), np.array([9.0, 0.02, -0.03])):
+        assert np.isfinite(gradient(jnp.zeros(2), velocity)).all()
+        assert np.abs(gradient(jnp.zeros(2), velocity)).min() > 0
+        np.testing.assert_array_equal(gradient(jnp.array([jnp.nan, 0.0]), velocity), 0.0)
+
+
+@functools.cache
+def ride_with_factors():
+    """A ride with a long hole, a filter that undoes a low-pass, and a network that says factors and
+    no displacement: the arguments of a run after the network, and the compiled run."""
+    config = dataclasses.replace(CONFIG, low_pass_seconds=0.05, bridge_seconds=2 * DT)
+    config = dataclasses.replace(config, clones_per_window=3)
+    ekf = filtering.Filter(config, NOISE, STD, measurements=(MOUNTED,))
+    time = DT * np.arange(40 * N)[:, None]
+    gyro = 0.1 * np.sin(time * [[1.0, 1.4, 0.6]])
+    accel = np.cos(time * [[0.7, 1.1, 0.4]]) + np.array([0.0, 0.0, 9.81])
+    valid = np.ones(len(time), bool)
+    valid[17 * N + 1 : 18 * N + 3] = valid[52] = False
+    start = filtering.initial_state(ekf, np.eye(3), np.array([8.0, 0.1, 0.0]), np.zeros(3))
+
+    def predict(windows):
+        factor = jnp.tanh(windows[:, -1, :2]) - 0.5
+        nothing = jnp.full((len(windows), 3), jnp.nan, jnp.float32)
+        diagnostics = {"nonholonomic_log_factor": factor}
+        return Prediction(nothing, jnp.zeros_like(nothing), diagnostics)
+
+    run = jax.jit(lambda *signals: filtering.run_odometry(predict, ekf, *signals))
+    return (start, gyro, accel, valid), ekf, predict, run
+
+
+def test_no_factors_come_from_a_window_in_which_the_filter_coasted():
+    (start, *signals), ekf, _, run = ride_with_factors()
+    _, history = run(start, *signals)
+    present = np.isfinite(history.diagnostics["nonholonomic_log_factor"]).all(axis=1)
+    # The third sample of the hole, 88, is the first that is not held, and 92 the last one.
+    for k in range(40):
+        first, stop = (k - 2) * N, (k + 1) * N
+        assert present[k] == (k >= ekf.config.first_measured and not (first < 93 and stop > 88)), k
+
+
+def test_with_factors_the_tracker_is_the_run_and_so_are_two_calls():
+    (start, gyro, accel, valid), ekf, predict, run = ride_with_factors()
+    final, history = run(start, gyro, accel, valid)
+    tracker = filtering.Tracker(predict, ekf, start)
+    broken = np.where(valid[:, None], gyro, np.nan)
+    pushed = [
+        tracker.push(*row) for row in zip(DT * np.arange(len(gyro)), broken, accel, strict=True)
+    ]
+    poses = [pose for pose in pushed if pose is not None]
+    assert len(poses) == 40
+    for name in ("rotation", "velocity", "position"):
+        rows = np.array([getattr(pose, name) for pose in poses])
+        np.testing.assert_allclose(rows, getattr(history, name), rtol=1e-9, atol=1e-9)
+    state = start
+    for rows in (slice(0, 18 * N), slice(18 * N, None)):
+        state, _ = run(state, gyro[rows], accel[rows], valid[rows])
+    np.testing.assert_allclose(state.position, final.position, atol=1e-9)
+
+
+def test_a_run_with_factors_is_repeated_and_smoothed_without_its_network():
+    """And without its factors it is another run."""
+    signals, ekf, _, run = ride_with_factors()
+    final, history = run(*signals)
+    rows = (ekf, *signals[:3], *history.unscaled_displacements(NOISE), signals[3], "own")
+    factors = {"diagnostics": history.diagnostics}
+    again = filtering.run_filter(*rows, **factors)[1]
+    np.testing.assert_allclose(again.position, history.position, atol=1e-9)
+    other = filtering.run_filter(*rows)[1]
+    assert np.abs(other.position - history.position).max() > 1e-4
+    smoothed = filtering.smooth(*rows, **factors)
+    np.testing.assert_allclose(smoothed.position[-1], final.position, atol=1e-9)
 
 
 def test_it_is_a_measurement_of_the_settings():

@@ -35,6 +35,18 @@ def test_free_parameters_and_back():
     np.testing.assert_allclose(slope(np.log(1 / 3)), 0.25 * 0.75)
 
 
+def test_the_mounting_and_the_lever_may_be_zero_or_negative():
+    numbers = {"lateral_std": 0.5, "yaw": 0.0, "pitch": -0.02, "lever_z": -0.6}
+    settings = FilterSettings(measurements={"nonholonomic": numbers})
+    free = free_parameters(settings, ["measurements"])
+    names = {name.rpartition(".")[2]: value for name, value in free.items()}
+    np.testing.assert_allclose(names["lateral_std"], np.log(0.5))
+    assert names["yaw"] == 0 and names["lever_z"] == -0.6 and names.keys() == numbers.keys()
+    assert with_written_parameters(settings, free, 5) == settings
+    moved = with_written_parameters(settings, {"measurements.nonholonomic.yaw": -0.2}, 5)
+    assert moved.measurements["nonholonomic"]["yaw"] == -0.02
+
+
 def test_what_a_filter_does_not_have_is_left_out():
     """Errors without a size, and measurements without numbers."""
     ekf = filtering.make_filter(DataConfig(), FilterSettings(measurements={"zero_velocity": None}))
@@ -78,7 +90,7 @@ def test_every_setting_of_the_filter_is_reachable_from_a_file_or_fixed_by_name()
     others = {
         **{name: 0.5 for name in ("success_seconds", "pause_seconds", "rest_seconds")},
         **{name: 0.25 for name in ("rest_gyro", "rest_accel", "bridge_seconds")},
-        **{name: 0.75 for name in ("gap_gyro_std", "gap_accel_std")},
+        **{name: 0.75 for name in ("gap_gyro_std", "gap_accel_std", "low_pass_seconds")},
         **{"gate_threshold": 7.0, "convergence_seconds": 3.0},
         **{"log_std_min": -5.0, "speed_limit": 9.0},
         **{"error": "additive", "window_rotation": "single", "measures": "velocity"},

@@ -9,6 +9,7 @@ from gnio_jax.models.layers import EPSILON
 from tests.support.compiling import quick
 
 SMALL = {
+    "ai_imu": {},
     "airio": {"width": 4},
     "ctin": {"width": 12, "encoder_width": 8, "ffn": 10, "heads": 2, "decoder_layers": 2},
     "deepils": {"width": 4},

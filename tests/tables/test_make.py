@@ -126,7 +126,7 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
 @pytest.mark.parametrize(
     "more, words",
     [
-        (["--methods", "gnio,nosuch"], "no network 'nosuch'; known: airio, ctin"),
+        (["--methods", "gnio,nosuch"], "no network 'nosuch'; known: ai_imu, airio"),
         (["--base", "nosuch.yaml"], "no such config file"),
         (["--base", "configs/baselines/tlio.yaml"], "is of the network 'tlio'"),
     ],

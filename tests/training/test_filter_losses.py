@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
@@ -80,6 +81,36 @@ def test_a_turned_and_shifted_estimate_has_no_relative_error():
     assert np.isfinite(quick(jax.grad(of))(jnp.zeros((K + 1, 3)))).all()
 
 
+def test_the_relative_translation_is_kittis():
+    """The mean over pieces one by one, in 100 m units here: 1 % where the estimate is 1 % long."""
+    _, truth = paths(1)
+    steps = np.random.default_rng(2).uniform(5.0, 25.0, (K, 1)) * [[1.0, 0.2, -0.1]]
+    position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, 0)])
+    truth = truth._replace(position=position)
+    turn = Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix()
+    estimate = truth._replace(position=1.02 * position, rotation=turn @ truth.rotation)
+    every, errors = 5, []
+    for i in range(0, K, every):
+        for length in range(100, 900, 100):
+            far = [j for j in range(i, K + 1) if distance(position, i, j) > length]
+            if far:
+                moves = [
+                    path.rotation[i].T @ (path.position[far[0]] - path.position[i])
+                    for path in (estimate, truth)
+                ]
+                errors.append(np.hypot(np.linalg.norm(moves[0] - moves[1]) / length, 1e-3))
+    relative = jax.value_and_grad(filter_losses.relative_translation, has_aux=True)
+    relative = quick(relative, static_argnums=2)
+    (value, pieces), slope = relative(estimate, truth, every)
+    assert len(errors) > 20 and value == pytest.approx(np.mean(errors), rel=1e-9)
+    assert pieces == len(errors)
+    # A path that is too short has none, and an error of zero has a derivative.
+    assert relative(*paths(), every)[0] == (0, 0)
+    for one, other in ((truth, truth), paths()):
+        assert np.isfinite(relative(one, other, every)[1].position).all()
+    assert np.abs(slope.position).max() > 0
+
+
 def test_the_likelihood_of_innovations_is_the_mean_over_those_that_there_are():
     likelihood = np.array([np.nan, 2.0, np.nan, 5.0])
     both = quick(jax.value_and_grad(filter_losses.innovation_nll))
@@ -127,8 +158,8 @@ def test_the_sum_has_the_weights_and_the_horizons_that_fit():
         nis=np.where(np.arange(K) < 5, np.nan, 6.0),
         healthy=np.ones(K),
     )
-    names = ("displacement", "yaw", "innovation", "state", "window")
-    of_each = dict(zip(names, (2.0, 3.0, 5.0, 7.0, 11.0), strict=True))
+    names = ("displacement", "yaw", "innovation", "state", "window", "translation")
+    of_each = dict(zip(names, (2.0, 3.0, 5.0, 7.0, 11.0, 13.0), strict=True))
     weights = ThroughFilter(**{f"{name}_weight": value for name, value in of_each.items()})
     losses = quick(filter_losses.filter_losses, static_argnums=(3, 4))
     signal, nowhere = np.zeros((4 * K, 3)), np.full((4 * K, 2), np.nan)

@@ -320,12 +320,25 @@ def test_the_errors_of_the_starts_do_not_depend_on_the_yaws(training):
 def test_the_error_at_waypoints_is_logged_where_walks_have_them(training, start, monkeypatch):
     training, source = training
     horizons = np.ones(3)
-    found = FilterLosses(1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.09, 1.0, 1.0, True)
+    found = FilterLosses(1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.0, 0.0, 0.09, 1.0, 1.0, True)
     monkeypatch.setattr(filter_task, "validate", lambda *_, **__: found)
     for tapped in (False, True):
         walks = source._replace(tapped=np.arange(len(source.tapped)) < 7 * tapped)
         row = training.figures_of(begun(training, start), walks, KEY)
         assert row.get("val_waypoint_error") == (pytest.approx(0.3) if tapped else None)
+
+
+def test_segments_that_are_too_short_for_kittis_error_do_not_lower_it(training, start, monkeypatch):
+    """Of which a quarter has pieces of 100 m: the mean over all, 0.005, is a quarter of theirs."""
+    training, source = training
+    weights = dataclasses.replace(training.config.through_filter, translation_weight=1.0)
+    config = dataclasses.replace(training.config, through_filter=weights)
+    training, horizons = dataclasses.replace(training, config=config), np.ones(3)
+    for share, expected in ((0.25, pytest.approx(2.0)), (0.0, None)):
+        means = 1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.02 * share, share, 0.09, 1.0, 1.0, True
+        monkeypatch.setattr(filter_task, "validate", lambda *_, m=means, **__: FilterLosses(*m))
+        row = training.figures_of(begun(training, start), source, KEY)
+        assert row.get("val_t_rel") == expected
 
 
 def test_the_filter_in_training_has_a_slope_at_its_gate_is_cut_and_does_not_call_lapack(
@@ -455,6 +468,34 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
     assert same(statistics["norm"], theirs["batch_stats"]["norm"])
     assert state.variables.keys() == {"params", "batch_stats"}
     assert (np.asarray(statistics["uncertainty"]["log_factor"]) == 0).all()
+
+
+def test_a_network_without_displacements_is_trained_from_random_weights(recording, tmp_path):
+    """Its factors of the constraint learn, with the constants, the mounting and the lever."""
+    numbers = {"lateral_std": 0.3, "vertical_std": 0.3, "yaw": 0.0, "lever_x": 0.0}
+    run = tmp_path / "run"
+    config = tiny(
+        recording,
+        run,
+        init_from=None,
+        data=DataConfig(rate=50.0, window_seconds=WINDOW, window_rotation="body_axes"),
+        model=ModelConfig(name="ai_imu"),
+        filter=dataclasses.replace(OPTIONS, measurements={"nonholonomic": numbers}),
+        through_filter=dataclasses.replace(THROUGH, learn=("all",), start_spread=0.0),
+    )
+    loop.train(config)
+    first, last = rows(run)
+    assert last["skipped"] == 0 and last["gradient_norm/log_std"] > 0
+    assert last["gradient_norm/filter/measurements.nonholonomic.yaw"] > 0
+    assert last["gradient_norm/filter1"] > 0 and first["gradient_norm/filter2"] > 0
+    assert not {"val_rmse", "val_nis"} & last.keys() and np.isfinite(last["val_loss"])
+    trained = checkpoint.load_latest(run)
+    assert np.abs(trained.variables["params"]["log_std"]["kernel"]).max() > 0
+    found = trained.config.filter.measurements["nonholonomic"]
+    assert all(found[name] != number for name, number in numbers.items())
+    with pytest.raises(InputError, match=r"'ai_imu' is trained in the filter's loop alone; name"):
+        elsewhere = str(tmp_path / "elsewhere")
+        loop.train(dataclasses.replace(config, workdir=elsewhere, through_filter=ThroughFilter()))
 
 
 def test_mistakes(recording, tmp_path):

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import Filter, FilterState, Pose, level_state
 from gnio_jax.filtering.checks import checked_state
 from gnio_jax.filtering.displacement import scaled_displacement
@@ -36,7 +37,7 @@ from gnio_jax.filtering.resampler import ACCEL, GYRO
 from gnio_jax.filtering.start import REST_SECONDS
 from gnio_jax.filtering.state import invariant_errors, state_shapes
 from gnio_jax.filtering.tracker import advance_filter
-from gnio_jax.models import Network
+from gnio_jax.models import Network, predicts_displacement
 from gnio_jax.types import Array
 
 STATE, NEXT, POSE = "state.", "next.", "pose."
@@ -75,6 +76,13 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
     """The four programs of a network and its filter. JAX's x64 must be on. The output
     `displacement` of the network is what the filter measures (`FilterConfig.measures`)."""
     config, noise = ekf.config, ekf.noise
+    if config.low_pass_seconds:
+        problem = "is not undone by an exported filter"
+        raise InputError("filter.low_pass_seconds", problem, "set it to 0")
+    model = getattr(network.apply, "model", None)
+    if model is not None and not predicts_displacement(model):
+        problem = "predicts no displacement, and an exported filter takes nothing else"
+        raise InputError("network", problem, "export another network")
     samples = jax.ShapeDtypeStruct((config.reach, 6), jnp.float64)
     inside = functools.partial(invariant_errors, config=config)
     shape = DeployedState(jax.eval_shape(inside, state_shapes(config, noise, jnp.float64)), samples)

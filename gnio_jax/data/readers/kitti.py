@@ -22,7 +22,7 @@ not changed.
 
 Splits are ours, because none is published for the raw drives. A drive is assigned by a hash of its
 name (70/10/20 % of the names), so it is in the same split in every copy, and pieces of one drive
-are never in different splits.
+are never in different splits. `all` is every drive, for folds of whole drives.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from gnio_jax.numerics import stretches
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
 RATE = 100.0
-SPLITS = ("train", "val", "test")
+SPLITS = ("train", "val", "test", "all")
 SEED = "kitti raw 28"
 """Seed of the draw of drives. Of a few seeds it is the one for which the shares of the drives' time
 are nearest to the shares of the names."""
@@ -87,10 +87,11 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
     """The drives of a split, or their pieces if these are separate files."""
     sources, drives = [], find_drives(root)
     for drive, paths in drives.items():
-        if split_of(drive) == split and paths[0].is_dir():
+        belongs = split in ("all", split_of(drive))
+        if belongs and paths[0].is_dir():
             files = file_in(paths[0], "timestamps.txt"), paths[0] / "data"
             sources.append(RecordingSource(drive, partial(read_packets, paths[0]), files))
-        elif split_of(drive) == split:
+        elif belongs:
             sources += [
                 RecordingSource(_piece_name(path), partial(read_piece, path), (path,))
                 for path in paths

@@ -56,6 +56,17 @@ def test_a_drive_in_both_layouts_is_read_once_and_the_slow_export_is_named(tmp_p
     assert "start_time" in sequence.attributes  # of the packets
 
 
+def test_all_is_every_drive_and_has_folds_of_whole_drives(tmp_path):
+    for drive in (TRAIN, TEST):
+        for piece in (0, 1):
+            files.write_piece(tmp_path / f"train__{drive}_extract{piece}.npz")
+    names = {sequence.name[:21] for sequence in data.load("kitti", tmp_path, "all")}
+    assert names == {TRAIN, TEST}
+    parts = [data.load("kitti", tmp_path, f"all+{number}of2") for number in (0, 1)]
+    assert {sequence.name[:21] for part in parts for sequence in part} == names
+    assert [len({sequence.name[:21] for sequence in part}) for part in parts] == [1, 1]
+
+
 def test_what_lies_in_a_gap_of_a_piece_or_near_a_jump_is_not_valid(tmp_path):
     """Half a second of rows is missing, which is too short to divide the drive."""
 
