@@ -103,10 +103,7 @@ def memory_step(predict: PredictWithMemory, ekf: Filter) -> MemoryStep:
     config = ekf.config
 
     def advance(memory: Memory, state: FilterState, imu: Imu) -> tuple[Memory, Recall]:
-        rates, forces = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
-        attitude = geometry.integrate_turns(state.rotation, rates * config.dt)
-        samples = jnp.concatenate([forces, rates], axis=1)
-        memory, prediction = predict.step(memory, samples, attitude)
+        memory, prediction = predict.step(memory, *interval_samples(state, imu, config))
         _check(jax.tree.map(lambda leaf: leaf[None], prediction))
         prediction = jax.tree.map(_make_floating, prediction)
         if imu.gap is not None:
@@ -124,16 +121,41 @@ def memory_step(predict: PredictWithMemory, ekf: Filter) -> MemoryStep:
     return advance
 
 
+def interval_samples(
+    state: FilterState, imu: Imu, config: FilterConfig
+) -> tuple[Float[Array, "n 6"], Float[Array, "3 3 n+1"]]:
+    """The samples and attitudes of a clone interval that begins with `state`, as
+    `PredictWithMemory.step` takes them."""
+    rates, forces = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
+    attitude = geometry.integrate_turns(state.rotation, rates * config.dt)
+    return jnp.concatenate([forces, rates], axis=1), attitude
+
+
 def recalled_displacement(
     ekf: Filter, recall: Recall, state: FilterState, oldest: Array | int
 ) -> tuple[Displacement, dict[str, Array]]:
     """The displacement that a network with memory measures, in the yaw frame of the oldest clone,
     with its diagnostics."""
     dtype = state.offset.dtype
-    to_world = geometry.heading_rotation(*recall.heading.astype(dtype))
-    turn = geometry.matmul(geometry.yaw_rotation(state.clone_rotation[oldest]).T, to_world)
     displacement = recall.prediction.displacement.astype(dtype)
     covariance = recall.prediction.covariance(ekf.config.log_std_min, dtype)
+    measured = turned_displacement(ekf, displacement, covariance, recall.heading, state, oldest)
+    return measured, recall.prediction.diagnostics
+
+
+def turned_displacement(
+    ekf: Filter,
+    displacement: Float[Array, "3"],
+    covariance: Float[Array, "3 3"],
+    heading: Float[Array, "2"],
+    state: FilterState,
+    oldest: Array | int,
+) -> Displacement:
+    """A displacement in the frame of a memory with this heading, m, and its covariance, m², as
+    measured in the yaw frame of the oldest clone."""
+    dtype = state.offset.dtype
+    to_world = geometry.heading_rotation(*heading.astype(dtype))
+    turn = geometry.matmul(geometry.yaw_rotation(state.clone_rotation[oldest]).T, to_world)
     # No NaN may enter the products, because otherwise the derivatives would be NaN too.
     finite = jnp.isfinite(displacement).all() & jnp.isfinite(covariance).all()
     turned = geometry.matmul(turn, jnp.where(finite, displacement, 0.0)[:, None])[:, 0]
@@ -141,8 +163,7 @@ def recalled_displacement(
     covariance = jnp.where(finite, covariance, jnp.eye(3, dtype=dtype))
     covariance = geometry.matmul(geometry.matmul(turn, covariance), turn.T)
     symmetric = 0.5 * (covariance + covariance.T)
-    measured = scaled_displacement(turned, symmetric, ekf.noise, ekf.config.displacement_frame)
-    return measured, recall.prediction.diagnostics
+    return scaled_displacement(turned, symmetric, ekf.noise, ekf.config.displacement_frame)
 
 
 def network_measurement(

@@ -178,23 +178,42 @@ def step(
     samples: [accel m/s², gyro rad/s] in the body, without biases; attitude: body → world at each
     sample and at the end of the interval. constants: those of the network.
     """
+    signals, heading = express_samples(memory, samples, attitude)
+    state, prediction = advance_interval(model, variables, memory.network, signals, **constants)
+    return Memory(state, heading, attitude[:, :, -1], memory.intervals + 1), prediction
+
+
+def express_samples(
+    memory: Memory, samples: Float[Array, "n 6"], attitude: Float[Array, "3 3 n+1"]
+) -> tuple[Float[Array, "n 6"], Float[Array, "2"]]:
+    """The samples of one interval in the frame of the memory, and the heading of this frame, which
+    has turned with the filter's correction. The arguments are those of `step`."""
     heading = turned_heading(memory, attitude[:, :, 0])
     vectors = samples.reshape(-1, 2, 3).transpose(2, 1, 0)
     vectors = geometry.matmul(attitude[:, :, :-1], vectors).reshape(3, -1)
     vectors = geometry.matmul(geometry.heading_rotation(*heading).T, vectors)
     signals = vectors.reshape(3, 2, -1).transpose(2, 1, 0).reshape(-1, 6)
-    state = jax.tree.map(lambda leaf: leaf[None], memory.network)
+    return signals, heading
+
+
+def advance_interval(
+    model: NetworkWithMemory,
+    variables: Any,
+    state: Any,
+    signals: Float[Array, "n 6"],
+    **constants: Any,
+) -> tuple[Any, Prediction]:
+    """The network's state after one interval, and the displacement over the last window, in the
+    frame of the signals. `state` is a tree without a leading axis, as in `Memory`."""
+    state = jax.tree.map(lambda leaf: leaf[None], state)
     rows: Any = signals[None].astype(jnp.float32)
     state, prediction = model.apply(
-        variables, state, rows, len(samples), method="advance", **constants
+        variables, state, rows, len(signals), method="advance", **constants
     )
-    after = Memory(
+    return (
         jax.tree.map(lambda leaf: leaf[0], state),
-        heading,
-        attitude[:, :, -1],
-        memory.intervals + 1,
+        jax.tree.map(lambda leaf: leaf[0, 0], prediction),
     )
-    return after, jax.tree.map(lambda leaf: leaf[0, 0], prediction)
 
 
 def turned_heading(memory: Memory, attitude: Float[Array, "3 3"]) -> Float[Array, "2"]:

@@ -133,6 +133,8 @@ class StateSpaceLayer(nn.Module):
         return last, u + y * jax.nn.sigmoid(linear(width, "gate")(y))
 
 
+FEW = 8
+"""Steps up to which a recurrence is a loop."""
 Pair = tuple[Array, Array]
 """Real and imaginary part."""
 
@@ -146,8 +148,13 @@ def linear_recurrence(factor: Pair, inputs: Pair, start: Pair) -> Pair:
         for part, begin in zip(inputs, first, strict=True)
     )
     inputs = real, imaginary
-    if real.shape[1] == 1:
-        return inputs
+    if real.shape[1] <= FEW:  # as in an interval of the filter; ONNX has no associative scan
+        rows = [(real[:, 0], imaginary[:, 0])]
+        for number in range(1, real.shape[1]):
+            carried = _product((factor[0][:, 0], factor[1][:, 0]), rows[-1])
+            rows.append((carried[0] + real[:, number], carried[1] + imaginary[:, number]))
+        real, imaginary = (jnp.stack(parts, axis=1) for parts in zip(*rows, strict=True))
+        return real, imaginary
     factors = tuple(jnp.broadcast_to(part, real.shape) for part in factor)
 
     def combine(before: tuple, after: tuple) -> tuple:

@@ -23,7 +23,7 @@ OPSET = 18
 """Version of the ONNX operators, which ONNX Runtime 1.14 or newer reads."""
 
 
-def to_model(program: Program, ekf: Filter) -> bytes:
+def to_model(program: Program, ekf: Filter, first_inferred: int) -> bytes:
     """The file of a model, weights included, whose inputs and outputs have the program's names,
     shapes and types.
 
@@ -53,6 +53,7 @@ def to_model(program: Program, ekf: Filter) -> bytes:
     _name_ends(model.graph, program)
     metadata = {
         "rate": f"{1 / ekf.config.dt:.17g}",
+        "first_inferred": str(first_inferred),
         "first_measured": str(ekf.config.first_measured),
         "log_std_min": f"{ekf.config.log_std_min:.17g}",
     }

@@ -27,6 +27,7 @@ class Models(NamedTuple):
     start: Any
     window: Any
     step: Any
+    first_inferred: int
     first_measured: int
     log_std_min: float
 
@@ -35,10 +36,10 @@ class WalkResult(NamedTuple):
     """The results of the models for K clone intervals."""
 
     windows: Float[np.ndarray, "m n c"]
-    """Windows that the network saw: none in the first F = `first_measured` intervals, so m = K −
-    F."""
-    displacement: Float[np.ndarray, "m 3"]
-    """m."""
+    """What the network saw. A network on windows sees none in the first F = `first_measured`
+    intervals, so m = K − F; one with memory sees every interval."""
+    displacement: Float[np.ndarray, "m2 3"]
+    """Displacements that the filter measured, K − F, m."""
     position: Float[np.ndarray, "k 3"]
     """m."""
     rotation: Float[np.ndarray, "k 3 3"]
@@ -59,6 +60,7 @@ def open_models(folder: Path, threads: int = 1) -> Models:
         start=start,
         window=window,
         step=step,
+        first_inferred=int(metadata["first_inferred"]),
         first_measured=int(metadata["first_measured"]),
         log_std_min=float(metadata["log_std_min"]),
     )
@@ -95,13 +97,17 @@ def walk(
         rows = slice(k * n, (k + 1) * n)
         stride = {"gyro": gyro[rows], "accel": accel[rows]}
         measured = {"displacement": np.full(3, np.nan), "covariance": np.eye(3)}  # none
-        if k >= models.first_measured:
-            window = run(models.window, {**state, **stride})["window"]
-            measured = measure(models, window)
-            windows.append(window[0])
-            displacements.append(measured["displacement"])
+        if k >= models.first_inferred:
+            window = run(models.window, {**state, **stride})
+            prediction = run(models.network, {**state, **window})
+            windows.append(window["window"][0])
+            if k >= models.first_measured:
+                measured = measure(models, prediction)
+            state = {**state, **next_state(prediction)}  # of a network with memory
         outputs = run(models.step, {**state, **stride, **measured})
-        state = {STATE + name.removeprefix(NEXT): value for name, value in outputs.items()}
+        state = {**state, **next_state(outputs)}
+        if k >= models.first_measured:
+            displacements.append(outputs["measured"])
         poses.append(outputs)
     position, rotation, covariance = (
         np.array([pose[POSE + name] for pose in poses])
@@ -110,9 +116,14 @@ def walk(
     return WalkResult(np.array(windows), np.array(displacements), position, rotation, covariance)
 
 
-def measure(models: Models, window: Float[np.ndarray, "1 n c"]) -> dict[str, np.ndarray]:
-    """The prediction of the network for a window, in the form that the filter step takes."""
-    prediction = run(models.network, {"window": window})
+def next_state(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of the next state that a model gives."""
+    arrays = {name: value for name, value in outputs.items() if name.startswith(NEXT)}
+    return {STATE + name.removeprefix(NEXT): value for name, value in arrays.items()}
+
+
+def measure(models: Models, prediction: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A prediction of the network in the form that the filter step takes."""
     log_std = np.maximum(prediction["log_std"][0].astype(float), models.log_std_min)
     displacement = prediction["displacement"][0].astype(float)
     covariance = np.diag(np.exp(2 * log_std))

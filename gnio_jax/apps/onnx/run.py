@@ -16,6 +16,7 @@ import numpy as np
 
 from gnio_jax.apps.onnx import conversion, driver
 from gnio_jax.apps.onnx.driver import WalkResult
+from gnio_jax.apps.onnx.networks import deploy_network
 from gnio_jax.apps.onnx.programs import programs, start_arrays
 from gnio_jax.config import DataConfig
 from gnio_jax.config.files import to_plain
@@ -36,12 +37,12 @@ SEED, PERSON, PLACEMENT = 9000, 900, "handheld"
 DISPLACEMENT_LIMIT, POSITION_LIMIT = 1e-5, 1e-3
 """Largest deviation of an export from the package, m; a larger one is an error of the
 conversion."""
-FORMAT, VERSION = "gnio-export", 3
+FORMAT, VERSION = "gnio-export", 4
 CONVENTIONS = (
     "SI units. The world is z-up with gravity (0, 0, -9.81) m/s². Rotations are matrices body → "
     "world. gyro and accel are raw, in the body frame, at `rate`, without holes; accel includes "
     "gravity. A displacement is expressed in the gravity frame of its window's first sample after "
-    "the context, whose yaw is zero; with `measures` velocity it is the velocity in the body at "
+    "the context, whose yaw is zero, or with a memory in its frame; with `measures` velocity it is the velocity in the body at "
     "the window's end, in metres per window. covariance of a measurement: diag(exp(2 max(log_std, "
     "log_std_min))), m², turned about z by the angle whose cosine and sine are the output axes, if "
     "there is one; a displacement of NaN is no measurement. Errors of rotations are in the "
@@ -87,9 +88,6 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     require_packages("gnio export", "onnx", *PACKAGES)
     run = load(which)
     network = Network.of(run.model, run.variables)
-    if network.has_memory:
-        problem = f"'{run.config.model.name}' has a memory, which the exported filter cannot carry"
-        raise InputError(which, problem, "export a network on windows")
     if run.config.filter.corrector is not None:
         problem = "has a corrector before its filter, which is not exported"
         raise InputError(which, problem, "set filter.corrector to null")
@@ -98,8 +96,9 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
         at_end.callback(logging.disable, logging.root.manager.disable)
         logging.disable(logging.WARNING)  # Converters write a log line for almost every node.
         files = {}
+        first_inferred = deploy_network(network, ekf).first_inferred
         for program in programs(network, ekf):
-            content = conversion.to_model(program, ekf)
+            content = conversion.to_model(program, ekf, first_inferred)
             (folder / f"{program.name}.onnx").write_bytes(content)
             files[f"{program.name}.onnx"] = {
                 **fingerprint(content),
@@ -110,7 +109,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
         walk = draw_walk(windows, ekf, seconds)
         start = walk.start.state(ekf)
         models = driver.open_models(folder)
-        result = driver.walk(models, start_arrays(start, ekf), walk.gyro, walk.accel)
+        result = driver.walk(models, start_arrays(start, network, ekf), walk.gyro, walk.accel)
         without = dataclasses.replace(ekf, considered=None)
         (package_estimate,) = estimate([walk], network, windows, without)
         deviation = deviation_of(result, package_estimate)
@@ -125,6 +124,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
             "epoch": run.epoch,
             "step": run.step,
             "accuracy": {"seconds": seconds, **deviation._asdict()},
+            "first_inferred": first_inferred,
             **_filter(ekf),
             "files": files,
         }
