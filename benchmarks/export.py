@@ -24,6 +24,7 @@ jax.config.update("jax_enable_x64", True)
 
 from gnio_jax import filtering, networks  # noqa: E402
 from gnio_jax.apps.onnx import driver, export_run  # noqa: E402
+from gnio_jax.apps.onnx.networks import deploy_network  # noqa: E402
 from gnio_jax.apps.onnx.programs import start_arrays  # noqa: E402
 from gnio_jax.apps.onnx.run import draw_walk  # noqa: E402
 from gnio_jax.evaluation import PreparedRecording  # noqa: E402
@@ -63,12 +64,12 @@ def measure(
     """Seconds of each part of each clone interval that has a window."""
     ekf = make_filter(run.config.data, run.config.filter)
     network = Network.of(run.model, run.variables)
-    apply = jax.jit(
-        lambda window: network.apply(network.variables, window)._replace(diagnostics={})
-    )
+    deployed = deploy_network(network, ekf)
+    infer = jax.jit(deployed.infer)
     state = recording.start.state(ekf)
-    tracker = filtering.Tracker(apply, ekf, state)
-    arrays, dt = start_arrays(state, ekf), ekf.config.dt
+    predict = network.predict(lambda prediction: prediction._replace(diagnostics={}))
+    tracker = filtering.Tracker(predict, ekf, state)
+    arrays, dt = start_arrays(state, network, ekf), ekf.config.dt
     times: dict[str, list[float]] = defaultdict(list)
     for k, rows in enumerate(clone_intervals(len(recording.gyro), ekf.config.samples_per_clone)):
         stride = {"gyro": recording.gyro[rows], "accel": recording.accel[rows]}
@@ -79,19 +80,23 @@ def measure(
         ours, _ = timed(lambda sample=samples[-1]: tracker.push(*sample))
         measured = {"displacement": np.full(3, np.nan), "covariance": np.eye(3)}
         parts = {}
-        if k >= models.first_measured:
+        if k >= models.first_inferred:
             inputs = {**arrays, **stride}
             parts["window"], cut = timed(lambda inputs=inputs: driver.run(models.window, inputs))
-            window = cut["window"]
-            parts["network"], measured = timed(lambda w=window: driver.measure(models, w))
+            inputs = {**arrays, **cut}
+            parts["network"], prediction = timed(
+                lambda inputs=inputs: driver.run(models.network, inputs)
+            )
+            if k >= models.first_measured:
+                measured = driver.measure(models, prediction)
             times["gnio-jax, whole"].append(ours)
-            jitted, _ = timed(lambda w=window: jax.block_until_ready(apply(w)))
+            inputs = {name: inputs[name] for name in deployed.inputs}
+            jitted, _ = timed(lambda inputs=inputs: jax.block_until_ready(infer(inputs)))
             times["gnio-jax, network"].append(jitted)
+            arrays = {**arrays, **driver.next_state(prediction)}
         inputs = {**arrays, **stride, **measured}
-        parts["filter step"], next_state = timed(
-            lambda inputs=inputs: driver.run(models.step, inputs)
-        )
-        arrays = {"state." + key.removeprefix("next."): value for key, value in next_state.items()}
+        parts["filter step"], outputs = timed(lambda inputs=inputs: driver.run(models.step, inputs))
+        arrays = {**arrays, **driver.next_state(outputs)}
         if "network" in parts:
             times["ONNX, whole"].append(sum(parts.values()))
             for part, seconds in parts.items():

@@ -147,7 +147,8 @@ void track(const std::string& folder, const std::string& csv, const std::string&
   Model window(env, options, folder + "/filter_window.onnx");
   Model step(env, options, folder + "/filter_step.onnx");
   const double rate = step.said("rate"), log_std_min = step.said("log_std_min");
-  const size_t first_window = step.said("first_measured"), n = step.samples();
+  const size_t first_inferred = step.said("first_inferred"), n = step.samples();
+  const size_t first_measured = step.said("first_measured");
 
   const auto samples = resample(read(csv), rate);
   if (samples.size() < start.samples()) throw std::runtime_error(csv + ": is too short");
@@ -159,15 +160,16 @@ void track(const std::string& folder, const std::string& csv, const std::string&
   for (size_t k = 0; (k + 1) * n <= samples.size(); ++k) {
     const Tensors imu = stride(samples, k * n, n);
     Tensors answer;
-    if (k >= first_window) {
+    if (k >= first_inferred) {
       const Tensors seen = window.run({&state, &imu});
-      answer = network.run({&seen});
+      answer = network.run({&seen, &state});
     }
-    const Tensors given = measured(k >= first_window ? &answer : nullptr, log_std_min);
+    const Tensors given = measured(k >= first_measured ? &answer : nullptr, log_std_min);
     Tensors after = step.run({&state, &imu, &given});
-    for (auto& [name, value] : after)
-      if (name.rfind("next.", 0) == 0)
-        state.insert_or_assign("state." + name.substr(5), std::move(value));
+    for (Tensors* outputs : {&answer, &after})  // a network with memory gives its own arrays
+      for (auto& [name, value] : *outputs)
+        if (name.rfind("next.", 0) == 0)
+          state.insert_or_assign("state." + name.substr(5), std::move(value));
     const double* position = after.at("pose.position").GetTensorData<double>();
     const double* covariance = after.at("pose.covariance").GetTensorData<double>();  // (15, 15)
     out << samples[0][0] + (k + 1) * n / rate;

@@ -35,8 +35,6 @@ ALWAYS = {"airimu", "gru", "ionet"}
 NAMED = {"airimu": "tlio", "bins": "gnio", "eqnio_ronin": "ronin_resnet", "eqnio_tlio": "tlio"}
 NAMED |= {"rio": "ronin_resnet"}
 """The networks of recipes that have another name."""
-WITH_MEMORY = {"gru", "state_space", "ronin_lstm", "ronin_tcn"}
-"""Networks that are not exported."""
 OF_CONSTRAINT = {"ai_imu"}
 """Networks without displacements, which are trained through the filter and have a test of their
 own."""
@@ -132,9 +130,6 @@ def test_from_training_to_live(
     assert np.linalg.norm(track.position[-1] - path.position[-1]) < 0.5
     if not all(map(importlib.util.find_spec, ("jax2onnx", "onnx", "onnxruntime"))):
         return
-    if recipe in WITH_MEMORY:
-        assert "has a memory" in mistake("export", "named.zip", "--out", "models")
-    else:
-        brief = functools.partial(onnx.export_run, seconds=6.0)
-        monkeypatch.setattr(onnx, "export_run", brief)
-        assert "against gnio-jax" in gnio("export", "named.zip", "--out", "models")
+    brief = functools.partial(onnx.export_run, seconds=6.0)
+    monkeypatch.setattr(onnx, "export_run", brief)
+    assert "against gnio-jax" in gnio("export", "named.zip", "--out", "models")

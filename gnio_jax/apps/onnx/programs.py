@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -152,6 +152,6 @@ def _interval(arrays: Arrays) -> Imu:
     return Imu(arrays["gyro"], arrays["accel"], None)
 
 
-def _read_by_step(arrays: dict[str, Array]) -> dict[str, Array]:
+def _read_by_step(arrays: dict[str, Any]) -> dict[str, Any]:
     """The arrays of a state that the filter step takes and gives back."""
     return {name: value for name, value in arrays.items() if not name.startswith(OF_NETWORK)}

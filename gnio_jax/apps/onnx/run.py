@@ -42,11 +42,11 @@ CONVENTIONS = (
     "SI units. The world is z-up with gravity (0, 0, -9.81) m/s². Rotations are matrices body → "
     "world. gyro and accel are raw, in the body frame, at `rate`, without holes; accel includes "
     "gravity. A displacement is expressed in the gravity frame of its window's first sample after "
-    "the context, whose yaw is zero, or with a memory in its frame; with `measures` velocity it is the velocity in the body at "
-    "the window's end, in metres per window. covariance of a measurement: diag(exp(2 max(log_std, "
-    "log_std_min))), m², turned about z by the angle whose cosine and sine are the output axes, if "
-    "there is one; a displacement of NaN is no measurement. Errors of rotations are in the "
-    "world frame, left-multiplied."
+    "the context, whose yaw is zero, or in the frame of a network's memory; with `measures` "
+    "velocity it is the velocity in the body at the window's end, in metres per window. covariance "
+    "of a measurement: diag(exp(2 max(log_std, log_std_min))), m², turned about z by the angle "
+    "whose cosine and sine are the output axes, if there is one; a displacement of NaN is no "
+    "measurement. Errors of rotations are in the world frame, left-multiplied."
 )
 
 

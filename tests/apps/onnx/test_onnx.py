@@ -11,18 +11,23 @@ import sysconfig
 import types
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from gnio_jax import filtering
-from gnio_jax.apps.onnx import driver
+from gnio_jax.apps.onnx import driver, export_run
 from gnio_jax.apps.onnx.programs import start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check
 from gnio_jax.commands import app, console
-from gnio_jax.config import ModelConfig
+from gnio_jax.config import DataConfig, ModelConfig
+from gnio_jax.data.simulated.walks import pedestrian
+from gnio_jax.models import Network
 from gnio_jax.networks import read_network
+from gnio_jax.numerics import matrix_from_quaternion
 from tests.apps.onnx.conftest import BIAS, CONFIG, SECONDS
 from tests.support import drawn_run
+from tests.support.networks import SMALL
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "onnx"
 REST = round(CONFIG.data.rate)
@@ -71,9 +76,10 @@ def test_the_start_has_the_bias_of_a_gyro_at_rest(run, models, walked):
     """So have the starts of `gnio track` and `gnio live`, which those arrays equal."""
     rest = {"gyro": walked.gyro[:REST], "accel": walked.accel[:REST]}
     arrays = driver.run(driver.open_models(models[0]).start, rest)
-    loaded = read_network(run).config
-    ekf = filtering.make_filter(loaded.data, loaded.filter)
-    wanted = start_arrays(from_rest(ekf, walked), ekf)
+    loaded = read_network(run)
+    ekf = filtering.make_filter(loaded.config.data, loaded.config.filter)
+    network = Network.of(loaded.model, loaded.variables)
+    wanted = start_arrays(from_rest(ekf, walked), network, ekf)
     assert arrays.keys() == wanted.keys()
     for name, value in wanted.items():
         np.testing.assert_allclose(arrays[name], value, atol=1e-9, err_msg=name)
@@ -82,7 +88,7 @@ def test_the_start_has_the_bias_of_a_gyro_at_rest(run, models, walked):
     # ring.
     state = from_rest(ekf, walked)
     with pytest.raises(ValueError, match=r"^state: is one after 3 clone intervals of a run"):
-        start_arrays(state._replace(step=state.step + 3), ekf)
+        start_arrays(state._replace(step=state.step + 3), network, ekf)
 
 
 def test_the_filter_is_in_float64_and_every_tensor_is_described(models):
@@ -133,20 +139,73 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(
     assert not (tmp_path / "exports").exists()
 
 
-def test_a_network_with_memory_is_refused(tmp_path, monkeypatch, capsys):
+@pytest.fixture(scope="module", params=["gru", "state_space", "ronin_lstm", "ronin_tcn"])
+def remembering(request, tmp_path_factory):
+    """A network with memory, whose weights are drawn, and the folder of its models."""
     for name in PACKAGES:
-        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
-    model = ModelConfig(name="ronin_tcn", width=2)
+        pytest.importorskip(name, reason="needs pip install 'gnio-jax[onnx]'")
+    folder = tmp_path_factory.mktemp(request.param)
+    windows = DataConfig(rate=50.0, stride_seconds=0.2)
+    options = dict(SMALL[request.param])
+    model = ModelConfig(name=request.param, width=options.pop("width"), options=options)
+    config = dataclasses.replace(CONFIG, data=windows, model=model)
     run = drawn_run.save(
-        tmp_path / "tcn",
-        dataclasses.replace(CONFIG, model=model),
-        lambda random, _, shape: random.normal(0, 0.1, shape),
+        folder / "run", config, lambda random, _, shape: random.normal(0, 0.3, shape)
     )
-    with pytest.raises(SystemExit, match="2"):
-        console.run(lambda: app.main(["export", str(run), "--out", str(tmp_path / "out")]))
-    error = capsys.readouterr().err
-    assert "'ronin_tcn' has a memory" in error and error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+    export_run(run, folder / "models", seconds=2.0)
+    return run, folder / "models"
+
+
+def test_a_network_with_memory_is_that_of_the_package(remembering):
+    """The filter corrects the yaw, so the frame of the memory turns on the way."""
+    run, folder = remembering
+    loaded = read_network(run)
+    ekf = filtering.make_filter(loaded.config.data, loaded.config.filter)
+    network = Network.of(loaded.model, loaded.variables)
+    walk = pedestrian(5, 5, seconds=12.0, rate=loaded.config.data.rate)
+    count = 10 * (len(walk.gyro) // 10)
+    gyro, accel = walk.gyro[:count] + BIAS, walk.accel[:count]
+    start = filtering.initial_state(
+        ekf, matrix_from_quaternion(walk.orientation[0]), np.ones(3), np.zeros(3)
+    )
+    predict = network.predict(lambda prediction: prediction._replace(diagnostics={}))
+    history = jax.jit(lambda start: filtering.run_odometry(predict, ekf, start, gyro, accel)[1])(
+        start
+    )
+    walked = driver.walk(driver.open_models(folder), start_arrays(start, network, ekf), gyro, accel)
+    assert np.nansum(history.accepted) > 20
+    first = ekf.config.first_measured
+    assert len(walked.windows) == len(walked.position) == len(walked.displacement) + first
+    np.testing.assert_allclose(walked.displacement, history.displacement[first:], atol=1e-5)
+    np.testing.assert_allclose(walked.position, history.position, atol=1e-4)
+    np.testing.assert_allclose(walked.rotation, history.rotation, atol=1e-6)
+    np.testing.assert_allclose(walked.covariance, history.covariance, rtol=1e-4, atol=1e-6)
+    # An integration without updates ends elsewhere.
+    alone = filtering.run_filter(
+        ekf,
+        start,
+        gyro,
+        accel,
+        np.full((len(history.position), 3), np.nan),
+        np.tile(np.eye(3), (len(history.position), 1, 1)),
+    )[1]
+    turned = alone.rotation[-1] @ np.asarray(history.rotation[-1]).T
+    assert np.abs(np.arctan2(turned[1, 0], turned[0, 0])) > 1e-3
+
+
+def test_the_state_of_a_memory_is_given_back_by_the_network(remembering):
+    _, folder = remembering
+    manifest = json.loads((folder / "export.json").read_text())["files"]
+    names = {
+        (name, kind): {tensor["name"] for tensor in described[kind]}
+        for name, described in manifest.items()
+        for kind in ("inputs", "outputs")
+    }
+    inputs, outputs = names["network.onnx", "inputs"], names["network.onnx", "outputs"]
+    state = {name for name in inputs if name.startswith("state.memory.network")}
+    assert state == inputs - {"window"} and state < names["filter_start.onnx", "outputs"]
+    assert {name.replace("state.", "next.", 1) for name in state} < outputs
+    assert not state & names["filter_step.onnx", "inputs"]
 
 
 def library(folder):
