@@ -76,7 +76,10 @@ def with_readings(sensor, **changes):
         (with_readings("gnss", values=PLACE.values[:, [1, 2, 0]]), "'gnss' is NaN or Inf in row 1"),
         (with_readings("gnss", values=PLACE.values * 3), "column 'latitude' of field 'gnss' reach"),
         (with_readings("gnss", std=-PLACE.std), "a std of field 'gnss' is not above 0"),
-        (circle()._replace(readings={"odour": FIELD}), "not a known sensor; known: magnetometer, ba"),
+        (
+            circle()._replace(readings={"odour": FIELD}),
+            "not a known sensor; known: magnetometer, ba",
+        ),
     ],
 )
 def test_impossible_readings_are_named_with_a_remedy(sequence, words):
