@@ -51,7 +51,7 @@ class Poses(NamedTuple):
     time: Float[np.ndarray, " n"]
     """s."""
     attitude: Rotation
-    """n rotations, IMU body → world."""
+    """n rotations, IMU body → world, as `numerics.rotations` makes them of quaternions wxyz."""
     position: Float[np.ndarray, "n 3"]
     """Position of the tracked point, m."""
     velocity: Float[np.ndarray, "n 3"] | None = None

@@ -119,6 +119,49 @@ def test_fixes_show_the_yaw_and_no_more_than_they_show():
 
 
 @pytest.mark.slow
+def test_fixes_alone_show_a_narrow_yaw_as_the_exact_posterior_does_and_a_wide_one_less():
+    """The posterior is that of filters with a known yaw, each for one value of a grid, with the
+    likelihood of their fixes. The wide start is the limit that docs/filter.md states."""
+    runs, intervals, fix_std, rows = 40, 120, 0.3, np.arange(9, 120, 10)
+    open_gate = np.full((runs, intervals), np.inf)
+    nothing = jnp.full((intervals, 3), jnp.nan), jnp.tile(jnp.eye(3)[None], (intervals, 1, 1))
+
+    @functools.partial(jax.jit, static_argnames="error")
+    def run(error, yaw, rotation, velocity, position, gyro, accel, fix):
+        std = filtering.InitialStd(velocity=1.0, yaw=yaw, position=10.0)
+
+        def one(rotation, velocity, position, gyro, accel, fix):
+            ekf = filtering.Filter(config_of(error), NOISE, std)
+            state = filtering.initial_state(ekf, rotation, velocity, position)
+            signals = ekf, state, gyro, accel, *nothing
+            return filtering.run_filter(*signals, measurements=(fix,))[1]
+
+        return jax.vmap(one)(rotation, velocity, position, gyro, accel, fix)
+
+    for yaw, least, most in ((0.1, 0.85, 1.1), (0.5, 0.4, 0.8)):
+        std = filtering.InitialStd(velocity=1.0, yaw=yaw, position=10.0)
+        walks = simulate(1, runs, intervals, N, CLONES, DT, NOISE, std, SIGMA)
+        position = np.full((runs, intervals, 3), np.nan)
+        white = np.random.default_rng(5).normal(size=(runs, len(rows), 3))
+        position[:, rows] = walks.position[:, rows] + fix_std * white
+        spread = np.broadcast_to(fix_std**2 * np.eye(3), (runs, intervals, 3, 3))
+        fix = filtering.Fix(position, spread, *np.zeros((2, runs, intervals)), open_gate)
+        history = run("invariant", yaw, *walks[:5], fix)
+        grid, weights = np.linspace(-3, 3, 25) * yaw, []
+        for turn in grid:
+            rotation = Rotation.from_euler("z", turn).as_matrix() @ walks.rotation0
+            outcome = run("additive", 1e-4, rotation, *walks[1:5], fix).outcomes["fix"]
+            fits = jnp.where(outcome.present, -0.5 * outcome.nis - jnp.log(outcome.volume), 0.0)
+            weights.append(np.asarray(fits.sum(axis=1)) - 0.5 * (turn / yaw) ** 2)
+        weights = np.exp(weights - np.max(weights, axis=0))
+        weights /= weights.sum(axis=0)
+        mean = weights.T @ grid
+        variance = np.mean(weights.T @ grid**2 - mean**2)
+        reported = np.asarray(history.covariance)[:, -1, 2, 2].mean()
+        assert least < np.sqrt(reported / variance) < most, yaw
+
+
+@pytest.mark.slow
 def test_the_smoother_is_as_uncertain_as_it_may_be():
     result = monte_carlo("invariant", WIDE, smoothed=True)
     for row in (20, 60, 119):
