@@ -66,7 +66,9 @@ def test_the_reference_of_a_drive_that_is_held_out_has_no_part_in_the_choice(dri
 def test_zero_of_the_search_is_the_default_and_one_is_a_unit_of_every_constant():
     default, other = settings_at(0.06, np.zeros(14)), settings_at(0.06, np.ones(14))
     assert default.low_pass_seconds == 0.06
-    before, after = (dict(settings.measurements["nonholonomic"]) for settings in (default, other))
+    before, after = (
+        dict((settings.measurements["nonholonomic"] or {}).items()) for settings in (default, other)
+    )
     assert before["lateral_std"] == before["vertical_std"] == 1.0
     assert before["yaw"] == before["pitch"] == before["lever_x"] == before["lever_z"] == 0.0
     assert after["lateral_std"] == pytest.approx(np.e)
