@@ -195,11 +195,14 @@ def relative_translation(
     whole = last < len(walked)
     last = jnp.minimum(last, len(walked) - 1)
 
-    def moved(path: MotionPath) -> Float[Array, "i l 3"]:
+    def relative_motion(path: MotionPath) -> Float[Array, "i l 3"]:
         change = path.position[last] - path.position[first][:, None]
         return jnp.einsum("iab,ila->ilb", path.rotation[first], change)
 
-    squared = jnp.sum((moved(estimate) - moved(truth)) ** 2, axis=2) / length[None] ** 2
+    squared = (
+        jnp.sum((relative_motion(estimate) - relative_motion(truth)) ** 2, axis=2)
+        / length[None] ** 2
+    )
     error = jnp.sqrt(jnp.where(whole, squared, 0.0) + TRANSLATION_FLOOR**2)
     pieces = jnp.sum(whole)
     return jnp.sum(jnp.where(whole, error, 0.0)) / jnp.maximum(pieces, 1), pieces
