@@ -44,14 +44,13 @@ def test_the_standard_deviation_is_that_of_the_errors():
 
 
 def test_a_drive_that_slides_more_is_less_certain():
-    """The standard deviation follows from the velocities across that are left over, ten times those
-    of a car that hardly slides."""
+    """The standard deviation grows with the velocities across that no mounting explains."""
     constraint, stds = NonHolonomic(yaw=0.3, pitch=0.1), []
-    for across in (0.05, 1.0):
+    for across in (0.05, 0.5):
         ride = drive(2, 1, 500, 5, 1 / RATE, NOISE, STD, constraint, across, across)
         mounting = find_mounting(ride.gyro[0], ride.accel[0], RATE, "drive")
         stds.append(mounting.std)
-    assert stds[1] > 3 * stds[0]
+    assert stds[1] > 4 * stds[0]
 
 
 @pytest.mark.parametrize(
