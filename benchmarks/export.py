@@ -69,7 +69,7 @@ def measure(
     state = recording.start.state(ekf)
     predict = network.predict(lambda prediction: prediction._replace(diagnostics={}))
     tracker = filtering.Tracker(predict, ekf, state)
-    arrays, dt = start_arrays(state, network, ekf), ekf.config.dt
+    arrays, dt = start_arrays(state, deployed, ekf), ekf.config.dt
     times: dict[str, list[float]] = defaultdict(list)
     for k, rows in enumerate(clone_intervals(len(recording.gyro), ekf.config.samples_per_clone)):
         stride = {"gyro": recording.gyro[rows], "accel": recording.accel[rows]}

@@ -39,7 +39,7 @@ from gnio_jax.filtering.checks import check_numbers
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.history import FilterHistory
 from gnio_jax.filtering.scan import Measure
-from gnio_jax.filtering.settings import FilterConfig
+from gnio_jax.filtering.settings import FilterConfig, differentiable_frame
 from gnio_jax.filtering.smoother import SmoothedHistory
 from gnio_jax.filtering.state import FilterState, Mean, arc_covariance
 from gnio_jax.types import Array
@@ -183,11 +183,9 @@ def step_with_tangents(
             in_body = measured.frame == "body"
             rotation = jax.lax.stop_gradient(state.rotation)[None] if in_body else None
             displacement = disturb(measured.displacement[None], c, rotation)[0]
-            frame = "turning" if measured.frame == "own" else measured.frame
-            return (
-                dataclasses.replace(measured, displacement=displacement, frame=frame),
-                diagnostics,
-            )
+            frame = differentiable_frame(measured.frame)
+            disturbed = dataclasses.replace(measured, displacement=displacement, frame=frame)
+            return disturbed, diagnostics
 
         whole = jax.tree.map(
             lambda part, leaf: leaf if part is None else part,

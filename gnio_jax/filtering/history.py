@@ -86,7 +86,8 @@ class FilterHistory(NamedTuple):
     ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
         """Displacements (K, 3), m, and their covariances (K, 3, 3), m², before the scaling of
         `noise`, which must be that of the run. With them `run_filter` repeats a run of
-        `run_odometry` without its network, with `frame` = `FilterConfig.displacement_frame`."""
+        `run_odometry` without its network, with `frame` = `FilterConfig.displacement_frame` and
+        these `diagnostics`."""
         factor = jnp.stack([jnp.asarray(value) for value in noise.std_factor])
         scale = noise.measurement_scale * factor[:, None] * factor[None]
         return jnp.asarray(self.displacement), self.measurement_covariance / scale[None]

@@ -47,6 +47,11 @@ of another attitude. body: the body at the newest clone, for the velocity there 
 window."""
 
 
+def differentiable_frame(frame: DisplacementFrame) -> DisplacementFrame:
+    """The same frame with the derivatives of a run with its network."""
+    return "turning" if frame == "own" else frame
+
+
 @no_type_check  # The tests' run-time checker would refuse what __post_init__ converts or names.
 @dataclass(frozen=True)
 class FilterConfig(FilterOptions):
@@ -153,7 +158,7 @@ class FilterConfig(FilterOptions):
     @property
     def derivative_frame(self) -> DisplacementFrame:
         """Frame of what the network measures in a run without it that is differentiated."""
-        return "turning" if self.displacement_frame == "own" else self.displacement_frame
+        return differentiable_frame(self.displacement_frame)
 
     @property
     def invariant(self) -> bool:

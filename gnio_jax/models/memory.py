@@ -178,22 +178,27 @@ def step(
     samples: [accel m/s², gyro rad/s] in the body, without biases; attitude: body → world at each
     sample and at the end of the interval. constants: those of the network.
     """
-    signals, heading = express_samples(memory, samples, attitude)
+    after = advance_frame(memory, attitude)
+    signals = express_samples(after.heading, samples, attitude)
     state, prediction = advance_interval(model, variables, memory.network, signals, **constants)
-    return Memory(state, heading, attitude[:, :, -1], memory.intervals + 1), prediction
+    return after._replace(network=state), prediction
+
+
+def advance_frame(memory: Memory, attitude: Float[Array, "3 3 m"]) -> Memory:
+    """The memory after an interval with these attitudes, as in `step`, but with the network's state
+    of before: its frame has turned with the filter's correction."""
+    heading = turned_heading(memory, attitude[:, :, 0])
+    return Memory(memory.network, heading, attitude[:, :, -1], memory.intervals + 1)
 
 
 def express_samples(
-    memory: Memory, samples: Float[Array, "n 6"], attitude: Float[Array, "3 3 n+1"]
-) -> tuple[Float[Array, "n 6"], Float[Array, "2"]]:
-    """The samples of one interval in the frame of the memory, and the heading of this frame, which
-    has turned with the filter's correction. The arguments are those of `step`."""
-    heading = turned_heading(memory, attitude[:, :, 0])
+    heading: Float[Array, "2"], samples: Float[Array, "n 6"], attitude: Float[Array, "3 3 n+1"]
+) -> Float[Array, "n 6"]:
+    """The samples of one interval, as in `step`, in the frame with this heading."""
     vectors = samples.reshape(-1, 2, 3).transpose(2, 1, 0)
     vectors = geometry.matmul(attitude[:, :, :-1], vectors).reshape(3, -1)
     vectors = geometry.matmul(geometry.heading_rotation(*heading).T, vectors)
-    signals = vectors.reshape(3, 2, -1).transpose(2, 1, 0).reshape(-1, 6)
-    return signals, heading
+    return vectors.reshape(3, 2, -1).transpose(2, 1, 0).reshape(-1, 6)
 
 
 def advance_interval(

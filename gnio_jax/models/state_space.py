@@ -5,7 +5,7 @@ A layer is linear in its memory x, P complex numbers that decay and turn, each b
 
     x' = exp(λ Δ) x + B̄ u,   y = 2 Re(C x') + D ⊙ u,   B̄ = (exp(λ Δ) − 1) / λ · B.
 
-So a recording needs one `associative_scan`, and a step of the filter's loop one product. Complex
+So a recording needs one `associative_scan`, and a step of the filter's loop a few products. Complex
 numbers are pairs of real ones, because memories and exported programs hold real numbers.
 """
 

@@ -110,13 +110,26 @@ def test_the_shipped_network_is_the_default_and_small(monkeypatch):
         assert words in text
 
 
-def test_the_shipped_network_answers():
+@pytest.mark.parametrize(
+    "name, published, step",
+    [
+        ("pedestrian", "7488243d1433afaf24d9172362275881249d6a221fcc998f71d9eec364e71bed", 2308),
+        (
+            "pedestrian_outdoor",
+            "b9f1c21d941d9f811145ec4e1f573bd813bf90d1d9c70065513d405e342c31c0",
+            2328,
+        ),
+    ],
+)
+def test_the_shipped_networks_answer(name, published, step):
     """The arrays are those that were published; a phone that lies still goes next to nowhere."""
-    path = find.SHIPPED / "pedestrian"
+    path = find.SHIPPED / name
     digest = hashlib.sha256((path / folder.WEIGHTS).read_bytes()).hexdigest()
-    assert digest == "7488243d1433afaf24d9172362275881249d6a221fcc998f71d9eec364e71bed"
-    network = gnio_jax.load_pretrained("pedestrian")
-    assert (network.name, network.digest, network.step) == ("pedestrian", digest, 2308)
+    assert digest == published
+    network = gnio_jax.load_pretrained(name)
+    assert (network.name, network.digest, network.step) == (name, digest, step)
+    recipe = configuration.load(configuration.find_experiment(name))
+    assert network.config.augment == recipe.augment and network.config.optim == recipe.optim
     config = network.config
     assert config.datasets == ("tyrex", "indoor_location") and config.model.name == "gnio"
     still = np.zeros((1, config.data.input_samples, 6), np.float32)

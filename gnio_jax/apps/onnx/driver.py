@@ -92,7 +92,7 @@ def walk(
     """Filter K·n samples, rad/s and m/s², raw, from the state of `models.start` or
     `start_arrays`."""
     n = next(array.shape[0] for array in models.step.get_inputs() if array.name == "gyro")
-    windows, displacements, poses = [], [], []
+    windows, steps = [], []
     for k in range(len(gyro) // n):
         rows = slice(k * n, (k + 1) * n)
         stride = {"gyro": gyro[rows], "accel": accel[rows]}
@@ -106,14 +106,13 @@ def walk(
             state = {**state, **next_state(prediction)}  # of a network with memory
         outputs = run(models.step, {**state, **stride, **measured})
         state = {**state, **next_state(outputs)}
-        if k >= models.first_measured:
-            displacements.append(outputs["measured"])
-        poses.append(outputs)
+        steps.append(outputs)
     position, rotation, covariance = (
-        np.array([pose[POSE + name] for pose in poses])
+        np.array([outputs[POSE + name] for outputs in steps])
         for name in ("position", "rotation", "covariance")
     )
-    return WalkResult(np.array(windows), np.array(displacements), position, rotation, covariance)
+    measured = np.array([outputs["measured"] for outputs in steps[models.first_measured :]])
+    return WalkResult(np.array(windows), measured, position, rotation, covariance)
 
 
 def next_state(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

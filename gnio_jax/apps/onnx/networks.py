@@ -9,18 +9,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from gnio_jax.apps.onnx.state import STATE, Arrays, DeployedState, next_arrays, to_arrays
+from gnio_jax.apps.onnx.state import STATE, Arrays, DeployedState, name_leaves, next_arrays
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import Filter, FilterState
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.network import interval_samples, network_window, turned_displacement
 from gnio_jax.filtering.resampler import ACCEL, GYRO
-from gnio_jax.models import Network
-from gnio_jax.models.memory import advance_interval, express_samples
+from gnio_jax.models import Network, predicts_displacement
+from gnio_jax.models.memory import advance_frame, advance_interval, express_samples
 from gnio_jax.types import Array, Memory, Prediction
 
-OF_NETWORK = STATE + "memory.network"
-"""Arrays of the state that the network alone reads and changes."""
+OF_NETWORK = STATE + "memory.network."
+"""Prefix of the arrays of the state that the network alone reads and changes."""
 
 
 class DeployedNetwork(NamedTuple):
@@ -40,17 +41,20 @@ class DeployedNetwork(NamedTuple):
     """Arrays of the state that `window` reads."""
     window: Callable[[DeployedState, Imu], Float[Array, "1 n c"]]
     """The network's input, float32, given the state before an interval."""
-    measure: Callable[
-        [DeployedState, Imu, Arrays], Callable[[FilterState, Array | int], Displacement]
-    ]
-    """What the filter measures, as a function of its state and of the slot of the oldest clone,
-    given the state before an interval and the inputs `displacement` and `covariance`."""
     remember: Callable[[DeployedState, Imu], Memory | None]
-    """The memory after an interval, given the state before it."""
+    """The memory after an interval, given the state before it, but for the network's part."""
+    measure: Callable[[Arrays, Memory | None, FilterState, Array | int], Displacement]
+    """What the filter measures, given the inputs `displacement` and `covariance`, the memory after
+    the interval, the filter's state and the slot of the oldest clone."""
 
 
 def deploy_network(network: Network, ekf: Filter) -> DeployedNetwork:
-    """The network of an export. JAX's x64 must be on."""
+    """The network of an export. JAX's x64 must be on. Raises `InputError` for one that predicts no
+    displacement."""
+    model = getattr(network.apply, "model", None)
+    if model is not None and not predicts_displacement(model):
+        problem = "predicts no displacement, and an exported filter takes nothing else"
+        raise InputError("network", problem, "export another network")
     return _with_memory(network, ekf) if network.has_memory else _on_windows(network, ekf)
 
 
@@ -68,11 +72,10 @@ def _on_windows(network: Network, ekf: Filter) -> DeployedNetwork:
         return network_window(state.filter, oldest, samples[:, GYRO], samples[:, ACCEL], config)
 
     def measure(
-        state: DeployedState, imu: Imu, arrays: Arrays
-    ) -> Callable[[FilterState, Array | int], Displacement]:
+        arrays: Arrays, memory: None, state: FilterState, oldest: Array | int
+    ) -> Displacement:
         prediction = arrays["displacement"], arrays["covariance"]
-        measured = scaled_displacement(*prediction, ekf.noise, config.displacement_frame)
-        return lambda state, oldest: measured
+        return scaled_displacement(*prediction, ekf.noise, config.displacement_frame)
 
     shape = 1, config.input_samples, config.channels
     return DeployedNetwork(
@@ -83,8 +86,8 @@ def _on_windows(network: Network, ekf: Filter) -> DeployedNetwork:
         infer=infer,
         read_by_window=("clone_rotation", "gyro_bias", "accel_bias", "step", "samples"),
         window=window,
-        measure=measure,
         remember=lambda state, imu: None,
+        measure=measure,
     )
 
 
@@ -94,48 +97,45 @@ def _with_memory(network: Network, ekf: Filter) -> DeployedNetwork:
     apply: Any = network.apply
     variables, constants = network.variables
     empty: Memory = network.predict().begin(jnp.float64)
-    leaves, tree = jax.tree.flatten(empty.network)
-    nothing = DeployedState(None, jnp.zeros((0, 6)), empty)  # type: ignore[arg-type]
-    names = [name for name in to_arrays(nothing) if name.startswith(OF_NETWORK)]
+    leaves, tree = name_leaves(empty.network, OF_NETWORK), jax.tree.structure(empty.network)
 
     def infer(arrays: Arrays) -> dict[str, Array]:
-        state = jax.tree.unflatten(tree, [arrays[name] for name in names])
+        state = jax.tree.unflatten(tree, [arrays[name] for name in leaves])
         signals = arrays["window"][0]
         state, prediction = advance_interval(apply.model, variables, state, signals, **constants)
-        after = next_arrays(dict(zip(names, jax.tree.leaves(state), strict=True)))
+        after = next_arrays(name_leaves(state, OF_NETWORK))
         return _outputs(jax.tree.map(lambda leaf: leaf[None], prediction)) | after
 
-    def express(state: DeployedState, imu: Imu) -> tuple[Array, Array, Array]:
-        """Signals and heading of the memory's frame, and the attitude at the end."""
+    def window(state: DeployedState, imu: Imu) -> Float[Array, "1 n 6"]:
+        """The samples of the interval in the memory's frame."""
         assert state.memory is not None
         samples, attitude = interval_samples(state.filter, imu, ekf.config)
-        return *express_samples(state.memory, samples, attitude), attitude[:, :, -1]
-
-    def measure(
-        before: DeployedState, imu: Imu, arrays: Arrays
-    ) -> Callable[[FilterState, Array | int], Displacement]:
-        _, heading, _ = express(before, imu)
-        predicted = arrays["displacement"], arrays["covariance"], heading
-        return lambda state, oldest: turned_displacement(ekf, *predicted, state, oldest)
+        heading = advance_frame(state.memory, attitude).heading
+        return express_samples(heading, samples, attitude)[None].astype(jnp.float32)
 
     def remember(state: DeployedState, imu: Imu) -> Memory:
         assert state.memory is not None
-        _, heading, attitude = express(state, imu)
-        return Memory(state.memory.network, heading, attitude, state.memory.intervals + 1)
+        return advance_frame(state.memory, interval_samples(state.filter, imu, ekf.config)[1])
 
-    window = jax.ShapeDtypeStruct((1, ekf.config.samples_per_clone, 6), jnp.float32)
-    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
+    def measure(
+        arrays: Arrays, memory: Memory, state: FilterState, oldest: Array | int
+    ) -> Displacement:
+        prediction = arrays["displacement"], arrays["covariance"]
+        return turned_displacement(ekf, *prediction, memory.heading, state, oldest)
+
+    rows = jax.ShapeDtypeStruct((1, ekf.config.samples_per_clone, 6), jnp.float32)
+    shapes = {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
     frame = "memory.heading", "memory.attitude", "memory.intervals"
     return DeployedNetwork(
         samples=0,
         memory=empty,
         first_inferred=0,
-        inputs={"window": window, **dict(zip(names, shapes, strict=True))},
+        inputs={"window": rows, **shapes},
         infer=infer,
         read_by_window=("rotation", "gyro_bias", "accel_bias", *frame),
-        window=lambda state, imu: express(state, imu)[0][None].astype(jnp.float32),
-        measure=measure,
+        window=window,
         remember=remember,
+        measure=measure,
     )
 
 

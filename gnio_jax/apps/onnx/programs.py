@@ -28,7 +28,6 @@ from gnio_jax.apps.onnx.networks import (
     OF_NETWORK,
     DeployedNetwork,
     append_samples,
-    deploy_network,
 )
 from gnio_jax.apps.onnx.state import (
     POSE,
@@ -46,7 +45,6 @@ from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.start import REST_SECONDS
 from gnio_jax.filtering.state import invariant_errors, state_shapes
 from gnio_jax.filtering.tracker import advance_filter
-from gnio_jax.models import Network, predicts_displacement
 from gnio_jax.types import Array
 
 
@@ -63,19 +61,14 @@ class Program(NamedTuple):
         return jax.eval_shape(self.function, self.inputs)
 
 
-def programs(network: Network, ekf: Filter) -> list[Program]:
+def programs(network: DeployedNetwork, ekf: Filter) -> list[Program]:
     """The four programs of a network and its filter. JAX's x64 must be on. The output
     `displacement` of the network is what the filter measures (`FilterConfig.measures`)."""
     config = ekf.config
     if config.low_pass_seconds:
         problem = "is not undone by an exported filter"
         raise InputError("filter.low_pass_seconds", problem, "set it to 0")
-    model = getattr(network.apply, "model", None)
-    if model is not None and not predicts_displacement(model):
-        problem = "predicts no displacement, and an exported filter takes nothing else"
-        raise InputError("network", problem, "export another network")
-    deployed = deploy_network(network, ekf)
-    deploy = functools.partial(_deploy_state, ekf=ekf, network=deployed)
+    deploy = functools.partial(_deploy_state, ekf=ekf, network=network)
     shape = jax.eval_shape(deploy, state_shapes(config, ekf.noise, jnp.float64))
 
     def start(arrays: Arrays) -> dict[str, Array]:
@@ -85,21 +78,21 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
 
     def window(arrays: Arrays) -> dict[str, Array]:
         """The network's input from the state before an interval and its samples."""
-        return {"window": deployed.window(from_arrays(arrays, shape), _interval(arrays))}
+        return {"window": network.window(from_arrays(arrays, shape), _interval(arrays))}
 
     def step(arrays: Arrays) -> dict[str, Array]:
         """`advance_filter` with a given displacement."""
         state, imu = from_arrays(arrays, shape), _interval(arrays)
-        measure = deployed.measure(state, imu, arrays)
+        memory = network.remember(state, imu)
         filtered, history = advance_filter(
             ekf,
             state.filter,
             imu,
             jnp.zeros(n),
-            lambda state, oldest: (measure(state, oldest), {}),
+            lambda state, oldest: (network.measure(arrays, memory, state, oldest), {}),
             state.filter.step % config.clones,
         )
-        samples, memory = append_samples(state.samples, imu), deployed.remember(state, imu)
+        samples = append_samples(state.samples, imu)
         after = _read_by_step(to_arrays(DeployedState(filtered, samples, memory)))
         fields = (name for name in Pose._fields if name not in ("time", "failure", "quiet"))
         pose = {POSE + name: getattr(history, name)[0] for name in fields}
@@ -110,11 +103,11 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
 
     state, n = to_arrays(shape), config.samples_per_clone
     rest_samples = round(REST_SECONDS / config.dt)
-    read_by_window = {STATE + name: state[STATE + name] for name in deployed.read_by_window}
+    read_by_window = {STATE + name: state[STATE + name] for name in network.read_by_window}
     interval = {"gyro": float64(n, 3), "accel": float64(n, 3)}
     measured = {"displacement": float64(3), "covariance": float64(3, 3)}
     return [
-        Program("network", deployed.infer, deployed.inputs),
+        Program("network", network.infer, network.inputs),
         Program(
             "filter_start",
             start,
@@ -125,7 +118,9 @@ def programs(network: Network, ekf: Filter) -> list[Program]:
     ]
 
 
-def start_arrays(state: FilterState, network: Network, ekf: Filter) -> dict[str, np.ndarray]:
+def start_arrays(
+    state: FilterState, network: DeployedNetwork, ekf: Filter
+) -> dict[str, np.ndarray]:
     """The arrays of a filter that begins with `state`, from `initial_state` or `level_state`.
 
     Raises `ValueError` for the final state of a run: its clones are ordered by age and measured
@@ -134,7 +129,7 @@ def start_arrays(state: FilterState, network: Network, ekf: Filter) -> dict[str,
     if state.step > 0:
         problem = f"is one after {int(state.step)} clone intervals of a run"
         raise ValueError(f"state: {problem}; a deployed filter begins with one without clones")
-    deployed = _deploy_state(checked_state(state, ekf), ekf, deploy_network(network, ekf))
+    deployed = _deploy_state(checked_state(state, ekf), ekf, network)
     return {name: np.asarray(value) for name, value in to_arrays(deployed).items()}
 
 

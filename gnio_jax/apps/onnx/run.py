@@ -96,9 +96,9 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
         at_end.callback(logging.disable, logging.root.manager.disable)
         logging.disable(logging.WARNING)  # Converters write a log line for almost every node.
         files = {}
-        first_inferred = deploy_network(network, ekf).first_inferred
-        for program in programs(network, ekf):
-            content = conversion.to_model(program, ekf, first_inferred)
+        deployed = deploy_network(network, ekf)
+        for program in programs(deployed, ekf):
+            content = conversion.to_model(program, ekf, deployed.first_inferred)
             (folder / f"{program.name}.onnx").write_bytes(content)
             files[f"{program.name}.onnx"] = {
                 **fingerprint(content),
@@ -109,7 +109,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
         walk = draw_walk(windows, ekf, seconds)
         start = walk.start.state(ekf)
         models = driver.open_models(folder)
-        result = driver.walk(models, start_arrays(start, network, ekf), walk.gyro, walk.accel)
+        result = driver.walk(models, start_arrays(start, deployed, ekf), walk.gyro, walk.accel)
         without = dataclasses.replace(ekf, considered=None)
         (package_estimate,) = estimate([walk], network, windows, without)
         deviation = deviation_of(result, package_estimate)
@@ -124,7 +124,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
             "epoch": run.epoch,
             "step": run.step,
             "accuracy": {"seconds": seconds, **deviation._asdict()},
-            "first_inferred": first_inferred,
+            "first_inferred": deployed.first_inferred,
             **_filter(ekf),
             "files": files,
         }

@@ -41,7 +41,7 @@ class DeployedState(NamedTuple):
 def to_arrays(state: DeployedState) -> dict[str, Any]:
     """The arrays of a state, or their shapes, by name; only those that have entries and that a step
     reads."""
-    leaves = _named_leaves(state).items()
+    leaves = _named_state(state).items()
     return {name: leaf for name, leaf in leaves if leaf.size > 0 and name not in _OF_GAPS}
 
 
@@ -49,7 +49,7 @@ def from_arrays(arrays: Arrays, shape: DeployedState) -> DeployedState:
     """The state of these arrays. Arrays that are left out are zero, because nothing needs them."""
     leaves = [
         arrays[name] if name in arrays else jnp.zeros(leaf.shape, leaf.dtype)
-        for name, leaf in _named_leaves(shape).items()
+        for name, leaf in _named_state(shape).items()
     ]
     return jax.tree.unflatten(jax.tree.structure(shape), leaves)
 
@@ -59,8 +59,15 @@ def next_arrays(arrays: dict[str, Any]) -> dict[str, Any]:
     return {NEXT + name.removeprefix(STATE): value for name, value in arrays.items()}
 
 
-def _named_leaves(state: DeployedState) -> dict[str, Any]:
-    leaves = jax.tree_util.tree_leaves_with_path(state)
-    paths = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves]
-    names = [STATE + path.removeprefix("filter.") for path in paths]
-    return {name: leaf for name, (_, leaf) in zip(names, leaves, strict=True)}
+def name_leaves(tree: Any, prefix: str) -> dict[str, Any]:
+    """The leaves of a tree by the prefix and their path."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {
+        prefix + jax.tree_util.keystr(path, simple=True, separator="."): leaf
+        for path, leaf in leaves
+    }
+
+
+def _named_state(state: DeployedState) -> dict[str, Any]:
+    """The leaves in the order of the tree; those of the filter are the state's own."""
+    return name_leaves(state.filter, STATE) | name_leaves(state._replace(filter=None), STATE)

@@ -17,6 +17,7 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.apps.onnx import driver, export_run
+from gnio_jax.apps.onnx.networks import deploy_network
 from gnio_jax.apps.onnx.programs import start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check
 from gnio_jax.commands import app, console
@@ -78,7 +79,7 @@ def test_the_start_has_the_bias_of_a_gyro_at_rest(run, models, walked):
     arrays = driver.run(driver.open_models(models[0]).start, rest)
     loaded = read_network(run)
     ekf = filtering.make_filter(loaded.config.data, loaded.config.filter)
-    network = Network.of(loaded.model, loaded.variables)
+    network = deploy_network(Network.of(loaded.model, loaded.variables), ekf)
     wanted = start_arrays(from_rest(ekf, walked), network, ekf)
     assert arrays.keys() == wanted.keys()
     for name, value in wanted.items():
@@ -172,7 +173,8 @@ def test_a_network_with_memory_is_that_of_the_package(remembering):
     history = jax.jit(lambda start: filtering.run_odometry(predict, ekf, start, gyro, accel)[1])(
         start
     )
-    walked = driver.walk(driver.open_models(folder), start_arrays(start, network, ekf), gyro, accel)
+    arrays = start_arrays(start, deploy_network(network, ekf), ekf)
+    walked = driver.walk(driver.open_models(folder), arrays, gyro, accel)
     assert np.nansum(history.accepted) > 20
     first = ekf.config.first_measured
     assert len(walked.windows) == len(walked.position) == len(walked.displacement) + first
