@@ -36,12 +36,12 @@ from gnio_jax.config import (
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Displacements, SequenceEstimate, Trajectory
-from gnio_jax.evaluation.estimate import BatchInputs
+from gnio_jax.evaluation.estimate import BatchInputs, filter_inputs
 from gnio_jax.evaluation.prepare import Start, prepare
 from gnio_jax.filtering.settings import free_parameters
 from gnio_jax.filtering.state import GYRO_BIAS
 from gnio_jax.networks import load
-from tests.support import tiny_run
+from tests.support import estimators, tiny_run
 from tests.support.filter_settings import changed
 from tests.support.walks import simulate, with_correlated_errors
 
@@ -532,6 +532,31 @@ def test_the_considered_covariance_of_positions_is_that_of_the_whole_state():
         axis,
     )
     np.testing.assert_allclose(fitting._add_considered(positions, std), whole, rtol=1e-12)
+
+
+def test_the_sensitivity_of_positions_does_not_depend_on_which_axis_of_the_phone_is_vertical():
+    """Displacements of a network that turn with the frame of the x axis; a bias turns with the axes
+    of the phone."""
+    walk = simulated.pedestrian(1, 1, "handheld", 12.0, estimators.RATE)
+    (recording,) = estimators.ready([walk], gyro_bias="reference")
+    other, labels = estimators.relabel(recording)
+    assert abs(other.start.rotation[2, 0]) > 0.8
+    network = estimators.network(0.05, -2.0, log_std_gain=0.0)
+    positions = []
+    for one in (recording, other):
+        ekf = filtering.make_filter(estimators.CONFIG, estimators.OPTIONS)
+        (estimate,) = estimators.tight([one], network)
+        rows = [Displacements(*(part[1:] for part in estimate.displacements[:2]))]
+        inputs = filter_inputs([one], rows, one.strides, ekf.config)
+        truth = one.reference.position[None, 1:]
+        settings = estimators.CONFIG, estimators.OPTIONS
+        positions.append(fitting.compare_positions(inputs, truth, *settings).sensitivity)
+    expected, actual = positions
+    of_bias = np.einsum("kid,cd->kic", expected[..., :3], labels)
+    scale = np.abs(of_bias).max()
+    np.testing.assert_allclose(actual[..., :3], of_bias, atol=1e-4 * scale)
+    scale = np.abs(expected[..., 3:]).max()
+    np.testing.assert_allclose(actual[..., 3:], expected[..., 3:], atol=1e-4 * scale)
 
 
 def test_the_prior_counts_as_many_independent_errors_as_there_are():

@@ -25,10 +25,13 @@ from tests.support.estimators import (
     loose,
     network,
     ready,
+    relabel,
     rotations,
+    sensed,
     summed,
     tight,
     unyaw,
+    with_factors,
     with_truth,
     with_waypoints,
 )
@@ -129,22 +132,27 @@ def test_the_filter_of_true_displacements_ignores_the_calibration(walks):
     assert perfect(make_filter(CONFIG, considered)).considered == ConsideredStd(**of_gyro)
 
 
-def test_consider_covariance_widens_the_covariance_and_moves_nothing(walks):
+@pytest.mark.parametrize("apply, tolerance", [(sensed, 1e-6), (with_factors, 1e-5)])
+def test_consider_covariance_widens_the_covariance_and_moves_nothing(walks, apply, tolerance):
     """The derivative of positions by the gyro bias is that of runs whose gyro differs a little and
     whose network ignores its windows. It turns with its yaw frame, because the x axis is level. The
-    bias of a raw gyro is larger along the vertical at the start."""
+    bias of a raw gyro is larger along the vertical at the start. Factors of the network hold in the
+    derivative, too."""
     recordings = [with_level_axis(one) for one in ready(walks[:2], gyro_bias="reference")]
     raw = recordings[1].start._replace(raw_gyro=True)
     recordings = [recordings[0], recordings[1]._replace(start=raw)]
-    alike = network(0.0, -2.0, log_std_gain=0.0, constant=(0.9, 0.2, 0.02))
+    alike = network(0.0, -2.0, log_std_gain=0.0, constant=(0.9, 0.2, 0.02))._replace(apply=apply)
+    numbers = {"nonholonomic": {"lateral_std": 2.0, "vertical_std": 2.0}}
+    measurements = numbers if apply is with_factors else {}
+    without = dataclasses.replace(OPTIONS, measurements=measurements)
 
     def run(recordings, options):
         return tight(recordings, alike, options=options)
 
-    options = changed(OPTIONS, considered={"gyro_bias": 1e-3, "raw_gyro_bias": 5e-3})
-    estimates = run(recordings, OPTIONS), run(recordings, options)
+    options = changed(without, considered={"gyro_bias": 1e-3, "raw_gyro_bias": 5e-3})
+    estimates = run(recordings, without), run(recordings, options)
     ahead, behind = (
-        [run([with_gyro_bias(recording, off) for recording in recordings], OPTIONS) for off in axes]
+        [run([with_gyro_bias(recording, off) for recording in recordings], without) for off in axes]
         for axes in (1e-5 * np.eye(3), -1e-5 * np.eye(3))
     )
     for row, (plain, considered) in enumerate(zip(*estimates, strict=True)):
@@ -163,12 +171,32 @@ def test_consider_covariance_widens_the_covariance_and_moves_nothing(walks):
         added = moved @ variance @ moved.swapaxes(1, 2)
         expected = plain.filtered.covariance + added
         assert added[-1].max() > 1e-6
-        np.testing.assert_allclose(considered.filtered.covariance, expected, rtol=1e-2, atol=1e-6)
+        covariance = considered.filtered.covariance
+        np.testing.assert_allclose(covariance, expected, rtol=1e-2, atol=tolerance)
         std = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
         np.testing.assert_allclose(considered.states.std[:, 6:9], std, rtol=1e-2)
         # A constant bias exists from the start.
         at_start = np.sqrt(plain.states.std[0, 9:12] ** 2 + np.diag(variance))
         np.testing.assert_allclose(considered.states.std[0, 9:12], at_start, rtol=1e-12)
+
+
+def test_the_consider_covariance_does_not_depend_on_which_axis_of_the_phone_is_vertical(walks):
+    """Window, displacement and covariance turn with the frame of the x axis."""
+    recordings = ready(walks[:1], gyro_bias="reference")
+    other, _ = relabel(recordings[0])
+    assert abs(other.start.rotation[2, 0]) > 0.8
+    turning = network(0.05, -2.0, log_std_gain=0.0)
+    considered = {"gyro_bias": 0.01, "scale": 0.1, "heading": 0.1}
+    options = changed(OPTIONS, considered=considered)
+    (estimate,), (relabelled,) = (
+        tight([one], turning, options=options) for one in (recordings[0], other)
+    )
+    plain = tight(recordings, turning)[0].filtered.covariance
+    position = estimate.trajectory.position
+    np.testing.assert_allclose(relabelled.trajectory.position, position, atol=1e-3)
+    expected = estimate.filtered.covariance
+    added = np.abs(expected - plain).max()
+    np.testing.assert_allclose(relabelled.filtered.covariance, expected, atol=2e-3 * added)
 
 
 def test_the_covariance_has_the_arc_of_a_considered_yaw(walks):

@@ -12,7 +12,7 @@ from gnio_jax.evaluation import infer, no_displacements, perfect, prepare, refer
 from gnio_jax.evaluation.estimate import PERFECT_STD
 from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
-from gnio_jax.types import Prediction, Waypoints
+from gnio_jax.types import NONHOLONOMIC_LOG_FACTOR, Prediction, Waypoints
 from tests.support.filter_settings import changed
 
 RATE = 50.0
@@ -43,6 +43,15 @@ def network(gain, log_std, log_std_gain=1.0, constant=(0.0, 0.0, 0.0)):
     return Network(sensed, {name: jnp.float32(value) for name, value in named.items()})
 
 
+def with_factors(variables, windows):
+    """`sensed` that trusts the non-holonomic constraint of a car four and two times as far."""
+    prediction = sensed(variables, windows)
+    log_factor = -jnp.log(jnp.tile(jnp.array([[4.0, 2.0]]), (len(windows), 1)))
+    return prediction._replace(
+        diagnostics={**prediction.diagnostics, NONHOLONOMIC_LOG_FACTOR: log_factor}
+    )
+
+
 NETWORK = network(0.05, -3.0)
 
 
@@ -61,6 +70,18 @@ def ready(walks, config=CONFIG, **how):
     recordings, left_out = prepare(walks, config, **how)
     assert not left_out
     return recordings
+
+
+def relabel(recording):
+    """The recording with other axes of the body, of which x is the one that is nearest to the
+    vertical at the start, and the matrix from the old axes to them."""
+    steep = int(np.argmax(np.abs(recording.start.rotation[2])))
+    labels = np.roll(np.eye(3), -steep, axis=0)
+    start = recording.start._replace(
+        rotation=recording.start.rotation @ labels.T, gyro_bias=labels @ recording.start.gyro_bias
+    )
+    signals = {"gyro": recording.gyro @ labels.T, "accel": recording.accel @ labels.T}
+    return recording._replace(start=start, **signals), labels
 
 
 def tight(recordings, network=NETWORK, config=CONFIG, options=OPTIONS, **how):
