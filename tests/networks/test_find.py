@@ -55,7 +55,8 @@ def test_names_are_those_of_folders_and_zips(networks, run, monkeypatch, tmp_pat
     assert gnio_jax.load_pretrained(networks / "walk").card is not None
     refused("wolk", "no such network", "did you mean 'walk'?", "known names: walk, other, small")
     refused(tmp_path, "holds no network (config.yaml is missing)")
-    refused(networks / "begun", "holds no weights", "let gnio train finish its first epoch")
+    begun = "holds no weights (weights.safetensors is missing)"
+    refused(networks / "begun", begun, "let gnio train finish its first epoch")
     monkeypatch.setenv("GNIO_WEIGHTS", str(tmp_path / "nowhere"))
     refused("walk", "$GNIO_WEIGHTS", "nowhere")
 
