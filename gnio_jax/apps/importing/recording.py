@@ -121,6 +121,7 @@ def _in_si(
     accel = accel._replace(values=accel.values * scale)
     rows, is_slower = physics.repeats(gyro.time, gyro.values)
     force = interpolate(gyro.time, accel.time, accel.values)
+    # Some gyros read 0 at rest: these rows are measured.
     rows &= ~physics.find_rest(physics.ImuSamples(gyro.time, gyro.values, force), rows)
     gyro = _without_repeats(gyro, rows, is_slower, raw)
     accel = _without_repeats(accel, *physics.repeats(accel.time, accel.values), raw)
