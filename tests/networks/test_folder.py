@@ -217,7 +217,10 @@ def of_another_network(_, __):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (with_nan, ["holds values that are not finite; take another network, or train it again"]),
+        (
+            with_nan,
+            [": 'params/", "' holds values that are not finite; take another network, or train it"],
+        ),
         (of_another_network, ["'batch_stats/norm/mean' has shape None", "[4]"]),
         (wider, ["has shape [4, 2], and in the configured network [4]"]),
         *(
