@@ -1,7 +1,7 @@
 """The error of a vehicle's filter on KITTI's held-out drives, with constants chosen without them.
 
     python -m benchmarks.vehicle_constants --data-root DIR [--seeds 0 1 2] [--folds 3]
-        [--trials 156] [--low-pass 0 0.03 0.06 0.09]
+        [--only 0 1 2] [--trials 156] [--low-pass 0 0.03 0.06 0.09]
 
 The drives of a fold are held out whole. Everything is chosen within the other drives (nested
 cross-validation), and the held-out drives are measured once:
@@ -15,8 +15,9 @@ cross-validation), and the held-out drives are measured once:
   over drives, plus the penalty times the squared distance in `UNITS`.
 
 The filter starts at the reference's pose and velocity, and gets no displacement and no rest. Only
-the seed of the search differs between the seeds. `--low-pass 0` is the same protocol with the
-low-pass left in. The brackets are 95 % intervals of a bootstrap over drives (10,000 draws).
+the seed of the search differs between the seeds, so the low-pass is chosen once for each fold.
+`--low-pass 0` is the same protocol with the low-pass left in. `--only` runs some folds. The
+brackets are 95 % intervals of a bootstrap over drives (10,000 draws).
 
 SciPy has no CMA-ES. Its methods without derivatives are for few constants or for many more trials,
 so the strategy is written out below and needs no other package.
@@ -225,7 +226,10 @@ def search(
 
 
 def choose_low_pass(drives: Sequence[PreparedRecording], seconds: Sequence[float]) -> float:
-    """The time constant with which the defaults have the smallest objective on these drives."""
+    """The time constant with which the defaults have the smallest objective on these drives. One
+    constant alone is no choice and costs no run."""
+    if len(seconds) == 1:
+        return seconds[0]
     defaults = np.zeros((1, len(UNITS)))
     return min(seconds, key=lambda tau: objective(drives, tau, defaults)[0])
 
@@ -249,23 +253,33 @@ def choose(
     return Choice(low_pass_seconds, penalty, search(drives, low_pass_seconds, penalty, trials, rng))
 
 
-def evaluate_fold(
+class Fold(NamedTuple):
+    """The drives of a fold, and the constant of the low-pass that the others choose for it. No seed
+    changes them."""
+
+    training: list[PreparedRecording]
+    held_out: list[PreparedRecording]
+    low_pass_seconds: float
+
+
+def make_fold(
     drives: Sequence[PreparedRecording],
     fold_of: Mapping[str, int],
-    fold: int,
+    number: int,
     low_pass: Sequence[float],
-    trials: int,
-    seed: int,
-) -> FoldResult:
-    """Choose by the drives that are not in this fold, and then measure the drives in it."""
-    training = [drive for drive in drives if fold_of[drive.group] != fold]
-    tau = choose_low_pass(training, low_pass)
-    choice = choose(training, tau, trials, (seed, fold))
+) -> Fold:
+    """Divide the drives, and choose the low-pass by those that are not held out."""
+    training = [drive for drive in drives if fold_of[drive.group] != number]
+    held_out = [drive for drive in drives if fold_of[drive.group] == number]
+    return Fold(training, held_out, choose_low_pass(training, low_pass))
+
+
+def evaluate_fold(fold: Fold, trials: int, seed: Sequence[int]) -> FoldResult:
+    """Choose by the training drives of a fold, and then measure the drives that are held out."""
+    choice = choose(fold.training, fold.low_pass_seconds, trials, seed)
     points = np.stack([np.zeros(len(UNITS)), choice.point])
     errors = {
-        drive.name: measure_drive(drive, tau, points)
-        for drive in drives
-        if fold_of[drive.group] == fold
+        drive.name: measure_drive(drive, fold.low_pass_seconds, points) for drive in fold.held_out
     }
     return FoldResult(choice, *({name: pair[i] for name, pair in errors.items()} for i in (0, 1)))
 
@@ -305,30 +319,33 @@ def main() -> None:
     parser.add_argument("--data-root", help="KITTI's folder, as for gnio evaluate")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--folds", type=int, default=3)
+    parser.add_argument("--only", type=int, nargs="+", help="folds to run; default: all")
     parser.add_argument("--trials", type=int, default=156, help="of one search")
     parser.add_argument("--low-pass", type=float, nargs="+", default=[0.0, 0.03, 0.06, 0.09])
     arguments = parser.parse_args()
+    numbers = range(arguments.folds) if arguments.only is None else arguments.only
+    if not set(numbers) <= set(range(arguments.folds)):
+        parser.error(f"--only: there are the folds 0 to {arguments.folds - 1}")
     drives, fold_of = load_drives(arguments.data_root, arguments.folds)
     total = sum(pieces(drive.reference, WINDOWS.stride_seconds).shape[1] for drive in drives)
     print(f"{len(drives)} drives, {total} pieces", flush=True)
     defaults = np.zeros((1, len(UNITS)))
     unchanged = {drive.name: measure_drive(drive, 0.0, defaults)[0] for drive in drives}
     print(f"defaults, low-pass left in: {describe_errors(unchanged)}", flush=True)
+    folds = {n: make_fold(drives, fold_of, n, arguments.low_pass) for n in numbers}
     by_seed = []
     for seed in arguments.seeds:
         default_errors, errors = {}, {}
-        for fold in range(arguments.folds):
-            result = evaluate_fold(
-                drives, fold_of, fold, arguments.low_pass, arguments.trials, seed
-            )
+        for number, fold in folds.items():
+            result = evaluate_fold(fold, arguments.trials, (seed, number))
             default_errors |= result.default_errors
             errors |= result.errors
             tau, penalty, point = result.choice
             free = free_parameters(settings_at(tau, point), UNITS)
-            print(f"seed {seed}, fold {fold}: {describe_errors(result.errors)}", flush=True)
+            print(f"seed {seed}, fold {number}: {describe_errors(result.errors)}", flush=True)
             print(f"  low-pass {tau:g} s, penalty {penalty:g}, free parameters {free}", flush=True)
         if not by_seed:
-            differences = {name: default_errors[name] - unchanged[name] for name in unchanged}
+            differences = {name: error - unchanged[name] for name, error in default_errors.items()}
             print(f"defaults, low-pass chosen: {describe_errors(default_errors)}", flush=True)
             print(f"  minus low-pass left in: {describe_errors(differences)}", flush=True)
         by_seed.append(errors)

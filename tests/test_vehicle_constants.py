@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks import vehicle_constants
-from benchmarks.vehicle_constants import WINDOWS, evaluate_fold, minimise, settings_at
+from benchmarks.vehicle_constants import WINDOWS, evaluate_fold, make_fold, minimise, settings_at
 from gnio_jax.evaluation.prepare import prepare
 from gnio_jax.numerics import quaternions
 from gnio_jax.types import Sequence
@@ -48,7 +48,7 @@ def stretch_reference(sequence):
 
 def evaluate_first_fold(sequences):
     recordings, _ = prepare(sequences, WINDOWS)
-    return evaluate_fold(recordings, FOLDS, 0, LOW_PASS, 12, 7)
+    return evaluate_fold(make_fold(recordings, FOLDS, 0, LOW_PASS), 12, (7, 0))
 
 
 def test_the_reference_of_a_drive_that_is_held_out_has_no_part_in_the_choice(drives):
@@ -90,12 +90,38 @@ def test_the_strategy_comes_to_the_minimum_of_a_turned_ellipsoid():
     np.testing.assert_allclose(minimise(value, 6, 3600, rng), minimum, atol=1e-6)
 
 
-def test_the_program_prints_the_errors_of_all_drives(drives, monkeypatch, capsys):
+def test_the_program_prints_the_errors_of_all_drives_and_chooses_the_low_pass_once_for_a_fold(
+    drives, monkeypatch, capsys
+):
+    choose_low_pass, choices = vehicle_constants.choose_low_pass, []
+
+    def count_choice(training, seconds):
+        choices.append(sorted(drive.name for drive in training))
+        return choose_low_pass(training, seconds)
+
+    monkeypatch.setattr(vehicle_constants, "choose_low_pass", count_choice)
+    monkeypatch.setattr(vehicle_constants, "PENALTIES", (0.03,))
     monkeypatch.setattr(vehicle_constants.data, "load", lambda *_: drives)
-    arguments = "vehicle_constants --seeds 3 --folds 2 --trials 12 --low-pass 0.06"
-    monkeypatch.setattr(sys, "argv", arguments.split())
+    words = "vehicle_constants --seeds 3 4 --folds 2 --trials 12 --low-pass 0.06"
+    monkeypatch.setattr(sys, "argv", words.split())
     vehicle_constants.main()
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("4 drives, ")
-    for beginning in ("defaults, low-pass chosen: ", "seed 3: ", "mean of 1 seed(s)"):
+    for beginning in ("defaults, low-pass chosen: ", "seed 3: ", "seed 4: ", "mean of 2 seed(s)"):
         assert sum(line.startswith(beginning) for line in lines) == 1
+    # Two folds have two choices, whatever the number of seeds.
+    assert len(choices) == 2 and set(choices[0]).isdisjoint(choices[1])
+
+    monkeypatch.setattr(sys, "argv", [*words.split(), "--only", "1"])
+    vehicle_constants.main()
+    part = capsys.readouterr().out.splitlines()
+    assert not any("fold 0" in line for line in part)
+    of_fold = [[x for x in text if x.startswith("seed 4, fold 1: ")] for text in (lines, part)]
+    assert of_fold[0] == of_fold[1] and len(of_fold[0]) == 1
+
+
+def test_a_fold_that_does_not_exist_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", "vehicle_constants --folds 2 --only 2".split())
+    with pytest.raises(SystemExit):
+        vehicle_constants.main()
+    assert "--only: there are the folds 0 to 1" in capsys.readouterr().err

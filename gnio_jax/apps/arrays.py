@@ -5,7 +5,9 @@ arrays → check → one clock, as of every recording → the start and the filt
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -15,14 +17,18 @@ from jaxtyping import Float
 from gnio_jax import networks
 from gnio_jax.apps.importing import units
 from gnio_jax.apps.importing.clocks import Sensor
+from gnio_jax.apps.importing.readings import RawReadings
 from gnio_jax.apps.importing.recording import RawRecording, as_sequence
 from gnio_jax.apps.summary import summarise
 from gnio_jax.apps.track import estimate_recording
 from gnio_jax.config import ImportOptions
 from gnio_jax.data import physics
+from gnio_jax.data.geodesy import Place
 from gnio_jax.data.parsing.stamps import check_seconds, first_stamp
+from gnio_jax.data.sensors import GNSS, SENSOR_KINDS, check_readings
 from gnio_jax.data.validation import check_accel
 from gnio_jax.errors import InputError
+from gnio_jax.types import Readings
 
 SOURCE = "samples"
 """Name of the arrays in messages and notes."""
@@ -31,8 +37,8 @@ SOURCE = "samples"
 class Odometry(NamedTuple):
     """Poses of an IMU, its velocity, and the uncertainty of its position, at k moments.
 
-    The world is z-up. It begins where the IMU begins, with yaw zero. Rows from a divergence of the
-    filter on are NaN, and a note says why.
+    The world is z-up. It begins where the IMU begins, with yaw zero; with fixes of a receiver its
+    axes are east and north. Rows from a divergence of the filter on are NaN, and a note says why.
     """
 
     time: Float[np.ndarray, "k"]
@@ -46,10 +52,19 @@ class Odometry(NamedTuple):
     covariance: Float[np.ndarray, "k 3 3"]
     """Covariance of the error of `position`, m²."""
     notes: tuple[str, ...]
-    """Warnings, and what was found out about the samples and the start, one sentence each."""
+    """Warnings, what was found out about the samples and the start, and what the other sensors did,
+    one sentence each."""
+    origin: Place | None = None
+    """The place of the start on the earth, if fixes show it."""
 
 
-def track(time: Any, gyro: Any, accel: Any, network: str | Path = "pedestrian") -> Odometry:
+def track(
+    time: Any,
+    gyro: Any,
+    accel: Any,
+    network: str | Path = "pedestrian",
+    sensors: Mapping[str, Any] = MappingProxyType({}),
+) -> Odometry:
     """The trajectory of a phone that somebody carries, from arrays of its IMU's samples.
 
     Start, filter and result are those of `gnio track` for a file with these samples. Stand still
@@ -63,13 +78,24 @@ def track(time: Any, gyro: Any, accel: Any, network: str | Path = "pedestrian") 
         accel: (n, 3) specific force, body frame, m/s², with gravity in it: the axis that points up
             reads +9.81 at rest, as on Android.
         network: Name of a trained network, or its folder or zip.
+        sensors: Readings of the phone's other sensors, with the stamps of the sensor, f of them in
+            any order, on the clock of `time`:
+
+            - `"magnetometer": (time, field)`, (f, 3) µT in the axes of the IMU;
+            - `"barometer": (time, pressure)`, (f,) or (f, 1) Pa;
+            - `"gnss": (time, places)` or `(time, places, std)`, (f, 3) latitude and longitude in
+              degrees and altitude in m, and their standard deviations east, north and up in m. NaN:
+              the altitude, or a standard deviation, is not known.
+
+            A sensor of which the filter refuses most is left out, and a note says so.
 
     Raises:
         InputError: An array has the wrong shape, a value that is not finite, or another unit; the
-            samples last less than two seconds or so; there is no such network. It is a
+            samples last less than two seconds or so; there is no such network or sensor. It is a
             `ValueError`.
     """
     time, gyro, accel = _checked_samples(time, gyro, accel)
+    others = tuple(_checked_readings(name, parts, time) for name, parts in sensors.items())
     recording = RawRecording(
         Path(SOURCE),
         Sensor("gyro", Path(SOURCE), time, gyro, second="s", unit="rad/s"),
@@ -77,12 +103,16 @@ def track(time: Any, gyro: Any, accel: Any, network: str | Path = "pedestrian") 
         notes=[],
         warnings=[],
         sign="android",
+        others=others,
     )
     chosen = networks.load(network)
     with jax.enable_x64(True):  # for the filter; the network states its float32
         imported = as_sequence(recording, ImportOptions(), None, SOURCE)
-        estimate, ready, ekf = estimate_recording(imported.sequence, chosen)
-        summary = summarise(estimate, {}, ready, imported, chosen, ekf)
+        sequence = imported.sequence
+        fused = estimate_recording(sequence, sequence.readings, chosen)
+        estimate, ready, ekf, uses, origin = fused
+        summary = summarise(estimate, {}, ready, imported, chosen, ekf, uses, origin)
+    used = (f"{use.sensor}: {use.line}" for use in uses if use.accepted is not None)
     path, filtered, states = estimate.trajectory, estimate.filtered, estimate.states
     assert filtered is not None and states is not None
     return Odometry(
@@ -91,7 +121,8 @@ def track(time: Any, gyro: Any, accel: Any, network: str | Path = "pedestrian") 
         path.orientation,
         np.where(path.known[:, None], states.velocity, np.nan),
         np.where(path.known[:, None, None], filtered.covariance, np.nan),
-        (*summary.warnings, *summary.notes),
+        (*summary.warnings, *summary.notes, *used),
+        origin,
     )
 
 
@@ -123,6 +154,34 @@ def _checked_samples(time: Any, gyro: Any, accel: Any) -> tuple[np.ndarray, np.n
         problem = f"looks like deg/s ({reason}), expected rad/s"
         raise InputError("gyro", problem, "convert it: numpy.radians(gyro)")
     return stamps, rate, force
+
+
+def _checked_readings(sensor: str, parts: Any, clock: Float[np.ndarray, "n"]) -> RawReadings:
+    """An entry of `sensors` of `track`. `clock` has the stamps of the IMU. Raises `InputError`
+    naming it, what it is and what is expected."""
+    kind = SENSOR_KINDS.get(sensor)
+    if kind is None:
+        names = ", ".join(SENSOR_KINDS)
+        raise InputError("sensors", f"unknown sensor '{sensor}'", f"known: {names}")
+    field, width = f"sensors['{sensor}']", len(kind.columns)
+    if not isinstance(parts, tuple | list) or len(parts) not in (2, 3)[: 1 + (sensor == GNSS)]:
+        remedy = "give (time, values)" + (", or (time, values, std)" if sensor == GNSS else "")
+        raise InputError(field, "is no tuple of arrays, or has too many or too few", remedy)
+    try:
+        time, *columns = (np.asarray(part, dtype=np.float64) for part in parts)
+    except (TypeError, ValueError) as error:
+        raise InputError(field, f"has something that is no array of numbers ({error})") from None
+    if width == 1:
+        columns = [part[:, None] if part.ndim == 1 else part for part in columns]
+    if time.ndim != 1 or any(part.shape != (len(time), width) for part in columns):
+        shapes = ", ".join(str(part.shape) for part in (time, *columns))
+        problem = f"has arrays of the shapes {shapes}, expected (f,) and (f, {width})"
+        raise InputError(field, problem, "give each stamp one row")
+    values, std = columns if len(columns) == 2 else (*columns, np.full((len(time), width), np.nan))
+    rows = np.unique(time, return_index=True)[1]
+    readings = Readings(time[rows] - clock.min(), values[rows], std[rows])
+    check_readings(sensor, readings, np.sort(clock) - clock.min(), field)
+    return RawReadings(sensor, Path(SOURCE), time, values, std, second="s", unit=kind.unit)
 
 
 def _checked_array(name: str, values: Any, count: int | None) -> np.ndarray:

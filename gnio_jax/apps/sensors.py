@@ -126,70 +126,107 @@ def fuse(
 
     Sensors that cannot be used, and those of which the filter refuses most, are left out, and their
     text has the reason. If none remains, the first run is the result.
+
+    Heights and field are fitted once, because neither depends on another sensor. The run without
+    fixes, to whose path these are aligned, decides what it can: a sensor of which it refuses most
+    has no part in the run with fixes, and it is the result if no fix can be used.
     """
     refused = dict[str, str]()
+    bare = by_field = Fused(first, ready, ekf, (), None)
+    fits: dict[str, Measurement] = {}
+    if BAROMETER in readings:
+        fits |= _try(refused, BAROMETER, lambda: _heights(readings[BAROMETER], ready, ekf))
+    if MAGNETOMETER in readings:
+        field = _try(
+            refused, MAGNETOMETER, lambda: _field(readings[MAGNETOMETER], first, ready, ekf)
+        ).get(MAGNETOMETER)
+        if field is not None:
+            fits[MAGNETOMETER] = field.rows
+            start = ready._replace(start=field.start)
+            by_field = bare._replace(ready=start, ekf=_without_bias(ekf))
+    without_fixes, sensors = bare, tuple[str, ...]()
     while True:
-        sensors = {sensor: r for sensor, r in readings.items() if sensor not in refused}
-        fused = _fuse(first, ready, ekf, sensors, refused, run)
-        shares = {u.sensor: u.accepted for u in fused.uses if u.accepted is not None}
-        if not fused.estimate.trajectory.known.all() and first.trajectory.known.all() and shares:
-            refused[list(shares)[-1]] = "with it the filter diverged"
-        elif shares and min(shares.values()) < LEAST_ACCEPTED:
-            sensor = min(shares, key=lambda name: shares[name])
-            refused[sensor] = f"the filter refused {1 - shares[sensor]:.0%} of its measurements"
-        else:
-            reasons = (
-                SensorUse(sensor, len(readings[sensor].time), None, f"left out: {reason}")
-                for sensor, reason in refused.items()
-            )
-            return fused._replace(uses=(*fused.uses, *reasons))
+        fits = {sensor: rows for sensor, rows in fits.items() if sensor not in refused}
+        has_field, has_fixes = MAGNETOMETER in fits, GNSS in readings and GNSS not in refused
+        base = by_field if has_field else bare
+        if tuple(fits) != sensors and (has_field or not has_fixes):
+            without_fixes, sensors = _estimate(base, readings, fits, run), tuple(fits)
+            if _refuse_one(without_fixes, first, refused):
+                continue
+        fused = without_fixes
+        if has_fixes:
+            path = without_fixes.estimate if has_field else first
+            fused = _with_fixes(base, path, readings, fits, refused, run)
+            if fused is None or _refuse_one(fused, first, refused):
+                continue
+        reasons = (
+            SensorUse(sensor, len(readings[sensor].time), None, f"left out: {reason}")
+            for sensor, reason in refused.items()
+        )
+        return fused._replace(uses=(*fused.uses, *reasons))
 
 
-def _fuse(
-    first: SequenceEstimate,
-    ready: PreparedRecording,
-    ekf: Filter,
+def _refuse_one(fused: Fused, first: SequenceEstimate, refused: dict[str, str]) -> bool:
+    """Whether a sensor must be left out. It is added to `refused` with the reason."""
+    shares = {use.sensor: use.accepted for use in fused.uses if use.accepted is not None}
+    if not shares:
+        return False
+    if not fused.estimate.trajectory.known.all() and first.trajectory.known.all():
+        refused[list(shares)[-1]] = "with it the filter diverged"
+        return True
+    sensor = min(shares, key=lambda name: shares[name])
+    if shares[sensor] >= LEAST_ACCEPTED:
+        return False
+    refused[sensor] = f"the filter refused {1 - shares[sensor]:.0%} of its measurements"
+    return True
+
+
+def _with_fixes(
+    base: Fused,
+    path: SequenceEstimate,
     readings: dict[str, Readings],
+    fits: dict[str, Measurement],
     refused: dict[str, str],
     run: Run,
+) -> Fused | None:
+    """The track with the receiver, too, which begins where the fixes place the path without them.
+    None, with the reason in `refused`, if they do not show that."""
+    longest = math.inf if MAGNETOMETER in fits else FIRST_FIXES
+    placement: Placement | None = _try(
+        refused, GNSS, lambda: place_on_map(readings[GNSS], path, longest)
+    ).get(GNSS)
+    if placement is None:
+        return None
+    ready, ekf = _start_on_map(base.ready, base.ekf, placement), _for_fixes(base.ekf)
+    fits = dict(fits)
+    for sensor, rows in fits.items():
+        if isinstance(rows, Magnetometer):
+            fits[sensor] = rows._replace(direction=rows.direction + placement.yaw)
+    fits[GNSS] = placement.fixes(ready, ekf)
+    return _estimate(base._replace(ready=ready, ekf=ekf), readings, fits, run, placement)
+
+
+def _estimate(
+    base: Fused,
+    readings: dict[str, Readings],
+    fits: dict[str, Measurement],
+    run: Run,
+    placement: Placement | None = None,
 ) -> Fused:
-    """The track with these sensors. The reasons of those that cannot be used are added to
-    `refused`."""
-    measurements, before, origin, placement = dict[str, Measurement](), first, None, None
-    if BAROMETER in readings:
-        measurements |= _try(refused, BAROMETER, lambda: _heights(readings[BAROMETER], ready, ekf))
-    field: _Field | None = None
-    if MAGNETOMETER in readings:
-        rows = readings[MAGNETOMETER]
-        field = _try(refused, MAGNETOMETER, lambda: _field(rows, first, ready, ekf)).get(
-            MAGNETOMETER
-        )
-    if field is not None:
-        ready, ekf = ready._replace(start=field.start), _without_bias(ekf)
-        measurements[MAGNETOMETER] = field.rows
-    if GNSS in readings:
-        if field is not None:
-            before = run(_with_measurements(ready, measurements), ekf)
-        longest = FIRST_FIXES if field is None else math.inf
-        rows = readings[GNSS]
-        placement = _try(refused, GNSS, lambda: place_on_map(rows, before, longest)).get(GNSS)
-    if placement is not None:
-        ready, ekf, origin = _start_on_map(ready, ekf, placement), _for_fixes(ekf), placement.origin
-        if field is not None:
-            direction = field.rows.direction + placement.yaw
-            measurements[MAGNETOMETER] = field.rows._replace(direction=direction)
-        measurements[GNSS] = placement.fixes(ready, ekf)
-    if not measurements:
-        return Fused(first, ready, ekf, (), None)
-    estimate = run(_with_measurements(ready, measurements), ekf)
+    """The track with the measurements of these sensors. `base` has the estimate without them, the
+    start and the filter."""
+    if not fits:
+        return base
+    estimate = run(base.ready._replace(measurements=tuple(fits.values())), base.ekf)
     uses = []
-    for sensor in measurements:
+    for sensor in fits:
         accepted = estimate.accepted[NAMES[sensor]]
         accepted = accepted[np.isfinite(accepted)]
         share = float(accepted.mean()) if len(accepted) else 0.0
-        text = _describe(sensor, first, estimate, ready, placement)
+        text = _describe(sensor, base.estimate, estimate, base.ready, placement)
         uses.append(SensorUse(sensor, len(readings[sensor].time), share, text))
-    return Fused(estimate, ready, ekf, tuple(uses), origin)
+    origin = placement and placement.origin
+    return base._replace(estimate=estimate, uses=tuple(uses), origin=origin)
 
 
 def _try(refused: dict[str, str], sensor: str, make: Callable[[], Any]) -> dict[str, Any]:
@@ -200,12 +237,6 @@ def _try(refused: dict[str, str], sensor: str, make: Callable[[], Any]) -> dict[
     except InputError as error:
         refused[sensor] = str(error)
         return {}
-
-
-def _with_measurements(
-    ready: PreparedRecording, measurements: dict[str, Measurement]
-) -> PreparedRecording:
-    return ready._replace(measurements=tuple(measurements.values()))
 
 
 # --- barometer and magnetometer

@@ -35,7 +35,7 @@ from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.models import Network
 from gnio_jax.networks import TrainedNetwork, load_corrector
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Sequence
+from gnio_jax.types import Readings, Sequence
 
 NAMES = ("summary.json", "trajectory.txt", "track.png")
 """Files of every track."""
@@ -84,15 +84,7 @@ def track(
     readings = sensors.usable_readings(sequence, without)
     if sensors.GNSS not in readings:
         export.check_map(formats)
-    result, ready, ekf = estimate_recording(sequence, trained, progress)
-    uses, origin = (), None
-    if readings:
-        network = Network.of(trained.model, trained.variables)
-
-        def run(ready: PreparedRecording, ekf: Filter) -> SequenceEstimate:
-            return estimate([ready], network, config.data, ekf, 1)[0]
-
-        result, ready, ekf, uses, origin = sensors.fuse(result, ready, ekf, readings, run)
+    result, ready, ekf, uses, origin = estimate_recording(sequence, readings, trained, progress)
     compared = np.isfinite(result.reference.position).any() or result.waypoints is not None
     errors = metrics.score([result])[result.name].values if compared else {}
     summary = summarise(result, errors, ready, recording, trained, ekf, uses, origin)
@@ -119,14 +111,19 @@ def _check_results(
 
 
 def estimate_recording(
-    sequence: Sequence, trained: TrainedNetwork, progress: Progress = silent
-) -> tuple[SequenceEstimate, PreparedRecording, Filter]:
-    """The estimate of a recording, the recording as the filter took it, and the filter.
+    sequence: Sequence,
+    readings: dict[str, Readings],
+    trained: TrainedNetwork,
+    progress: Progress = silent,
+) -> sensors.Fused:
+    """The estimate of a recording with these readings of its other sensors, the recording as the
+    filter took it, and the filter.
 
-    The trajectory starts at the origin with yaw zero. The tilt at the start comes from the gravity
-    of the first second. The velocity is zero, with a standard deviation that depends on how quiet
-    that second is, and a rest at the start gives the gyro's bias. A reference is not used. Raises
-    `InputError` for a recording that is too short or has a hole that is too long.
+    The trajectory starts at the origin with yaw zero; with fixes, whose axes are east and north,
+    with the yaw that they show. The tilt at the start comes from the gravity of the first second.
+    The velocity is zero, with a standard deviation that depends on how quiet that second is, and a
+    rest at the start gives the gyro's bias. A reference is not used. Raises `InputError` for a
+    recording that is too short or has a hole that is too long.
     """
     _check_bridged(sequence)
     config = trained.config
@@ -146,8 +143,12 @@ def estimate_recording(
         considered = ekf.considered._replace(raw_gyro_bias=0.0)
         ekf = dataclasses.replace(ekf, considered=considered if any(considered) else None)
     network = Network.of(trained.model, trained.variables)
-    (result,) = estimate(ready, network, config.data, ekf, 1, progress)
-    return result, ready[0], ekf
+    (first,) = estimate(ready, network, config.data, ekf, 1, progress)
+
+    def run(ready: PreparedRecording, ekf: Filter) -> SequenceEstimate:
+        return estimate([ready], network, config.data, ekf, 1)[0]
+
+    return sensors.fuse(first, ready[0], ekf, readings, run)
 
 
 def _check_bridged(sequence: Sequence) -> None:

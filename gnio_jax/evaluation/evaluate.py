@@ -54,6 +54,9 @@ NAMED = {
     "checkpoint": "{}",
 }
 """Choices that are part of a folder's name if they are not the default."""
+LONGEST_NAME = 150
+"""Largest number of bytes of a folder's name, to which the name of a data root may be added. File
+systems allow 255, and for a file that is written beside it a few more are needed."""
 WINDOWS = ("rate", "window_seconds", "context_seconds", "stride_seconds", "window_rotation")
 """Settings of `DataConfig` on which the figures depend."""
 
@@ -254,7 +257,8 @@ def folder_of(path: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
     if config.data_root is None:
         return folder
     root = Path(config.data_root)
-    with_root = folder.with_name(f"{folder.name}_{root.name}-{zlib.crc32(bytes(root)):08x}-root")
+    of_root = root.name.encode()[:50].decode(errors="ignore")
+    with_root = folder.with_name(f"{folder.name}_{of_root}-{zlib.crc32(bytes(root)):08x}-root")
     try:
         metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         occupied = metrics["settings"]["data_root"] != config.data_root
@@ -265,7 +269,7 @@ def folder_of(path: Path, config: EvaluateConfig, run: TrainConfig) -> Path:
 
 def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     """<dataset>_<split>_<estimator>, then every choice of a resolved `config` other than the
-    default."""
+    default. What is beyond `LONGEST_NAME` becomes a digest of the whole name."""
     defaults = vars(EvaluateConfig(orientation=_default_orientation(config)))
     choices = vars(config)
     parts = [config.dataset, config.split, config.estimator]
@@ -278,7 +282,11 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
                 text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
                 text = text.replace("/", "-")  # the folder of a corrector
                 parts.append(f"{name}-{text}")
-    return "_".join(map(str, parts))
+    name = "_".join(map(str, parts))
+    if len(name.encode()) <= LONGEST_NAME:
+        return name
+    digest = f"_{zlib.crc32(name.encode()):08x}"
+    return name.encode()[: LONGEST_NAME - len(digest)].decode(errors="ignore") + digest
 
 
 def _describe_settings(

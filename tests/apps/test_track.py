@@ -326,7 +326,8 @@ def test_a_gap_that_the_filter_does_not_count_is_told(runs, std, counted):
     time = np.delete(np.arange(620), np.s_[300:330]) / 100
     network = read_network(runs / "walker")
     config = dataclasses.replace(network.config, filter=settings)
-    _, ready, ekf = estimate_recording(without_poses("walk", time), network._replace(config=config))
+    walk = without_poses("walk", time)
+    _, ready, ekf, *_ = estimate_recording(walk, {}, network._replace(config=config))
     warnings = _warnings_of_start(ready, Imported(without_poses("walk", time), (), ()), ekf)
     (gaps,) = [warning for warning in warnings if warning.startswith("gaps: ")]
     assert ("more so than the filter says" in gaps) == counted
@@ -335,7 +336,7 @@ def test_a_gap_that_the_filter_does_not_count_is_told(runs, std, counted):
 def test_a_track_that_diverged_has_no_expected_error(runs):
     walk = without_poses("walk", np.arange(620) / 100)
     network = read_network(runs / "walker")
-    estimate, ready, ekf = estimate_recording(walk, network)
+    estimate, ready, ekf, *_ = estimate_recording(walk, {}, network)
     given = ({}, ready, Imported(walk, (), ()), network, ekf)
     assert summarise(estimate, *given).expected_error > 0
     path = estimate.trajectory

@@ -4,17 +4,20 @@ and what wrong readings do not do."""
 import json
 import xml.etree.ElementTree as ElementTree
 
+import jax
 import numpy as np
 import pytest
 
+import gnio_jax
 from gnio_jax.apps import sensors
 from gnio_jax.apps.importing import Imported
-from gnio_jax.apps.track import track
+from gnio_jax.apps.track import estimate_recording, track
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import SequenceEstimate
+from gnio_jax.evaluation import SequenceEstimate, prepare
 from gnio_jax.evaluation.trajectory import Trajectory, read_tum
+from gnio_jax.filtering import magnetometer, make_filter
 from gnio_jax.networks import read_network
 from tests.support import drawn_run, phone_walk, tiny_run
 from tests.support.filter_settings import changed
@@ -149,6 +152,59 @@ def test_wrong_readings_change_nothing_or_are_left_out_with_a_reason(runs, tmp_p
         assert result.summary.origin is not None and np.median(error) < 40
 
 
+BAROMETER, MAGNETOMETER, FIX = "barometer", "magnetometer", "fix"
+
+
+@pytest.mark.parametrize(
+    "refused, sets",
+    [
+        ((), [(BAROMETER, MAGNETOMETER), (BAROMETER, MAGNETOMETER, FIX)]),
+        # The run without fixes is the result, and nothing is run again.
+        ((FIX,), [(BAROMETER, MAGNETOMETER), (BAROMETER, MAGNETOMETER, FIX)]),
+        # A magnetometer that the run without fixes refuses has no part in the one with fixes.
+        ((MAGNETOMETER,), [(BAROMETER, MAGNETOMETER), (BAROMETER, FIX)]),
+        (
+            (BAROMETER, FIX),
+            [(BAROMETER, MAGNETOMETER), (MAGNETOMETER,), (MAGNETOMETER, FIX)],
+        ),
+        (
+            (MAGNETOMETER, FIX),
+            [(BAROMETER, MAGNETOMETER), (BAROMETER, FIX), (BAROMETER,)],
+        ),
+    ],
+)
+def test_every_set_of_sensors_is_run_once_and_the_field_is_fitted_once(monkeypatch, refused, sets):
+    """A filter that returns the true path and refuses most measurements of some sensors."""
+    walk = phone_walk.walk()
+    ekf = make_filter(CONFIG.data, CONFIG.filter)
+    (ready,), _ = prepare([walk], CONFIG.data, ekf, init="static", from_first=True)
+    angle = phone_walk.TURN * ready.time
+    zero = np.zeros_like(angle)
+    turned = np.stack([np.cos(angle / 2), zero, zero, np.sin(angle / 2)], axis=1)
+    path = Trajectory(ready.time, phone_walk.place(ready.time), turned)
+    first, runs_of_the_filter, fits = SequenceEstimate("walk", path, path), [], []
+
+    def run(ready, _):
+        names = tuple(rows.name for rows in ready.measurements)
+        runs_of_the_filter.append(names)
+        share = {name: 0.2 if name in refused else 0.9 for name in names}
+        phase = np.linspace(0, 1, len(path.time))
+        return first._replace(accepted={name: 1.0 * (phase < share[name]) for name in names})
+
+    def fit_field(*arguments, **options):
+        fits.append(arguments)
+        return magnetometer.fit_field(*arguments, **options)
+
+    monkeypatch.setattr(sensors, "fit_field", fit_field)
+    fused = sensors.fuse(first, ready, ekf, walk.readings, run)
+    assert runs_of_the_filter == sets and len(fits) == 1
+    left_out = {sensors.NAMES[use.sensor] for use in fused.uses if use.accepted is None}
+    assert left_out == set(refused) and len(fused.uses) == 3
+    assert set(fused.estimate.accepted) == {BAROMETER, MAGNETOMETER, FIX} - left_out
+    assert (fused.origin is None) == (FIX in refused)
+    assert (fused.ready.start.gyro_bias == 0).all() == (MAGNETOMETER in refused)
+
+
 def test_a_recording_without_other_sensors_has_the_bytes_of_one_that_leaves_them_out(
     runs, tmp_path
 ):
@@ -178,6 +234,80 @@ def test_the_screen_says_what_each_sensor_did(gnio, mistake, runs, tmp_path, mon
     assert "nose" in mistake(*words, "--without", "nose")
     refused = mistake(*words, "--without", "gnss", "--format", "gpx")
     assert "--format: gpx needs the place of the start" in refused
+
+
+@pytest.fixture(scope="module")
+def arrays():
+    """The walk with a smaller bias of the gyro, and its arrays."""
+    walk = phone_walk.walk()
+    walk = walk._replace(gyro=walk.gyro - [0.0, 0.0, 0.007], attributes={"start_time": 1.7e9})
+    sensors = {
+        name: (1.7e9 + one.time, one.values, one.std)
+        if name == "gnss"
+        else (1.7e9 + one.time, one.values)
+        for name, one in walk.readings.items()
+    }
+    return walk, (1.7e9 + walk.time, walk.gyro, walk.accel), sensors
+
+
+def test_arrays_of_other_sensors_give_the_track_of_a_recording_with_them(runs, arrays):
+    walk, samples, readings = arrays
+    odometry = gnio_jax.track(*samples, network=runs / "pace", sensors=readings)
+    with jax.enable_x64(True):
+        expected = estimate_recording(walk, walk.readings, read_network(runs / "pace"))
+    position = expected.estimate.trajectory.position
+    # Unix time is rounded to a quarter of a microsecond, which the fit of the field enlarges.
+    np.testing.assert_allclose(odometry.position, position, atol=0.5)
+    assert odometry.origin is not None and expected.origin is not None
+    np.testing.assert_allclose(odometry.origin, expected.origin, rtol=0, atol=1e-5)
+    truth = phone_walk.on_map(odometry.time - 1.7e9)
+    assert np.median(np.linalg.norm((odometry.position - truth)[:, :2], axis=1)) < 15
+    used = [note for note in odometry.notes if "% of its measurements used" in note]
+    assert sorted(note.partition(":")[0] for note in used) == sorted(readings)
+
+
+def test_arrays_of_a_barometer_alone_in_any_order_give_the_height(runs, arrays):
+    _, samples, readings = arrays
+    time, pressure = (part[::-1] for part in readings["barometer"])
+    alone = {"barometer": (time, pressure[:, 0])}
+    odometry = gnio_jax.track(*samples, network=runs / "pace", sensors=alone)
+    truth = phone_walk.place(odometry.time - 1.7e9)[:, 2]
+    assert odometry.origin is None and np.abs(odometry.position[:, 2] - truth).max() < 2.0
+
+
+def part_of(readings, name, change):
+    time, values, *_ = readings[name]
+    return {name: change(time, values)}
+
+
+WRONG = {
+    "sensors: unknown sensor 'nose'": lambda r: {"nose": r["barometer"]},
+    "is no tuple of arrays": lambda r: {"barometer": r["barometer"][1]},
+    "too many or too few; give (time, values)": lambda r: {"barometer": r["gnss"]},
+    "shapes (240,), (240, 1), expected (f,) and (f, 3)": lambda r: {"magnetometer": r["barometer"]},
+    "no array of numbers": lambda r: {"barometer": (["x"], [1e5])},
+    "sensors['barometer']: field 'barometer' has a median": (
+        lambda r: part_of(r, "barometer", lambda time, values: (time, values / 100))
+    ),
+    "sensors['magnetometer']: field 'magnetometer' has a median": (
+        lambda r: part_of(r, "magnetometer", lambda time, values: (time, values / 100))
+    ),
+    "share nothing with the IMU's": (
+        lambda r: part_of(r, "barometer", lambda time, values: (time - 1.7e9, values))
+    ),
+    "field 'gnss' is NaN or Inf in row 1": (
+        lambda r: part_of(r, "gnss", lambda time, values: (time, np.nan * values))
+    ),
+}
+"""The message -> what is wrong with the readings."""
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_arrays_of_other_sensors_that_are_wrong_are_refused_before_any_run(message, arrays):
+    _, samples, readings = arrays
+    with pytest.raises(InputError) as error:
+        gnio_jax.track(*samples, network="no network", sensors=WRONG[message](readings))
+    assert message in str(error.value)
 
 
 def test_fixes_of_a_phone_that_stands_show_no_heading():

@@ -198,6 +198,7 @@ def test_uncertainties_of_the_filter_reach_the_stages(workdir, walks, monkeypatc
     assert arguments.get("least_std", 0.0) == pytest.approx(least)
 
 
+@pytest.mark.usefixtures("trained")
 def test_the_name_of_a_folder_has_the_choices():
     slower = changed(TRAINED.filter, start={"velocity": 0.5})
     loose = {"coupling": "loose", "orientation": "device", "init": "static"}
@@ -216,6 +217,27 @@ def test_the_name_of_a_folder_has_the_choices():
         assert folder_name(config, TRAINED) == f"synthetic_test_{name}"
 
 
+@pytest.mark.usefixtures("trained")
+def test_a_folder_of_many_choices_has_a_name_that_a_file_system_takes(tmp_path):
+    root = tmp_path / ("ä" * 100) / ("ö" * 120)
+    root.mkdir(parents=True)
+    car = "filter.measurements.nonholonomic"
+    numbers = ("lateral_std", "vertical_std", "yaw", "pitch", "roll", "lever_x", "lever_z")
+    folders = []
+    for last in (0.1, 0.2):
+        words = tuple(f"{car}.{number}=0.123456" for number in numbers)
+        words = (*words, "filter.start.tilt=0.0123", f"filter.start.accel_bias={last}")
+        options = EvaluateConfig("w", dataset="csv", data_root=str(root), set=words)
+        config = resolve(options, TRAINED)
+        folder = folder_of(tmp_path / "run", config, TRAINED)
+        write_report(folder, report_of({"a": 1.0}, {"a": "x"}, data_root="another", definitions=1))
+        folders += [folder, folder_of(tmp_path / "run", config, TRAINED)]
+    assert len(set(folders)) == 4
+    for folder in folders:
+        assert folder.name.startswith("csv_test_ekf_") and len(folder.name.encode()) < 230
+
+
+@pytest.mark.usefixtures("trained")
 def test_figures_of_other_recordings_keep_their_folder(tmp_path, monkeypatch):
     roots = [tmp_path / name / "csv" for name in "ABC"]
     for root in roots:
