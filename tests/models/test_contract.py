@@ -1,6 +1,7 @@
 """What every network promises: its size, options that are checked, float32, and finite gradients of
 every parameter."""
 
+import functools
 import typing
 
 import jax
@@ -131,6 +132,19 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
             assert np.abs(old - new).max() > 0, path
         else:  # constants of the uncertainty
             np.testing.assert_array_equal(old, new)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_inference_has_no_random_number(name):
+    """No key either, not even one that nothing reads: an export would have to convert it."""
+    model = models.create(name, **SMALL[name])
+    ready = jax.eval_shape(
+        functools.partial(models.inference_variables, model), models.variable_shapes(model, 40)
+    )
+    windows = jax.ShapeDtypeStruct((1, 40, models.channels(model)), jnp.float32)
+    program = str(jax.make_jaxpr(models.Inference(model))(ready, windows))
+    assert "dot_general" in program or name == "ai_imu"
+    assert "random" not in program and "threefry" not in program
 
 
 def test_options_that_cannot_be_are_refused():
