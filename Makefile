@@ -2,7 +2,7 @@
 # make test   install everything the tests need, and run them on every core
 # make test-all   the tests that are marked slow, too: continuous integration runs these
 # make lint   ruff and pyright
-# make pedestrian   the networks that come with gnio-jax anew, from Tyrex and Indoor Location below
+# make pedestrian   the network that comes with gnio-jax anew, from Tyrex and Indoor Location below
 #             $GNIO_DATA: an hour and a half on two cores
 # make docs   the documentation as a site, in site/index.html; its notebooks run
 # make links  ask every external link of the pages if it answers; needs a network
@@ -53,16 +53,14 @@ demo: $(VENV)/.package
 # for the network of half the width.
 pedestrian: $(VENV)/.package
 	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_calibrated
-	rm -rf $(RUNS)/pedestrian_outdoor $(RUNS)/pedestrian_outdoor_calibrated
 	rm -rf $(RUNS)/pedestrian_first $(RUNS)/pedestrian_first_calibrated
-	$(BIN)/gnio train --config pedestrian --model.width 16 --workdir $(RUNS)/pedestrian_first
+	$(BIN)/gnio train --config pedestrian --model.width 16 --workdir $(RUNS)/pedestrian_first \
+		--optim.epochs 4 --set augment.mirror_share=0 --set augment.rocking_share=0 \
+		--set "augment.vertical_gain=[1,1]"
 	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian_first
 	$(BIN)/gnio train --config pedestrian --workdir $(RUNS)/pedestrian \
 		--set data.poses_by=$(RUNS)/pedestrian_first_calibrated
 	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian --average-headings
-	$(BIN)/gnio train --config pedestrian_outdoor --workdir $(RUNS)/pedestrian_outdoor \
-		--set data.poses_by=$(RUNS)/pedestrian_first_calibrated
-	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian_outdoor --average-headings
 
 test: $(VENV)/.with-$(EXTRAS)
 	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) $(SHARED_OUT) -m 'not slow' $(PYTEST_ARGS)

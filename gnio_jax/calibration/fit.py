@@ -13,7 +13,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.optimize import minimize
 
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flatten
@@ -84,8 +84,12 @@ FAILED = 1e6
 NO_GATE = 1e9
 """Threshold of a χ² gate that accepts everything: a gate that rejects would favour a noise so small
 that everything is rejected."""
-INDEPENDENT_SECONDS = 10.0
-"""Time between errors of the position that count as independent relative to the prior, s (ours)."""
+TAIL = 4.0
+"""Degrees of freedom of the t distribution of heights (ours): a recording on which the filter is
+lost counts, but it does not decide the slope of all others."""
+TAIL_VARIANCE = 0.690567
+"""Squared scale of that distribution for normally distributed heights of variance 1: the c with
+E[(ν + 1) x² / (ν c + x²)] = 1. Then heights without outliers get their own slope."""
 LEAST_WINDOWS = 100
 """Smallest number of windows with a reference for which factors of the axes are fitted (ours)."""
 LEAST_FACTOR = 1e-3
@@ -329,38 +333,32 @@ class PositionErrors(NamedTuple):
     """S of the yaw; 0 with additive errors."""
     raw_axis: Float[np.ndarray, "k 3"]
     """As `considered_covariance` takes it."""
+    recording: Int[np.ndarray, "k"]
+    """Number of the recording."""
 
 
-def fit_considered(
-    positions: PositionErrors, stride_seconds: float, settings: FilterSettings
-) -> ConsiderFit:
-    """Maximum-likelihood consider standard deviations, given the errors of positions, one every
-    `stride_seconds`.
+def fit_considered(positions: PositionErrors, settings: FilterSettings) -> ConsiderFit:
+    """Most likely consider standard deviations, given the errors of positions.
 
-    The search always begins at `CONSIDERED`. Recordings with a raw gyro determine only the further
-    error of raw gyros, because the yaw that they lose would be attributed to the displacements. If
-    every recording has one, they determine the other errors, and `raw_gyro_bias` is 0 (ours).
-    Raises `InputError` if no position has a reference, or if there is no likelihood.
+    The search always begins at `CONSIDERED`. Recordings with a raw gyro determine only the slope
+    and the further error of raw gyros, because the yaw that they lose would be attributed to the
+    displacements. If every recording has one, they determine the other errors, and `raw_gyro_bias`
+    is 0. The slope is fitted last, to the heights of all recordings, which do not depend on the yaw
+    (all ours). Raises `InputError` if no position has a reference, or if there is no likelihood.
     """
     if not len(positions.error):
         raise InputError("the filter", "is not healthy where these recordings have a reference")
     raw = positions.raw_axis.any(axis=1)
     mixed = raw.any() and not raw.all()
+    others = PositionErrors(*(part[~raw] for part in positions)) if mixed else positions
     initial = CONSIDERED._replace(raw_gyro_bias=0.0)
-    fitted = _fit_considered_below(
-        PositionErrors(*(part[~raw] for part in positions)) if mixed else positions,
-        stride_seconds,
-        dataclasses.replace(settings, considered=initial),
-        "considered",
-    )
+    fitted = _fit_below("considered", others, initial, settings, gaussian_nll)
     if mixed:
         initial = fitted.considered._replace(raw_gyro_bias=CONSIDERED.raw_gyro_bias)
-        fitted = _fit_considered_below(
-            positions,
-            stride_seconds,
-            dataclasses.replace(settings, considered=initial),
-            "considered.raw_gyro_bias",
-        )
+        path = "considered.raw_gyro_bias"
+        fitted = _fit_below(path, positions, initial, settings, gaussian_nll)
+    initial = fitted.considered._replace(slope=CONSIDERED.slope)
+    fitted = _fit_below("considered.slope", positions, initial, settings, _height_nll)
     with_fitted = _add_considered(positions, fitted.considered)
     before, after = (
         float(jnp.mean(normalised_squares(positions.error, covariance))) / 3
@@ -369,18 +367,28 @@ def fit_considered(
     return ConsiderFit(fitted, before, after)
 
 
-def _fit_considered_below(
-    positions: PositionErrors, stride_seconds: float, settings: FilterSettings, path: str
+def _fit_below(
+    path: str,
+    positions: PositionErrors,
+    initial: ConsideredStd,
+    settings: FilterSettings,
+    nll: Callable[[Array, Array], Array],
 ) -> FilterSettings:
-    """`settings` with the most likely values of the numbers below `path`."""
+    """`settings` with the most likely values of the numbers below `path`, from `initial`. `nll`
+    gives the mean −log-likelihood of errors and covariances.
+
+    Each of these errors is constant while a recording lasts, so the positions of a recording count
+    together as one observation beside the prior.
+    """
+    settings = dataclasses.replace(settings, considered=initial)
     free = free_parameters(settings, [path])
     names, start = tuple(free), np.array(list(free.values()))
-    independent = len(positions.error) * stride_seconds / INDEPENDENT_SECONDS
+    recordings = len(np.unique(positions.recording))
 
     def objective(free: Float[Array, "u"]) -> Array:
         std = with_free_parameters(settings, dict(zip(names, free, strict=True))).considered
-        likelihood = gaussian_nll(positions.error, _add_considered(positions, std))
-        return likelihood + _prior(free, start) / independent
+        likelihood = nll(positions.error, _add_considered(positions, std))
+        return likelihood + _prior(free, start) / recordings
 
     compiled = jax.jit(jax.value_and_grad(objective))
     search = minimize(
@@ -389,6 +397,16 @@ def _fit_considered_below(
     if not np.isfinite(search.fun):
         raise InputError("the filter", "has no positive definite covariance on these recordings")
     return with_written_parameters(settings, dict(zip(names, search.x, strict=True)), DIGITS)
+
+
+def _height_nll(
+    error: Float[Array, "k 3"], covariance: Float[Array, "k 3 3"]
+) -> Float[jax.Array, ""]:
+    """Mean of −ln t(e_z; 0, c P_zz) with `TAIL` degrees of freedom and c of `TAIL_VARIANCE`,
+    without its constant."""
+    variance = TAIL_VARIANCE * covariance[:, 2, 2]
+    normalised = error[:, 2] ** 2 / (TAIL * variance)
+    return jnp.mean((TAIL + 1) / 2 * jnp.log1p(normalised) + 0.5 * jnp.log(variance))
 
 
 def _add_considered(positions: PositionErrors, std: ConsideredStd) -> Array:
@@ -417,7 +435,8 @@ def compare_positions(
     healthy, position, *parts = jax.device_get(_run_walks(walks, settings, windows=windows))
     error = truth - position
     compared = np.isfinite(error).all(axis=2) & (healthy > 0)
-    return PositionErrors(*(part[compared] for part in (error, *parts)))
+    recording = np.broadcast_to(np.arange(len(error))[:, None], compared.shape)
+    return PositionErrors(*(part[compared] for part in (error, *parts, recording)))
 
 
 @functools.partial(jax.jit, static_argnames="windows")

@@ -132,7 +132,7 @@ def calibrate(
     references = (recording.reference.position[1:] for recording in recordings)
     truth = np.stack([filled_up(reference, strides, np.nan) for reference in references])
     positions = compare_positions(walks, truth, windows, innovation_fit.settings)
-    consider_fit = fit_considered(positions, windows.stride_seconds, innovation_fit.settings)
+    consider_fit = fit_considered(positions, innovation_fit.settings)
     progress("comparing", 0.0)
     before = run.config.filter
     effect = compare_filters(recordings, displacements, windows, before, consider_fit.settings)

@@ -33,7 +33,8 @@ NETWORKS = {
 }
 """Networks of --model.name, in the order of the help, and what each is."""
 DATASETS = ("blackbird", "comma2k19", "csv", "euroc", "idol", "indoor_location", "kitti")
-DATASETS += ("onavdata", "oxiod", "ridi", "ronin", "synthetic", "tlio", "tumvi", "tyrex")
+DATASETS += ("onavdata", "oxiod", "pedlocdata", "ridi", "ronin", "synthetic", "tlio", "tumvi")
+DATASETS += ("tyrex",)
 """Datasets of --dataset."""
 
 

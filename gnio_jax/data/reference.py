@@ -278,14 +278,25 @@ def smooth_positions(
     for a in range(4):
         for b in range(a, 4):
             smoothness[3 - (b - a), b : count - 3 + b] += stencil[a] * stencil[b]
-    smoothness *= (2.0 * np.sin(np.pi * cutoff * step)) ** -6
+    stiffness = (2.0 * np.sin(np.pi * cutoff * step)) ** -6
+    smoothness *= stiffness
     filled = np.where(usable[:, None], position, 0.0)
+    # Where nothing was measured a straight line counts a little, so that the system can be solved
+    # in double precision at any rate. Its largest eigenvalue is 64 times the stiffness.
+    little = max(1e-9, 100 * np.finfo(float).eps * 64 * stiffness)
+    rows = np.arange(count)
+    line = np.column_stack(
+        [
+            np.interp(rows, rows[usable], axis[usable]) if usable.any() else 0 * axis
+            for axis in filled.T
+        ]
+    )
     weight = usable.astype(float)
     smoothed = filled
     for _ in range(5):
         system = smoothness.copy()
-        system[-1] += weight + 1e-9  # the diagonal
-        smoothed = solveh_banded(system, weight[:, None] * filled)
+        system[-1] += weight + little  # the diagonal
+        smoothed = solveh_banded(system, weight[:, None] * filled + little * line)
         distance = np.linalg.norm(filled - smoothed, axis=1)
         scale = max(4.0 * float(np.median(distance[usable])), 2e-3) if usable.any() else 1.0
         weight = usable / (1.0 + (distance / scale) ** 2) ** 2

@@ -123,6 +123,7 @@ def estimate(
     if ekf is None:
         assert not isinstance(source, Network)
         return [integrate(*pair, windows) for pair in zip(recordings, source, strict=True)]
+    # `_run` takes the displacements where the network has no `apply`.
     network, displacements = (
         (source, None) if isinstance(source, Network) else (Network(None, None), source)
     )

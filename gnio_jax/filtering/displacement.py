@@ -18,7 +18,7 @@ entries instead of 3 W.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar, no_type_check
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +50,6 @@ GIMBAL = 1e-5
 expressed in a given frame is not used."""
 
 
-@no_type_check  # A tree may hold anything, and the tests' run-time checker would refuse it.
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Displacement:
@@ -161,7 +160,7 @@ def linearise_displacement(
 def _predict_velocity(
     state: FilterState, config: FilterConfig
 ) -> tuple[Float[Array, "3"], dict[str, Array]]:
-    """T Rᵀ v and its derivatives."""
+    """N dt Rᵀ v, the velocity in the body in metres per window, and its derivatives."""
     to_body = config.window * config.dt * state.rotation.T
     moved = geometry.matmul(to_body, state.velocity[:, None])[:, 0]
     by_turn = geometry.matmul(to_body, geometry.hat(state.velocity))

@@ -5,19 +5,18 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, no_type_check
+from typing import Any
 
 import jax
 from jax.core import Tracer
 
 from gnio_jax.config import ConsideredStd, DataConfig, FilterSettings, InitialStd, NoiseModel
-from gnio_jax.config.schema import TLIO_STD, Location
+from gnio_jax.config.schema import TLIO_STD, Location, Number
 from gnio_jax.filtering.measurements import create_measurements
 from gnio_jax.filtering.settings import FilterConfig, filter_config
 from gnio_jax.filtering.update import Measurement
 
 
-@no_type_check  # A tree may hold anything, and the tests' run-time checker would refuse it.
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Filter:
@@ -34,7 +33,7 @@ class Filter:
     """Standard deviations of the initial state."""
     considered: ConsideredStd | None = None
     """Standard deviations of errors that are not estimated (`consider`); None: there are none."""
-    raw_gyro_bias: float | None = None
+    raw_gyro_bias: Number | None = None
     """Standard deviation of the first bias of a gyro whose phone subtracts no bias, rad/s; None:
     that of `start`."""
     measurements: tuple[Measurement, ...] = ()

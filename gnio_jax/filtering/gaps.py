@@ -39,7 +39,7 @@ class Gap(NamedTuple):
 
 
 class Imu(NamedTuple):
-    """A stream of samples without holes, with their biases."""
+    """A stream of raw samples without holes: no bias is subtracted from them."""
 
     gyro: Float[Array, "*n 3"]
     """rad/s"""
@@ -51,7 +51,8 @@ class Imu(NamedTuple):
     """Variances of the errors of [accel, gyro] in the place of the filter's densities, (m/s²)² and
     (rad/s)², of corrected samples; None: the densities hold."""
     output: tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]] | None = None
-    """Gyro and accel behind the low-pass of the IMU, where it was undone; else None."""
+    """Gyro and accel as the IMU gave them, where its low-pass was undone in those above; else
+    None."""
 
 
 def no_gap(n: int, dtype: np.dtype) -> Gap:

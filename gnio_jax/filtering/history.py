@@ -94,8 +94,8 @@ class FilterHistory(NamedTuple):
 
 
 def explain_failure(history: FilterHistory, config: FilterConfig) -> str:
-    """The reason why the first row that is not healthy is not, in words; empty if all rows of this
-    one run are healthy."""
+    """The cause of the first row that is not healthy, in words; empty if all rows of this run are
+    healthy."""
     healthy = np.asarray(history.healthy) > 0
     if healthy.all():
         return ""

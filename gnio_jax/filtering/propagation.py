@@ -72,17 +72,17 @@ def integrate(start: Mean, imu: Imu, noise: NoiseModel, dt: float) -> Interval:
     """
     n, dtype = imu.gyro.shape[0], imu.gyro.dtype
     gap = no_gap(n, dtype) if imu.gap is None else imu.gap
-    # From the middle of each sample to the end of the interval, s.
-    lever = ((n - 0.5 - np.arange(n)) * dt).astype(dtype)
+    # From the middle of each sample, s.
+    time_to_end = ((n - 0.5 - np.arange(n)) * dt).astype(dtype)
     tail = np.tril(np.ones((n, n), dtype))  # x @ tail sums x over the samples from m on
 
     turns = (imu.gyro - start.gyro_bias[None]) * dt * gap.used[:, None]
-    pushes = (imu.accel - start.accel_bias[None]) * dt * gap.used[:, None]
+    body_steps = (imu.accel - start.accel_bias[None]) * dt * gap.used[:, None]
     rotations = geometry.integrate_turns(start.rotation, turns)
     before, after = rotations[:, :, :-1], rotations[:, :, 1:]
-    velocity_steps = matmul(before, pushes.T[:, None])[:, 0]  # Δv of every sample
+    velocity_steps = matmul(before, body_steps.T[:, None])[:, 0]  # Δv of every sample
     # Σ_{l≥m} Δv_l for m = 0 … n − 1, then Σ_{l≥m} (n − l − ½) dt Δv_l.
-    sums = velocity_steps @ np.concatenate([tail, lever[:, None] * tail], axis=1)
+    sums = velocity_steps @ np.concatenate([tail, time_to_end[:, None] * tail], axis=1)
     by_tilt = -jax.vmap(geometry.hat, in_axes=1, out_axes=2)(sums).reshape(3, 3, 2, n)
 
     # N_l over θ, v, p. The noise of the gyro turns every later Δv; that of the accelerometer adds
@@ -94,7 +94,7 @@ def integrate(start: Mean, imu: Imu, noise: NoiseModel, dt: float) -> Interval:
     theta = dt * geometry.contract_right(after, right_jacobians)
     of_gyro = [theta, matmul(later[:, :, 0], theta), matmul(later[:, :, 1], theta)]
     velocity = dt * before
-    of_accel = [jnp.zeros_like(velocity), velocity, lever[None, None] * velocity]
+    of_accel = [jnp.zeros_like(velocity), velocity, time_to_end[None, None] * velocity]
     effect = jnp.concatenate([jnp.concatenate(of_gyro), jnp.concatenate(of_accel)], axis=1)
     by_bias = -(effect * gap.used[None, None]).reshape(9 * 6, n) @ tail  # Φ_m[:, b]
     by_bias = by_bias.reshape(9, 6, n)
@@ -107,7 +107,7 @@ def integrate(start: Mean, imu: Imu, noise: NoiseModel, dt: float) -> Interval:
     return Interval(
         rotation=geometry.orthonormalize(rotations[:, :, -1]),
         velocity=start.velocity + sums[:, 0] + gravity * dt * jnp.sum(gap.used),
-        position=position + sums[:, n] + gravity * dt * (lever @ gap.used),
+        position=position + sums[:, n] + gravity * dt * (time_to_end @ gap.used),
         transition=jnp.concatenate([by_theta, by_velocity_position, by_bias[:, :, 0]], axis=1),
         noise=_interval_noise(effect, by_bias[:, :, 1:], gap, imu.variance, noise, dt),
     )

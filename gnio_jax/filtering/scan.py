@@ -187,8 +187,8 @@ def run_odometry(
                 lambda signal: jax.lax.dynamic_slice_in_dim(signal, first, config.reach), stream
             )
 
-        # From a start the scan's own counter is the same for every sequence of a batch, so this
-        # remains a branch under vmap.
+        # In a run from a start the scan's counter decides, which is one number for the whole batch.
+        # So this remains a branch under vmap. `state.step` is a number for each sequence.
         number_since_start = number + inputs.state.step if begun else number
         return of_window(number_since_start >= config.first_measured, latest, state, oldest)
 

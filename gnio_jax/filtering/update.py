@@ -136,8 +136,8 @@ class Step(NamedTuple):
     config: FilterConfig
     noise: NoiseModel
     before: Mapping[str, Outcome] = MappingProxyType({})
-    """Outcomes of the measurements of this interval before this one, by their names; the first is
-    the displacement."""
+    """Outcomes, by name, of the measurements that this interval has already taken; the first is
+    that of the displacement."""
     diagnostics: Mapping[str, Array] = MappingProxyType({})
     """The network's diagnostics by their names; NaN where it was not called."""
 

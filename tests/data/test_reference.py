@@ -1,10 +1,11 @@
 """A noisy tracker's poses on the clock of an IMU, against a walk in closed form."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import numerics
-from gnio_jax.data.reference import Poses, reference_at
+from gnio_jax.data.reference import Poses, reference_at, smooth_positions
 from gnio_jax.numerics import rotations
 from tests.support import known_walk as walk
 
@@ -40,3 +41,27 @@ def test_a_loss_and_a_flip_of_a_second_do_not_reach_their_surroundings():
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.05
     far = np.concatenate([np.arange(-10.0, -5.0, 1 / 60.0), np.arange(35.0, 40.0, 1 / 60.0)])
     assert not reference_at(CLOCK, walk.rate(CLOCK), tracked(far)).valid.any()
+
+
+@pytest.mark.parametrize("rate", [100.0, 500.0, 1000.0, 2000.0])
+def test_holes_in_fast_recordings_are_bridged(rate):
+    """The smoothest motion through a hole of half a second, at every rate of an IMU: the positions
+    on either side do not change, and the bridge is near the walk."""
+    time = np.arange(round(6 * rate)) / rate
+    axes = 30 + 1.2 * time, 0.3 * np.sin(2.0 * time) - 20, 0.02 * np.sin(9.0 * time) + 5
+    truth = np.stack(axes, axis=1)
+    usable = np.abs(time - 3.0) > 0.25
+    smoothed, velocity, used = smooth_positions(truth, usable, 1 / rate)
+    assert (used == usable).all()
+    np.testing.assert_allclose(smoothed[usable], truth[usable], atol=2e-3)
+    assert np.abs(smoothed - truth).max() < 0.05  # 5 mm at 200 Hz
+    expected = np.stack(
+        [1.2 + 0 * time, 0.6 * np.cos(2.0 * time), 0.18 * np.cos(9.0 * time)], axis=1
+    )
+    near = (np.abs(time - 3.0) > 0.5) & (time > 0.5) & (time < 5.5)
+    np.testing.assert_allclose(velocity[near], expected[near], atol=0.02)
+
+
+def test_a_recording_of_a_kilohertz_without_a_usable_position_is_zero():
+    smoothed, _, used = smooth_positions(np.ones((3000, 3)), np.zeros(3000, bool), 1e-3)
+    assert not used.any() and not smoothed.any()

@@ -173,7 +173,7 @@ def test_a_displacement_that_turns_with_its_frame_has_a_derivative_at_any_pitch(
     exact = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     rotation = exact if pitch == np.pi / 2 else Rotation.from_euler("y", pitch).as_matrix()
     rotation = Rotation.from_euler("z", 0.3).as_matrix() @ rotation
-    measured = Displacement(np.zeros(3), np.eye(3), np.bool_(True), "turning")
+    measured = Displacement(np.zeros(3), np.eye(3), jnp.bool_(True), "turning")
 
     def residual(turn):
         state = walking_state(geometry.exp(turn) @ rotation, moved)

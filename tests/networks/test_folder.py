@@ -201,12 +201,16 @@ def test_a_zip_that_unpacks_to_more_than_its_card_says_is_not_unpacked(published
     assert peak < 1 << 22
 
 
-def with_nan(content):
+def with_nan(content, _):
     """Weights whose last number is NaN: a network of them would track to nowhere."""
     return content[:-4] + np.float32(np.nan).tobytes()
 
 
-def of_another_network(_):
+def wider(_, variables):
+    return folder.to_bytes(jax.tree.map(lambda array: np.stack([array, array], -1), variables))
+
+
+def of_another_network(_, __):
     return folder.to_bytes({"params": {"head": {"kernel": np.zeros((4, 3), np.float32)}}})
 
 
@@ -215,11 +219,18 @@ def of_another_network(_):
     [
         (with_nan, ["holds values that are not finite; take another network, or train it again"]),
         (of_another_network, ["'batch_stats/norm/mean' has shape None", "[4]"]),
+        (wider, ["has shape [4, 2], and in the configured network [4]"]),
+        *(
+            (lambda content, _, end=end: content[:end], ["weights.safetensors: cannot be read"])
+            for end in (0, 5, 100, -1)
+        ),
     ],
 )
-def test_weights_that_no_network_has_are_refused(package, change, words):
-    with_file(package, WEIGHTS, change((package / WEIGHTS).read_bytes()))
-    refused(package, *words)
+def test_weights_that_no_network_has_are_refused(run, tmp_path, change, words):
+    copy = shutil.copytree(run, tmp_path / "walk")
+    content = change((copy / WEIGHTS).read_bytes(), read_network(run).variables)
+    (copy / WEIGHTS).write_bytes(content)
+    refused(copy, *words)
 
 
 def test_the_text_of_a_card_may_be_edited(package, run):

@@ -100,8 +100,8 @@ def _whole(path: Path) -> Path:
     if not path.is_file() or sensor_named(path.name) is None:
         return path
     sensors = {sensor_named(file.name) for file in folder.glob(f"*{path.suffix}")}
-    is_alone = not {*GYRO, *ACCEL} <= set(resolve_labels(files_of(path)[0].layout.labels))
-    return folder if is_alone and {"gyro", "accel"} <= sensors else path
+    holds_one = not {*GYRO, *ACCEL} <= set(resolve_labels(files_of(path)[0].layout.labels))
+    return folder if holds_one and {"gyro", "accel"} <= sensors else path
 
 
 def _recognise(path: Path) -> str:

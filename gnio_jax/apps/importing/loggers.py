@@ -77,8 +77,11 @@ OTHERS = {
 }
 """Sensor Logger's files of sensors beside the IMU: the sensor and its unit. Of two files of one
 sensor the first one is taken."""
-REMEDY = "record the gyroscope and the accelerometer with gravity"
-REMEDY += " (Sensor Logger: switch on Accelerometer and Gravity)"
+REMEDIES = {
+    "Sensor Logger": "switch on Gyroscope, Accelerometer and Gravity",
+    "phyphox": "record the experiment 'Acceleration (with g)' with the gyroscope beside it",
+}
+"""What each app's user does if a sensor is missing, by the first words of the app's name."""
 
 
 class _Set(NamedTuple):
@@ -284,9 +287,10 @@ def _recording(
     """The gyro, and the accelerometer with gravity: from a set of its own, or as the sum of the set
     without gravity and that of gravity."""
     kinds = {one.kind for one in sets}
+    remedy = next(remedy for name, remedy in REMEDIES.items() if app.startswith(name))
     for sensor, needed in (("gyro", {"gyro"}), ("accelerometer", {"accel", "linear", "raw"})):
         if not kinds & needed:
-            raise InputError(path, f"has no {sensor} (found: {spell_names(files)})", REMEDY)
+            raise InputError(path, f"has no {sensor} (found: {spell_names(files)})", remedy)
     gyro = _require_one("gyro", sets, path)
     if "accel" in kinds:
         parts = [_require_one("accel", sets, path)]
@@ -296,7 +300,7 @@ def _recording(
         parts = [_require_one("raw", sets, path)]
     else:
         name = next(one.file.name for one in sets if one.kind == "linear")
-        raise InputError(path, f"holds acceleration without gravity ({name})", REMEDY)
+        raise InputError(path, f"holds acceleration without gravity ({name})", remedy)
     accel = parts[0].sensor("accel")
     if len(parts) > 1:
         accel = _add_gravity(accel, parts[1].sensor("accel"))

@@ -26,6 +26,8 @@ from gnio_jax.types import Sequence
 
 GAPS = "lacks samples"
 """Words in a note about holes in a recording."""
+WORTH_TELLING = 0.05
+"""Time at both ends for which only one sensor has samples, beyond which a note has it, s (ours)."""
 SLOW = 50.0
 """Rate below which the impacts of steps are lost, Hz; networks are trained on 100 Hz and more
 (ours)."""
@@ -85,8 +87,9 @@ def as_sequence(
     gyro, accel = _in_si(raw, options, gyro, accel)
     if not np.array_equal(gyro.time, accel.time):
         lost = sum(abs(gyro.time[row] - accel.time[row]) for row in (0, -1))
-        problem = "gyro and accel have different stamps: both are interpolated to one clock, and"
-        notes.append(f"{problem} {lost:.2f} s that only one of them covers are cut off")
+        note = "gyro and accel have different stamps: both are interpolated to one clock"
+        cut = f", and {lost:.2f} s that only one of them covers are cut off"
+        notes.append(note + cut if lost >= WORTH_TELLING else note)
     recorded = max(rounded_rate(gyro.time), rounded_rate(accel.time))
     notes.append(f"put on a uniform clock of {rate or recorded:g} Hz")
     if recorded < SLOW:
@@ -118,6 +121,7 @@ def _in_si(
     accel = accel._replace(values=accel.values * scale)
     rows, is_slower = physics.repeats(gyro.time, gyro.values)
     force = interpolate(gyro.time, accel.time, accel.values)
+    # Some gyros read 0 at rest: these rows are measured.
     rows &= ~physics.find_rest(physics.ImuSamples(gyro.time, gyro.values, force), rows)
     gyro = _without_repeats(gyro, rows, is_slower, raw)
     accel = _without_repeats(accel, *physics.repeats(accel.time, accel.values), raw)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gnio_jax.apps.importing import read_imported
-from gnio_jax.apps.importing.loggers import REMEDY
+from gnio_jax.apps.importing.loggers import REMEDIES
 from gnio_jax.apps.live.checks import Nature
 from gnio_jax.apps.live.inbox import Inbox, read_stream, receive_datagrams
 from gnio_jax.apps.live.phyphox import Phyphox, PhyphoxRows
@@ -97,7 +97,9 @@ def sensor_logger(name: str, stated: Stated) -> Source:
     server.run()
     phone = SensorLogger(name, stated.units, stated.accel_sign)
     # What comes without a stated sign is Android's: see SensorLogger.
-    nature = Nature(name, stated.imu_rate, stated.accel_sign or "android", REMEDY)
+    nature = Nature(
+        name, stated.imu_rate, stated.accel_sign or "android", REMEDIES["Sensor Logger"]
+    )
     remarks = (
         f"in Sensor Logger: Settings, Data Streaming, HTTP Push, push to {server.address}data",
     )
@@ -110,7 +112,7 @@ def sensor_logger(name: str, stated: Stated) -> Source:
 def phyphox(name: str, stated: Stated) -> Source:
     """The rows of an experiment of phyphox at phyphox:ADDRESS, by its remote access."""
     phone, inbox = Phyphox(name.partition(":")[2], name), Inbox(name)
-    nature = Nature(name, stated.imu_rate, stated.accel_sign or "android", REMEDY)
+    nature = Nature(name, stated.imu_rate, stated.accel_sign or "android", REMEDIES["phyphox"])
 
     def arrivals() -> Iterator[Arrival]:
         phone.run(inbox)

@@ -72,6 +72,17 @@ def test_sensor_logger(tmp_path, platform, standardised, dropped, words):
     assert sequence.attributes["start_time"] - EPOCH * 1e-9 == pytest.approx(0.01, abs=1e-6)
 
 
+@pytest.mark.parametrize("late, words", [(0.0, False), (0.3, True)])
+def test_a_note_has_the_time_of_one_sensor_alone_if_it_is_worth_telling(tmp_path, late, words):
+    members = sensor_logger()
+    header, *rows = members["TotalAcceleration.csv"].splitlines()
+    rows = rows[round(100 * late) :]
+    members["TotalAcceleration.csv"] = "\n".join([header, *rows]) + "\n"
+    _, notes = import_recording(zipped(tmp_path / "walk.zip", members))
+    (note,) = (note for note in notes if "different stamps" in note)
+    assert ("s that only one of them covers are cut off" in note) == words
+
+
 def test_the_metadata_tell_the_sign_or_it_must_be_stated(tmp_path):
     unknown = "the sign of field 'accel' depends on the phone's system.*android, ios or detect"
     path = zipped(tmp_path / "walk.zip", without(sensor_logger("ios"), "Metadata.csv"))
@@ -102,7 +113,7 @@ def test_the_metadata_tell_the_sign_or_it_must_be_stated(tmp_path):
         (without(sensor_logger(), "Gyroscope.csv"), "has no gyro .found: Accelerometer.csv, .*; "),
         (
             without(sensor_logger("ios"), "Gravity.csv", "AccelerometerUncalibrated.csv"),
-            "walk.zip: holds acceleration without gravity .Accelerometer.csv.; record .* Gravity",
+            "walk.zip: holds acceleration without gravity .Accelerometer.csv.; switch .* Gravity",
         ),
         (
             {f"{day}/{name}": text for day in "ab" for name, text in sensor_logger().items()},
@@ -172,7 +183,10 @@ def test_phyphox_in_one_file(tmp_path):
     np.testing.assert_allclose(sequence.gyro, known_walk.rate(sequence.time), atol=1e-8)
     np.testing.assert_allclose(sequence.accel, known_walk.force(sequence.time), atol=1e-8)
     (tmp_path / "gyro.csv").write_text(phyphox()["Gyroscope.csv"])
-    refused(tmp_path / "gyro.csv", "gyro.csv: has no accelerometer .found: gyro.csv.; record")
+    refused(
+        tmp_path / "gyro.csv",
+        "gyro.csv: has no accelerometer .found: gyro.csv.; record the experiment",
+    )
     refused(tmp_path / "gyro.csv", "gyro.csv: has no topics", imu_topic="/imu")
 
 
@@ -274,7 +288,7 @@ def test_phyphox_of_an_earlier_release_in_another_language_in_degrees(tmp_path):
     words = "holds 2 sets of a sensor: .*; leave the table of one of them in it"
     refused(zipped(path, phyphox(sets=sets | second)), words)
     del sets["Beschleunigung"]
-    words = "walk.zip: holds acceleration without gravity .Linear Accelerometer.csv.; record"
+    words = "walk.zip: holds acceleration without gravity .Linear Accelerometer.csv.; record the"
     refused(zipped(path, phyphox(sets=sets)), words)
     # Gravity is found by its stamps, in any order.
     for rows in (slice(None), np.random.default_rng(0).permutation(len(later))):

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import pickle
+import zipfile
 
 import numpy as np
 import pytest
@@ -115,6 +116,32 @@ def written_as(whole):
     return text(lambda _: whole)
 
 
+def array(change):
+    """Of an array of NumPy whose file has no suffix."""
+
+    def apply(_, content):
+        out = io.BytesIO()
+        np.save(out, change(np.load(io.BytesIO(content))))
+        return out.getvalue()
+
+    return apply
+
+
+def in_zip(old, new):
+    """In the text of the only file of a zip."""
+
+    def apply(_, content):
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            (name,) = archive.namelist()
+            whole = archive.read(name).decode().replace(old, new)
+        out = io.BytesIO()
+        with zipfile.ZipFile(out, "w") as archive:
+            archive.writestr(name, whole)
+        return out.getvalue()
+
+    return apply
+
+
 def track(change):
     """Of the struct in a MATLAB file."""
 
@@ -164,6 +191,7 @@ def few_poses(table):
 
 HALF_POSE = f"T_BS: [{', '.join(['0.5'] * 16)}]\n"
 HALF = text(lambda whole: whole[: len(whole) // 2])
+HALF_BYTES = lambda _, content: content[: len(content) // 2]  # noqa: E731
 BLANK_STAMPS = lines(lambda rows: ["" for _ in rows[1:]] + rows[:1])
 NARROWER = cells(lambda table: table[:, :-1])
 NO_CELL = lines(lambda rows: rows[:1] + [row[: row.rindex(" ")] for row in rows[1:]])
@@ -253,6 +281,22 @@ BAD = {
         ("timestamps.txt", BLANK_STAMPS, "gives 1 packets a stamp"),
     ],
     "kitti npz": [(".npz", times("t", 10), "field 'time'", "10 Hz", "_extract")],
+    "comma2k19": [
+        ("gyro/value", array(lambda x: x[:-1]), "rows, but there are"),
+        ("gyro/value", array(lambda x: x[:, :2]), "expected (n, 3)"),
+        ("gyro/value", None, "no such file"),
+        ("accelerometer/t", array(lambda x: x * np.nan), "row 0 is not finite"),
+        ("frame_positions", array(lambda x: 0.5 * x), "not near the earth's surface"),
+        ("frame_orientations", array(lambda x: 2 * x), "not of length 1"),
+        ("frame_times", array(lambda x: x.astype(str)), "expected (n,)"),
+    ],
+    "onavdata": [
+        ("position.csv.zip", in_zip("Latitude", "Lat"), "'Latitude' is missing"),
+        ("position.csv.zip", in_zip(",0.78", ",45.78"), "is not an angle in rad"),
+        ("position.csv.zip", None, "no such file"),
+        ("velocity.csv.zip", HALF_BYTES, "cannot be read as a zip"),
+        ("attitude.csv.zip", in_zip(",4.0", ",1.0"), "holds 0 rows with a stamp"),
+    ],
     "blackbird": [
         (".hdf5", put("traj_target", (7, slice(3, 7)), 0.0), "not a unit quaternion", "row 8"),
         ("imu.txt", lines(lambda rows: rows[:-5]), "'ts'", "695 and 700 rows"),

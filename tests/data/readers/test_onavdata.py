@@ -1,8 +1,6 @@
 """onavdata: a known motion must come back from its increments and its angles, and damaged files are
 refused."""
 
-import zipfile
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -28,28 +26,6 @@ def test_a_drive_comes_back(tmp_path):
     )
     origin = known_walk.position(np.zeros(1))
     known_walk.compare(level, sequence.time, speed=2e-2, origin=origin)
-
-
-@pytest.mark.parametrize(
-    "name, change, words",
-    [
-        ("position", lambda text: text.replace("Latitude", "Lat"), "'Latitude' is missing"),
-        ("velocity", lambda text: text[: len(text) // 2] + "\nx,y\n", "cannot be read as a zip"),
-        ("attitude", lambda text: text.replace(",4.0", ",1.0"), "holds 0 rows with a stamp"),
-        ("position", lambda text: text.replace(",0.78", ",45.78"), "is not an angle in rad"),
-    ],
-)
-def test_damaged_tables_are_refused(tmp_path, name, change, words):
-    path = files.write(tmp_path, 8.0) / f"n380-{name}.csv.zip"
-    with zipfile.ZipFile(path) as archive:
-        text = archive.read(f"n380-{name}.csv").decode()
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(f"n380-{name}.csv", change(text))
-    with pytest.raises(InputError, match=words):
-        onavdata.read(path.parent)
-    path.unlink()
-    with pytest.raises(InputError, match="no such file"):
-        onavdata.read(path.parent)
 
 
 def test_tables_that_share_no_stamp_are_refused(tmp_path):
