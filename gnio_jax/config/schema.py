@@ -304,6 +304,9 @@ class ModelConfig:
     output_dim: Literal[2, 3] | None = None
     """Dimensions of the displacement: 3, or 2 without the vertical, as published (ronin_resnet,
     deepils, ctin, imot, ionext)."""
+    normalisation: Literal["batch", "group"] | None = None
+    """Normalisation of the convolutions (ronin_resnet: batch). group is that of RIO: over the
+    samples of one window and 32 groups of channels, alike in training and inference."""
     equivariance: Literal[
         "none", "four_headings", "canonical_frame", "o2_frame", "so2_frame", "so2_frame_shallow"
     ] = "none"

@@ -180,7 +180,11 @@ class TemporalEmbedding(nn.Module):
         positions = self.param(
             "positions", nn.initializers.normal(0.02), (windows.shape[1], self.width), jnp.float32
         )
-        return jnp.add(nn.Bidirectional(forward, backward)(windows), positions[None])
+        # Flax's own initial carry is zero too, but it splits a random key, which no export
+        # converts.
+        zero = jnp.zeros((len(windows), self.width // 2), jnp.float32)
+        both = nn.Bidirectional(forward, backward)
+        return both(windows, initial_carry=((zero, zero), (zero, zero))) + positions[None]
 
 
 class CausalDecoderLayer(nn.Module):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, Literal
 
 import chex
 import jax
@@ -17,6 +18,11 @@ MOMENTUM = 0.9
 0.1 is its complement)."""
 EPSILON = 1e-5
 """Added to the variance in batch and layer normalisation."""
+
+MOST_GROUPS = 32
+"""Groups of channels in group normalisation; of fewer channels, the largest number that divides
+both."""
+Normalisation = Literal["batch", "group"]
 
 FLOAT32: dict[str, Any] = {"dtype": jnp.float32, "param_dtype": jnp.float32}
 he_normal_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
@@ -41,11 +47,23 @@ def conv_norm(
     stride: int,
     train: bool,
     name: str,
+    normalisation: Normalisation = "batch",
     **options: Any,
 ) -> Float[Array, "b m d"]:
-    """A convolution, called `name`, and its batch normalisation, whose name has "bn" in the place
-    of "conv", by which `models.inference` finds them. Call it within a module."""
+    """A convolution, called `name`, and its normalisation. Call it within a module.
+
+    The name of a batch normalisation has "bn" in the place of "conv", by which `models.inference`
+    finds them. That of a group normalisation has "norm": it has no statistics and is not folded.
+    """
     x = conv(features, size, stride, train, name, **options)(x)
+    if normalisation == "group":
+        return nn.GroupNorm(
+            num_groups=math.gcd(MOST_GROUPS, features),
+            epsilon=EPSILON,
+            use_fast_variance=False,  # a difference of squares loses digits
+            name=name.replace("conv", "norm"),
+            **FLOAT32,
+        )(x)
     norm = nn.BatchNorm(
         use_running_average=not train,
         momentum=MOMENTUM,

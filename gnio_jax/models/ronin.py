@@ -30,13 +30,17 @@ class DisplacementRegressor(nn.Module):
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 6"], train: bool = False) -> Prediction:
         features = self.features(checked_windows(windows), train)
-        head = FullyConnectedHead(self.width, self.output_dim, self.dropout, name="displacement")
+        displacement = to_axes(self.head(name="displacement")(features, train))
         log_std = ConstantUncertainty(name="uncertainty")(features, train)
-        return Prediction(to_axes(head(features, train)), log_std)
+        return Prediction(displacement, log_std)
 
     def features(self, windows: Float[Array, "b n 6"], train: bool) -> Array:
         """Feature maps (b, m, 8·width)."""
         raise NotImplementedError
+
+    def head(self, name: str) -> FullyConnectedHead:
+        """The head, which the network calls `name`."""
+        return FullyConnectedHead(self.width, self.output_dim, self.dropout, name=name)
 
 
 class RoNINResNet(DisplacementRegressor):
@@ -47,9 +51,18 @@ class RoNINResNet(DisplacementRegressor):
     velocity over the window, `output_dim = 2` (4,634,882 parameters for windows of 200 samples),
     from [gyro, accel]. Ours: the displacement, which is that velocity in a window of 1 s, along
     three axes (4,635,395) unless two are asked for; then the vertical one is 0.
+
+    `normalisation` "group" is the network of RIO (Cao et al., CVPR 2022), of as many parameters.
+    Its number of groups is not published; ours is `layers.MOST_GROUPS`.
     """
 
     winograd: bool = False
+    normalisation: Literal["batch", "group"] = "batch"
 
     def features(self, windows: Float[Array, "b n 6"], train: bool) -> Array:
-        return ResNet18(self.width, self.winograd, name="encoder")(windows, train)
+        encoder = ResNet18(self.width, self.winograd, self.normalisation, name="encoder")
+        return encoder(windows, train)
+
+    def head(self, name: str) -> FullyConnectedHead:
+        options = self.width, self.output_dim, self.dropout, self.normalisation
+        return FullyConnectedHead(*options, name=name)

@@ -7,7 +7,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from gnio_jax.config.schema import Count, Probability
-from gnio_jax.models.layers import checked_windows, conv_norm, linear
+from gnio_jax.models.layers import Normalisation, checked_windows, conv_norm, linear
 from gnio_jax.models.resnet import ResNet18
 from gnio_jax.types import Prediction
 
@@ -51,10 +51,11 @@ class FullyConnectedHead(nn.Module):
     width: int
     outputs: int
     dropout: float
+    normalisation: Normalisation = "batch"
 
     @nn.compact
     def __call__(self, features: Float[Array, "b m d"], train: bool) -> Float[Array, "b k"]:
-        x = conv_norm(features, 2 * self.width, 1, 1, train, "neck_conv")
+        x = conv_norm(features, 2 * self.width, 1, 1, train, "neck_conv", self.normalisation)
         x = x.transpose(0, 2, 1).reshape(x.shape[0], -1)
         for name in ("fc1", "fc2"):
             x = nn.relu(linear(8 * self.width, name, kernel_init=SMALL)(x))

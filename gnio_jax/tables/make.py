@@ -22,6 +22,7 @@ from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.folder import read_views
+from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Cell, MetricSummary
 from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
@@ -31,12 +32,15 @@ from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.runs import RowResult, run_row
 
 METRICS = (
-    *("ate", "ate_2d", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
-    *("stationary_drift", "leg_ratio", "waypoint_rms", "nis", "nees"),
+    *("ate", "ate_2d", "ate_ronin", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
+    *("stationary_drift", "leg_ratio", "waypoint_rms", "nis", "nees", "nees_coverage"),
 )
 """Metrics of every table, if rows have them. Rows are compared by the first."""
 
-TITLES = {"ate_ronin_2d": tabulate.Column("RoNIN's ATE 2-D", "m")}
+TITLES = {
+    "ate_ronin": tabulate.Column("RoNIN's ATE", "m"),
+    "ate_ronin_2d": tabulate.Column("RoNIN's ATE 2-D", "m"),
+}
 """Metrics that tables of evaluations do not show."""
 ABLATIONS = {
     "components": experiments.components,
@@ -154,7 +158,8 @@ def make_table(
         figures |= _over_seeds("entropy of a window", [entropy[:, 0] for entropy in entropies])
         figures |= _over_seeds("entropy of their mean", [entropy[:, 1] for entropy in entropies])
     plots.save(with_ending(path, ".png"), plots.table(experiment, results, figures["ate"]))
-    text = f"## {experiment.title}\n\n{remarks}\n\n{render(experiment, figures)}"
+    table = render(experiment, figures, results[0].reports[0])
+    text = f"## {experiment.title}\n\n{remarks}\n\n{table}"
     heads = [
         {"row": row.name, "label": row.label, "seeds": options.seeds, "published": row.published}
         for row in experiment.rows
@@ -197,8 +202,12 @@ def figures_of(results: list[RowResult]) -> dict[str, list[Cell]]:
     }
 
 
-def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
-    """The table as Markdown, followed by the meaning of its marks."""
+def render(experiment: Experiment, figures: Mapping[str, list[Cell]], report: Report) -> str:
+    """The table as Markdown, followed by the meaning of its marks.
+
+    Its last rows are those to compare with: never moving, and perfect displacements in the filter
+    of `report`, the first evaluation.
+    """
     columns = {name: TITLES.get(name) or tabulate.column(name) for name in figures}
     header = ["", *(column.title for column in columns.values()), "median ATE (m)", "change of ATE"]
     header += ["difference of ATE, m (95 %)", "published (m)", "its change"]
@@ -213,6 +222,14 @@ def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
         measured = [tabulate.number(summary.median, 2), gain, tabulate.difference(difference, 2)]
         printed = [tabulate.number(row.published, 2), arrow(published_gain) if index else ""]
         table.append([row.label, *means, *measured, *printed])
+    for name in report.reference_rows:
+        summaries = report.summary(name)
+        means = [
+            tabulate.mean(summaries[x], column.digits) if x in summaries else "–"
+            for x, column in columns.items()
+        ]
+        median = tabulate.number(summaries["ate"].median, 2) if "ate" in summaries else "–"
+        table.append([name.replace("_", " "), *means, median, "", "", "", ""])
     marks = "".join(f"\n{line}\n" for line in tabulate.marks(figures["ate"]))
     return tabulate.markdown(header, table) + marks
 
@@ -281,7 +298,7 @@ def make_standing(
             picture = plots.attention(*activities.attention_by_activity(seeds[0]), words)
             plots.save(path.with_name(f"{stem}_attention.png"), picture)
     plots.save(with_ending(path, ".png"), plots.standing(by_method))
-    table = render(experiment, figures_of(results))
+    table = render(experiment, figures_of(results), results[0].reports[0])
     head = f"## {experiment.title}\n\n{remarks}\n\n{''.join(lines)}"
     text = f"{head}{table}\n{activities.render(by_method)}"
     write_text(with_ending(path, ".md"), text)

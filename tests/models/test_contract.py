@@ -1,6 +1,7 @@
 """What every network promises: its size, options that are checked, float32, and finite gradients of
 every parameter."""
 
+import functools
 import typing
 
 import jax
@@ -12,6 +13,7 @@ from gnio_jax import models
 from gnio_jax.config import ModelConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry, resnet
+from gnio_jax.types import GRAVITY
 from tests.support.compiling import quick
 from tests.support.networks import SMALL, count, drawn, shapes
 from tests.support.tiny_network import Tiny
@@ -24,6 +26,7 @@ def test_networks_have_as_many_parameters_as_published():
         ("gnio", {"bank_size": 0}, 3_846_144 + 3 * (512 * 3 + 3)),
         ("tlio", {}, 5_424_646),
         ("ronin_resnet", {"output_dim": 2}, 4_634_882),
+        ("ronin_resnet", {"output_dim": 2, "normalisation": "group"}, 4_634_882),
         ("ronin_lstm", {"output_dim": 2}, 216_620),
         # Weights, weight norms, biases and shortcuts of six blocks, three slopes each, the output.
         ("ronin_tcn", {"output_dim": 2}, 152_688 + 1_392 + 23_004 + 3 * 6 + 74),
@@ -73,7 +76,7 @@ NETWORKS = [
 @pytest.mark.parametrize("name", NETWORKS)
 def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(name, monkeypatch):
     """Whatever the windows come in; of networks with fewer layers. `imot_text` is `imot` with other
-    numbers of them."""
+    numbers of them. At rest the gradients are finite, those of the windows too."""
     monkeypatch.setattr(resnet, "BLOCKS_PER_GROUP", 1)
     if name != "gnio":  # whose bank is as wide as four groups make it
         monkeypatch.setattr(resnet, "GROUP_STRIDES", (1, 2))
@@ -88,7 +91,7 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
     variables = drawn({"batch_stats": {}, **models.variable_shapes(model, samples)})
     statistics = variables["batch_stats"]
 
-    def loss(params, key):
+    def loss(params, windows, key):
         given = {"params": params, "batch_stats": statistics}
         prediction, changed = model.apply(
             given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
@@ -101,10 +104,18 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
         value = jnp.sum((prediction.displacement - 1) ** 2) + jnp.sum(prediction.log_std**2)
         return value + jnp.sum(balance**2), (prediction, changed.get("batch_stats", {}))
 
-    gradient = quick(jax.grad(loss, has_aux=True))
-    (grads, (one, changed)), (others, (other, _)) = (
-        jax.device_get(gradient(variables["params"], jax.random.key(seed))) for seed in (0, 1)
+    gradient = quick(jax.grad(loss, (0, 1), has_aux=True))
+    ((grads, _), (one, changed)), ((others, _), (other, _)) = (
+        jax.device_get(gradient(variables["params"], windows, jax.random.key(seed)))
+        for seed in (0, 1)
     )
+    for gravity in (0.0, GRAVITY):
+        still = np.zeros(shape)
+        still[..., 2] = gravity
+        still[..., [6, 10][: shape[-1] - 6]] = 1  # axes of a body that is level
+        slopes, _ = gradient(variables["params"], jnp.asarray(still), jax.random.key(0))
+        for path, leaf in jax.tree.leaves_with_path(slopes):
+            assert np.isfinite(leaf).all(), (gravity, path)
     everything = jax.tree.leaves((variables, grads, one, changed))
     assert windows.dtype == float and {leaf.dtype for leaf in everything} == {np.dtype("float32")}
     assert one.displacement.shape == one.log_std.shape == (4, 3)
@@ -131,6 +142,19 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
             assert np.abs(old - new).max() > 0, path
         else:  # constants of the uncertainty
             np.testing.assert_array_equal(old, new)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_inference_has_no_random_number(name):
+    """No key either, not even one that nothing reads: an export would have to convert it."""
+    model = models.create(name, **SMALL[name])
+    ready = jax.eval_shape(
+        functools.partial(models.inference_variables, model), models.variable_shapes(model, 40)
+    )
+    windows = jax.ShapeDtypeStruct((1, 40, models.channels(model)), jnp.float32)
+    program = str(jax.make_jaxpr(models.Inference(model))(ready, windows))
+    assert "dot_general" in program or name == "ai_imu"
+    assert "random" not in program and "threefry" not in program
 
 
 def test_options_that_cannot_be_are_refused():

@@ -9,7 +9,7 @@ from gnio_jax.evaluation import tabulate
 from gnio_jax.tables import make, plots
 from gnio_jax.tables.experiments import Experiment, TableRow
 from gnio_jax.tables.runs import RowResult
-from tests.support.reports import BASE, LOST, report_of
+from tests.support.reports import BASE, LOST, measures, report_of
 
 
 def result(name, ates, published=None, groups="xyz"):
@@ -33,7 +33,10 @@ def test_a_table_by_hand():
     figures = make.figures_of(results)
     assert list(figures) == ["ate", "rpe_1s"]
     figures |= make._over_seeds("more", [np.zeros(0), np.array([0.25, 0.75])])
-    text = make.render(table_of(*results), figures)
+    first = results[0].reports[0]
+    rows = {"never_moves": {name: measures(ate=7.0) for name in first.scores}}
+    text = make.render(table_of(*results), figures, first._replace(reference_rows=rows))
+    assert "| never moves | 7.00 | – | – | 7.00 |  |  |  |  |" in text
     means = "| B | 1.50 ± 0.71 | 0.150 ± 0.071 | 0.500 ± 0.354 | 1.50 | ↓ 50.0 % "
     assert means + "| -1.50 (-5.80 to +2.80) | 1.80 | ↓ 25.0 % |" in text
     assert "| A | 3.00 ± 0.00 | 0.300 ± 0.000 | – | 2.50 |  |  | 2.40 |  |" in text
@@ -51,7 +54,7 @@ def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
         result("d", [[0.5, 1.0, LOST]]),
     ]
     experiment, figures = table_of(*results), make.figures_of(results)
-    text = make.render(experiment, figures)
+    text = make.render(experiment, figures, results[0].reports[0])
     assert "| B | 8.00 † 2/3 |" in text and "| ↑ 100.0 % | +4.00 over 1 |" in text
     assert "| C | – † 3/3 | – † 3/3 | ∞ | – | – |" in text and "| – | – ‡ |" in text
     for mark in ("† This number", "‡ Its remaining", "A difference is over"):

@@ -17,6 +17,7 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
 from gnio_jax.apps.onnx.programs import Program
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import Filter
 
 OPSET = 18
@@ -28,7 +29,7 @@ def to_model(program: Program, ekf: Filter, first_inferred: int) -> bytes:
     shapes and types.
 
     float64 stays float64. The metadata have the numbers that the loop around the models needs.
-    Raises the error of jax2onnx for an operation that it does not know.
+    Raises `InputError` for an operation that jax2onnx does not know.
     """
     import onnx
     import onnx_ir
@@ -41,14 +42,18 @@ def to_model(program: Program, ekf: Filter, first_inferred: int) -> bytes:
         results = program.function(dict(zip(names, values, strict=True)))
         return [results[name] for name in program.outputs]
 
-    converted = to_onnx(
-        jaxpr_as_fun(jax.make_jaxpr(call_flat)(*shapes)),
-        shapes,
-        model_name=program.name,
-        opset=OPSET,
-        enable_double_precision=any(shape.dtype == np.float64 for shape in shapes),
-        return_mode="ir",
-    )
+    try:
+        converted = to_onnx(
+            jaxpr_as_fun(jax.make_jaxpr(call_flat)(*shapes)),
+            shapes,
+            model_name=program.name,
+            opset=OPSET,
+            enable_double_precision=any(shape.dtype == np.float64 for shape in shapes),
+            return_mode="ir",
+        )
+    except NotImplementedError as error:
+        remedy = "write the network without it, or install a version of jax2onnx that converts it"
+        raise InputError(program.name, f"cannot be converted: {error}", remedy) from error
     model = onnx_ir.to_proto(RemoveUnusedNodesPass()(converted).model)
     _name_ends(model.graph, program)
     metadata = {

@@ -18,11 +18,12 @@ import pytest
 from gnio_jax import filtering
 from gnio_jax.apps.onnx import driver, export_run
 from gnio_jax.apps.onnx.networks import deploy_network
-from gnio_jax.apps.onnx.programs import start_arrays
+from gnio_jax.apps.onnx.programs import Program, start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig
 from gnio_jax.data.simulated.walks import pedestrian
+from gnio_jax.errors import InputError
 from gnio_jax.models import Network
 from gnio_jax.networks import read_network
 from gnio_jax.numerics import matrix_from_quaternion
@@ -138,6 +139,22 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert not (tmp_path / "exports").exists()
+
+
+def test_an_operation_that_cannot_be_converted_is_named_in_one_line():
+    for name in PACKAGES:
+        pytest.importorskip(name, reason="needs pip install 'gnio-jax[onnx]'")
+    from gnio_jax.apps.onnx import conversion
+
+    def draw(arrays):
+        key = jax.random.key(0)
+        return {"displacement": arrays["window"] + jax.random.normal(jax.random.split(key)[0])}
+
+    shape = jax.ShapeDtypeStruct((1, 3), np.float32)
+    program = Program("network", draw, {"window": shape})
+    ekf = filtering.make_filter(CONFIG.data, CONFIG.filter)
+    with pytest.raises(InputError, match=r"^network: cannot be converted: .*random.*; write the"):
+        conversion.to_model(program, ekf, 0)
 
 
 @pytest.fixture(scope="module", params=["gru", "state_space", "ronin_lstm", "ronin_tcn"])
