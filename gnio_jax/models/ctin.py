@@ -184,7 +184,7 @@ class TemporalEmbedding(nn.Module):
         # converts.
         zero = jnp.zeros((len(windows), self.width // 2), jnp.float32)
         both = nn.Bidirectional(forward, backward)
-        return both(windows, initial_carry=((zero, zero), (zero, zero))) + positions[None]
+        return jnp.add(both(windows, initial_carry=((zero, zero), (zero, zero))), positions[None])
 
 
 class CausalDecoderLayer(nn.Module):
