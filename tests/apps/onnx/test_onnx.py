@@ -9,6 +9,7 @@ import subprocess
 import sys
 import sysconfig
 import types
+from contextlib import nullcontext
 from pathlib import Path
 
 import jax
@@ -19,11 +20,13 @@ from gnio_jax import filtering
 from gnio_jax.apps.onnx import driver, export_run
 from gnio_jax.apps.onnx.networks import deploy_network
 from gnio_jax.apps.onnx.programs import Program, start_arrays
-from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check
+from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check, deviation_of
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig
 from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Displacements, SequenceEstimate
+from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.models import Network
 from gnio_jax.networks import read_network
 from gnio_jax.numerics import matrix_from_quaternion
@@ -69,9 +72,28 @@ def test_a_minute_is_that_of_the_package(found, models, walked, package):
     assert measured["displacement_largest"] <= 1e-5 and measured["position_largest"] <= 1e-3
     assert measured["ate"] == pytest.approx(measured["ate_of_package"], abs=1e-3)
     with pytest.raises(ValueError, match=r"walk: .* off by 0\.0001 m a window"):
-        check(Deviation(1e-4, 1e-4, 0.0, 1.0, 1.0), "walk")
+        check(Deviation(1e-4, 1e-4, 10.0, 0.0, 1.0, 1.0), "walk")
     # The walk says something: it moves, and the network turns it from where the IMU alone leads.
     assert np.ptp(found.position, axis=0).max() > 1 and np.abs(found.displacement).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    "error, std, excess", [(9e-6, 0.1, 0.9), (2e-5, 0.1, 2.0), (2e-5, 1.0, 0.4), (2e-4, 1.0, 4.0)]
+)
+def test_a_wide_distribution_may_be_rounded_by_more(error, std, excess):
+    """A deviation counts against 1e-5 m or a small part of the window's standard deviation."""
+    path = Trajectory(np.arange(3.0), np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)))
+    covariance = np.tile(std**2 / 3 * np.eye(3), (3, 1, 1))
+    rows = Displacements(np.zeros((3, 3)), covariance)
+    package_estimate = SequenceEstimate("walk", path, path, rows)
+    displacement, rotation = np.array([[0, 0, 0], [0, error, 0.0]]), np.tile(np.eye(3), (2, 1, 1))
+    states = np.zeros((2, 3)), rotation, np.zeros((2, 15, 15))
+    exported = driver.WalkResult(np.zeros((2, 9, 6)), displacement, *states)
+    deviation = deviation_of(exported, package_estimate)
+    assert deviation.displacement_excess == pytest.approx(excess)
+    assert deviation.displacement_largest == pytest.approx(error)
+    with nullcontext() if excess <= 1 else pytest.raises(InputError, match="the conversion is off"):
+        check(deviation, "walk")
 
 
 def test_the_start_has_the_bias_of_a_gyro_at_rest(run, models, walked):
