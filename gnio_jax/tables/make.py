@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from gnio_jax import config as configuration
 from gnio_jax import models
-from gnio_jax.config import TablesConfig, TrainConfig
+from gnio_jax.config import ModelConfig, TablesConfig, TrainConfig
 from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
@@ -99,13 +99,23 @@ def base_config(options: TablesConfig) -> TrainConfig:
 
 
 def networks(options: TablesConfig) -> tuple[str, ...]:
-    """The networks named by --methods; "all" stands for those of this package."""
-    names = NETWORKS if options.methods == "all" else _words(options.methods)
-    unknown = [f"no network '{name}'" for name in names if name not in models.names()]
-    if unknown or not names:
-        problem = unknown[0] if unknown else "names no network"
+    """The networks named by --methods; "all" stands for those of this package that predict
+    displacements."""
+    if options.methods == "all":
+        return tuple(name for name in NETWORKS if _predicts_displacement(name))
+    names = _words(options.methods)
+    problems = [f"no network '{name}'" for name in names if name not in models.names()]
+    problems = problems or [
+        f"'{name}' predicts no displacement" for name in names if not _predicts_displacement(name)
+    ]
+    if problems or not names:
+        problem = problems[0] if problems else "names no network"
         raise InputError("--methods", problem, f"known: {', '.join(models.names())}")
     return names
+
+
+def _predicts_displacement(name: str) -> bool:
+    return models.predicts_displacement(models.from_config(ModelConfig(name=name)))
 
 
 def _words(text: str) -> tuple[str, ...]:

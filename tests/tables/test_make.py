@@ -8,13 +8,20 @@ import numpy as np
 import pytest
 import yaml
 
-from gnio_jax import calibration
+from gnio_jax import calibration, models
 from gnio_jax import config as configuration
 from gnio_jax.calibration import run as calibration_run
-from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.config import (
+    CalibrateConfig,
+    DataConfig,
+    ModelConfig,
+    OptimConfig,
+    TablesConfig,
+    TrainConfig,
+)
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import reuse
-from gnio_jax.tables import activities
+from gnio_jax.tables import activities, experiments, make
 from gnio_jax.training import loop
 from tests.support.command_lines import run as gnio
 from tests.support.tlio_files import write_sequence
@@ -127,6 +134,7 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
     "more, words",
     [
         (["--methods", "gnio,nosuch"], "no network 'nosuch'; known: ai_imu, airio"),
+        (["--methods", "gnio,ai_imu"], "'ai_imu' predicts no displacement"),
         (["--base", "nosuch.yaml"], "no such config file"),
         (["--base", "configs/baselines/tlio.yaml"], "is of the network 'tlio'"),
     ],
@@ -134,3 +142,10 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
 def test_mistakes_are_named(made, more, words):
     with pytest.raises(InputError, match=words):
         gnio("tables", "comparison", *made[1], *more)
+
+
+def test_all_methods_are_the_networks_with_displacements_each_with_a_sound_configuration():
+    names = make.networks(TablesConfig("comparison", methods="all"))
+    assert set(names) == set(models.names()) - {"ai_imu"}
+    for name in names:
+        configuration.validate(experiments.method(name, TrainConfig()), name)
