@@ -65,3 +65,16 @@ def test_holes_in_fast_recordings_are_bridged(rate):
 def test_a_recording_of_a_kilohertz_without_a_usable_position_is_zero():
     smoothed, _, used = smooth_positions(np.ones((3000, 3)), np.zeros(3000, bool), 1e-3)
     assert not used.any() and not smoothed.any()
+
+
+@pytest.mark.parametrize("rate", [100, 1000])
+def test_smoothed_positions_do_not_depend_on_the_distance_from_the_origin(rate: int) -> None:
+    time = np.arange(4 * rate) / rate
+    walk = np.stack([np.sin(time), 0.5 * time, np.cos(time)], axis=1)
+    velocity = np.stack([np.cos(time), np.full_like(time, 0.5), -np.sin(time)], axis=1)
+    usable = (time < 2.0) | (time > 2.2)
+    position, rate_of_change, used = smooth_positions(walk + 1e6, usable, 1 / rate)
+    inner = slice(rate // 2, -rate // 2)
+    np.testing.assert_allclose((position - 1e6)[inner], walk[inner], atol=0.01)
+    np.testing.assert_allclose(rate_of_change[inner], velocity[inner], atol=0.1)
+    assert used[usable].all()
