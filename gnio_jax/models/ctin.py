@@ -7,6 +7,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float
 
@@ -183,8 +184,9 @@ class TemporalEmbedding(nn.Module):
         # Flax's own initial carry is zero too, but it splits a random key, which no export
         # converts.
         zero = jnp.zeros((len(windows), self.width // 2), jnp.float32)
-        both = nn.Bidirectional(forward, backward)
-        return jnp.add(both(windows, initial_carry=((zero, zero), (zero, zero))), positions[None])
+        carry = ((zero, zero), (zero, zero))
+        bidirectional = nn.Bidirectional(forward, backward)
+        return jnp.add(bidirectional(windows, initial_carry=carry), positions[None])
 
 
 class CausalDecoderLayer(nn.Module):
@@ -200,8 +202,9 @@ class CausalDecoderLayer(nn.Module):
         self, x: Float[Array, "b n d"], memory: Float[Array, "b n d"], train: bool
     ) -> Float[Array, "b n d"]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
-        causal = jnp.tril(jnp.ones((x.shape[1], x.shape[1]), bool))[None, None]
-        y = attention(self.heads, "self")(x, mask=causal)
+        # A constant: ONNX Runtime has no Where for booleans, by which JAX would make it.
+        causal = np.tril(np.ones((x.shape[1], x.shape[1]), bool))[None, None]
+        y = attention(self.heads, "self")(x, mask=jnp.asarray(causal))
         x = layer_norm("self_norm")(x + drop(y))
         y = attention(self.heads, "cross")(x, memory)
         x = layer_norm("cross_norm")(x + drop(y))

@@ -79,7 +79,7 @@ OTHERS = {
 sensor the first one is taken."""
 REMEDIES = {
     "Sensor Logger": "switch on Gyroscope, Accelerometer and Gravity",
-    "phyphox": "record the experiment 'Acceleration (with g)' with the gyroscope beside it",
+    "phyphox": "record the gyroscope and the acceleration with g in one experiment (+ adds one)",
 }
 """What each app's user does if a sensor is missing, by the first words of the app's name."""
 

@@ -68,7 +68,9 @@ def find_slices(path: Path) -> list[RecordingSource]:
     with parsing_as(path, "HDF5"), h5py.File(path, "r") as file:
         for group in GROUPS:
             node = hdf5_node(file, group, path)
-            for name in sorted(node) if isinstance(node, h5py.Group) else ():
+            if node is not None and not isinstance(node, h5py.Group):
+                raise damage_error(path, f"'{group}' is no group of slices")
+            for name in sorted(map(_text, node or ())):
                 recording = recording_of(name)
                 attributes = {"group": recording, "subject": recording}
                 where = f"{group}/{name}"
@@ -81,6 +83,11 @@ def find_slices(path: Path) -> list[RecordingSource]:
                     )
                 )
     return slices
+
+
+def _text(name: str | bytes) -> str:
+    """The name of a slice as text; one that is not UTF-8 has bytes as \\xNN."""
+    return name if isinstance(name, str) else name.decode(errors="backslashreplace")
 
 
 def recording_of(name: str) -> str:

@@ -185,7 +185,7 @@ def test_phyphox_in_one_file(tmp_path):
     (tmp_path / "gyro.csv").write_text(phyphox()["Gyroscope.csv"])
     refused(
         tmp_path / "gyro.csv",
-        "gyro.csv: has no accelerometer .found: gyro.csv.; record the experiment",
+        "gyro.csv: has no accelerometer .found: gyro.csv.; record the gyroscope and",
     )
     refused(tmp_path / "gyro.csv", "gyro.csv: has no topics", imu_topic="/imu")
 

@@ -48,6 +48,15 @@ def test_a_slice_belongs_to_what_its_name_begins_with(name, recording):
     assert pedlocdata.recording_of(name) == recording
 
 
+def test_a_slice_whose_name_is_not_utf8_is_listed(tmp_path):
+    with h5py.File(tmp_path / "pedloc.h5", "w") as file:
+        file.create_group("train").create_group(b"caf\xe9_3")
+    (source,) = pedlocdata.find_slices(tmp_path / "pedloc.h5")
+    assert source.attributes["group"] == r"caf\xe9"
+    with pytest.raises(InputError, match="is missing"):
+        source.read()
+
+
 def turn_the_reference(fields):
     fields["qua"] = fields["qua"][:, [0, 2, 1, 3]]
 
@@ -94,8 +103,13 @@ def test_damaged_slices_are_refused(tmp_path, change, words):
 
 def test_a_file_without_slices_has_none_and_a_foreign_one_is_named(tmp_path):
     with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["train"] = np.zeros(3)
+        file["walks"] = np.zeros(3)
     assert pedlocdata.recordings(tmp_path, "train") == []
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["train"] = np.zeros(3)
+    with pytest.raises(InputError, match=r"other\.h5: 'train' is no group of slices"):
+        pedlocdata.recordings(tmp_path, "train")
+    (tmp_path / "other.h5").unlink()
     (tmp_path / "text.hdf5").write_text("no file of this kind")
     with pytest.raises(InputError, match=r"text\.hdf5"):
         pedlocdata.recordings(tmp_path, "train")
