@@ -119,13 +119,17 @@ def threshold_of(present: Bool[Array, "m"], threshold: Float[Array, ""]) -> Floa
     The tails are erfc(√(q/2)) with one degree, e^(−q/2) with two, and with three the first and
     √(2 q/π) times the second.
     """
-    half = 0.5 * jnp.where(jnp.isfinite(threshold), threshold, 1.0)
-    tail = jnp.exp(-half)
-    if len(present) == 3:
-        tail = erfc(jnp.sqrt(half)) + 2 * jnp.sqrt(half / np.pi) * tail
-    count = present.sum()
-    fewer = jnp.where(count == 1, ndtri(0.5 * tail) ** 2, -2 * jnp.log(tail))
-    return jnp.where((count < len(present)) & jnp.isfinite(threshold), fewer, threshold)
+    count, is_tested = present.sum(), jnp.isfinite(threshold)
+
+    def of_fewer() -> Array:
+        half = 0.5 * jnp.where(is_tested, threshold, 1.0)
+        tail = jnp.exp(-half)
+        if len(present) == 3:
+            tail = erfc(jnp.sqrt(half)) + 2 * jnp.sqrt(half / np.pi) * tail
+        return jnp.where(count == 1, ndtri(0.5 * tail) ** 2, -2 * jnp.log(tail))
+
+    # A branch, because otherwise XLA computes the tails for every entry of the covariance.
+    return jax.lax.cond((count < len(present)) & is_tested, of_fewer, lambda: threshold)
 
 
 def fixes_on_intervals(
