@@ -220,4 +220,12 @@ def _conv(features: int, name: str) -> Any:
         features, (SPAN,), padding="VALID", use_bias=False, param_dtype=jnp.float32, name=name
     )
     before = (SPAN - 1) // 2
-    return lambda x: layer(jnp.pad(x, ((0, 0), (before, SPAN - 1 - before), (0, 0)), "edge"))
+    after = SPAN - 1 - before
+
+    def convolve(x: Float[Array, "b n c"]) -> Float[Array, "b n d"]:
+        # No jnp.pad with "edge", whose shapes the export loses.
+        ends = (x[:, :1], before), (x[:, -1:], after)
+        first, last = (jnp.broadcast_to(end, (len(x), n, x.shape[2])) for end, n in ends)
+        return layer(jnp.concatenate([first, x, last], axis=1))
+
+    return convolve
