@@ -31,7 +31,7 @@ from gnio_jax.models.equivariance import (
     turn_prediction,
     turn_windows,
 )
-from gnio_jax.models.layers import EPSILON
+from gnio_jax.models.layers import EPSILON, repeat_ends
 from gnio_jax.types import Prediction
 
 SPAN = 32
@@ -220,12 +220,4 @@ def _conv(features: int, name: str) -> Any:
         features, (SPAN,), padding="VALID", use_bias=False, param_dtype=jnp.float32, name=name
     )
     before = (SPAN - 1) // 2
-    after = SPAN - 1 - before
-
-    def convolve(x: Float[Array, "b n c"]) -> Float[Array, "b n d"]:
-        # No jnp.pad with "edge", whose shapes the export loses.
-        ends = (x[:, :1], before), (x[:, -1:], after)
-        first, last = (jnp.broadcast_to(end, (len(x), n, x.shape[2])) for end, n in ends)
-        return layer(jnp.concatenate([first, x, last], axis=1))
-
-    return convolve
+    return lambda x: layer(repeat_ends(x, before, SPAN - 1 - before, axis=1))

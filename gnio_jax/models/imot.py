@@ -18,6 +18,7 @@ from gnio_jax.models.layers import (
     checked_windows,
     layer_norm,
     linear,
+    repeat_ends,
 )
 from gnio_jax.types import Prediction
 
@@ -254,7 +255,7 @@ def decouple(channels: Float[Array, "b c n"]) -> Float[Array, "b k n"]:
 def moving_average(x: Float[Array, "b c n"], span: int) -> Float[Array, "b c n"]:
     """Centred mean over an odd number of samples; the first and the last sample are repeated beyond
     the ends (ours)."""
-    padded = jnp.pad(x, ((0, 0), (0, 0), (span // 2, span // 2)), mode="edge")
+    padded = repeat_ends(x, span // 2, span // 2, axis=2)
     terms = [padded[..., i : i + x.shape[-1]] for i in range(span)]
     return sum(terms[1:], terms[0]) / span
 

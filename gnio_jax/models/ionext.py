@@ -14,7 +14,7 @@ from gnio_jax.models.airio import norm
 from gnio_jax.models.convolution import convolve_depthwise
 from gnio_jax.models.deepils import maximum
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
-from gnio_jax.models.layers import FLOAT32, checked_windows, linear, unpadded_conv
+from gnio_jax.models.layers import FLOAT32, checked_windows, linear, repeat_ends, unpadded_conv
 from gnio_jax.types import Prediction
 
 DEPTHS = (2, 2, 6, 2)
@@ -53,7 +53,7 @@ class IONext(nn.Module):
         for stage, depth in enumerate(DEPTHS):
             if stage:
                 x = norm(f"down{stage}_norm", train)(x)
-                x = jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0)), "edge")
+                x = repeat_ends(x, 0, x.shape[1] % 2, axis=1)
                 x = unpadded_conv(self.width * 2**stage, 2, 2, train, f"down{stage}")(x)
             for number in range(depth):
                 x = DynamicBlock(name=f"stage{stage + 1}_block{number + 1}")(x, train)

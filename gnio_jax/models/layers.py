@@ -97,6 +97,20 @@ def layer_norm(name: str) -> nn.LayerNorm:
     return nn.LayerNorm(epsilon=EPSILON, name=name, **FLOAT32)
 
 
+def repeat_ends(x: Float[Array, "*b"], before: int, after: int, axis: int) -> Float[Array, "*d"]:
+    """`x` with its first entry along the axis `before` times more, and its last one `after` times.
+    (The export loses the shapes of `jnp.pad` with "edge".)"""
+    parts = [x]
+    for count, index in ((before, 0), (after, -1)):
+        if count:
+            end = jax.lax.index_in_dim(x, index, axis)
+            shape = list(x.shape)
+            shape[axis] = count
+            repeated = jnp.broadcast_to(end, shape)
+            parts = [repeated, *parts] if index == 0 else [*parts, repeated]
+    return jnp.concatenate(parts, axis=axis)
+
+
 def attend(
     query: Float[Array, "b n h d"],
     key: Float[Array, "b m h d"],

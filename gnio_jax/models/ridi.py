@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from gnio_jax.config.schema import Count
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
-from gnio_jax.models.layers import checked_windows
+from gnio_jax.models.layers import checked_windows, repeat_ends
 from gnio_jax.types import GRAVITY, Prediction
 
 SMOOTHING = 2.0
@@ -72,7 +72,7 @@ def features(windows: Float[Array, "b n 6"]) -> Float[Array, "b f"]:
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / SMOOTHING) ** 2)
     weights = np.float32(weights / weights.sum())
     x = windows - jnp.array([0, 0, GRAVITY, 0, 0, 0], jnp.float32)[None, None]
-    wide, samples = jnp.pad(x, ((0, 0), (reach, reach), (0, 0)), "edge"), windows.shape[1]
+    wide, samples = repeat_ends(x, reach, reach, axis=1), windows.shape[1]
     smooth = sum(weight * wide[:, k : k + samples] for k, weight in enumerate(weights))
     return jnp.asarray(smooth).reshape(len(windows), -1)
 
