@@ -19,7 +19,7 @@ import pytest
 from gnio_jax import filtering
 from gnio_jax.apps.onnx import driver, export_run
 from gnio_jax.apps.onnx.networks import deploy_network
-from gnio_jax.apps.onnx.programs import Program, start_arrays
+from gnio_jax.apps.onnx.programs import Program, programs, start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check, deviation_of
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig
@@ -27,7 +27,7 @@ from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Displacements, SequenceEstimate
 from gnio_jax.evaluation.trajectory import Trajectory
-from gnio_jax.models import Network
+from gnio_jax.models import Network, registry
 from gnio_jax.networks import read_network
 from gnio_jax.numerics import matrix_from_quaternion
 from tests.apps.onnx.conftest import BIAS, CONFIG, SECONDS
@@ -161,6 +161,38 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert not (tmp_path / "exports").exists()
+
+
+WINDOWED = ["ctin", "imot", "ionext", "ridi", "o2_frame", "so2_frame"]
+"""Networks with an operation of their own that a conversion has lost, and EqNIO's frames."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WINDOWED)
+def test_the_network_alone_gives_the_displacements_of_the_package(name):
+    import onnxruntime
+
+    from gnio_jax.apps.onnx import conversion
+
+    frame = {"width": 4, "equivariance": name}
+    network = ("ronin_resnet", frame) if name.endswith("_frame") else (name, SMALL[name])
+    model = registry.create(network[0], **network[1])
+    variables = registry.initialise(model, jax.random.key(0), CONFIG.data.input_samples)
+    ekf = filtering.make_filter(CONFIG.data, CONFIG.filter)
+    deployed = deploy_network(Network.of(model, variables), ekf)
+    (program,) = (one for one in programs(deployed, ekf) if one.name == "network")
+    session = onnxruntime.InferenceSession(
+        conversion.to_model(program, ekf, deployed.first_inferred)
+    )
+    random = np.random.default_rng(4)
+    inputs = {
+        key: random.standard_normal(array.shape).astype(array.dtype)
+        for key, array in program.inputs.items()
+    }
+    outputs = session.run(list(program.outputs), inputs)
+    expected = program.function({key: jax.numpy.asarray(value) for key, value in inputs.items()})
+    for key, value in zip(program.outputs, outputs, strict=True):
+        np.testing.assert_allclose(value, expected[key], atol=1e-4, err_msg=key)
 
 
 def test_an_operation_that_cannot_be_converted_is_named_in_one_line():
