@@ -271,6 +271,8 @@ def smooth_positions(
     of `cutoff`. Weights decrease with the residual, which removes single jumps. Where nothing was
     measured the smoother bridges with the smoothest acceleration.
     """
+    if not usable.any():
+        return np.zeros_like(position), np.zeros_like(position), usable
     cutoff = min(cutoff, 0.25 / step)
     # Δ³ᵀΔ³ in SciPy's upper banded form: bands[3 − d, j] couples j and j − d.
     stencil, count = np.array([-1.0, 3.0, -3.0, 1.0]), len(position)
@@ -282,18 +284,13 @@ def smooth_positions(
     smoothness *= stiffness
     # The rounding errors of the solution grow with the distance from the origin: with 1000 km and
     # 500 Hz they would be hundreds of metres.
-    origin = position[usable].mean(axis=0) if usable.any() else np.zeros(3)
+    origin = position[usable].mean(axis=0)
     filled = np.where(usable[:, None], position - origin, 0.0)
     # Where nothing was measured a straight line counts a little, so that the system can be solved
     # in double precision at any rate. Its largest eigenvalue is 64 times the stiffness.
     little = max(1e-9, 100 * np.finfo(float).eps * 64 * stiffness)
     rows = np.arange(count)
-    line = np.column_stack(
-        [
-            np.interp(rows, rows[usable], axis[usable]) if usable.any() else 0 * axis
-            for axis in filled.T
-        ]
-    )
+    line = interpolate(rows, rows[usable], filled[usable])
     weight = usable.astype(float)
     smoothed = filled
     for _ in range(5):
@@ -301,7 +298,7 @@ def smooth_positions(
         system[-1] += weight + little  # the diagonal
         smoothed = solveh_banded(system, weight[:, None] * filled + little * line)
         distance = np.linalg.norm(filled - smoothed, axis=1)
-        scale = max(4.0 * float(np.median(distance[usable])), 2e-3) if usable.any() else 1.0
+        scale = max(4.0 * float(np.median(distance[usable])), 2e-3)
         weight = usable / (1.0 + (distance / scale) ** 2) ** 2
     velocity = np.gradient(smoothed, step, axis=0, edge_order=2)
     return smoothed + origin, velocity, usable & (weight > 0.1)

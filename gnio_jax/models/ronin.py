@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from gnio_jax.config.schema import Count, Probability
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
-from gnio_jax.models.layers import checked_windows
+from gnio_jax.models.layers import Normalisation, checked_windows
 from gnio_jax.models.resnet import ResNet18
 from gnio_jax.models.tlio import FullyConnectedHead
 from gnio_jax.types import Prediction
@@ -57,7 +57,7 @@ class RoNINResNet(DisplacementRegressor):
     """
 
     winograd: bool = False
-    normalisation: Literal["batch", "group"] = "batch"
+    normalisation: Normalisation = "batch"
 
     def features(self, windows: Float[Array, "b n 6"], train: bool) -> Array:
         encoder = ResNet18(self.width, self.winograd, self.normalisation, name="encoder")
