@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 
+from gnio_jax.apps.live import sources as live_sources
 from gnio_jax.apps.live.batches import Batches
 from gnio_jax.apps.live.inbox import Inbox
 from gnio_jax.apps.live.phyphox import Phyphox, PhyphoxRows
@@ -269,3 +270,9 @@ def test_an_experiment_that_lacks_a_sensor_is_refused():
     experiment.inputs = []
     with pytest.raises(InputError, match="has neither"):
         Phyphox(experiment.address, "phyphox")
+
+
+def test_phyphox_gets_its_own_remedy_for_a_sensor_that_does_not_come():
+    experiment = Experiment(*walked())
+    of_phyphox = live_sources.phyphox(f"phyphox:{experiment.address}", live_sources.Stated())
+    assert "in one experiment" in of_phyphox.nature.needs
