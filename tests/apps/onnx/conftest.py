@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering
+from gnio_jax.apps.onnx.run import PACKAGES
 from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated.walks import pedestrian
@@ -82,11 +83,16 @@ def walked():
     return Walked(gyro + BIAS, np.concatenate([np.tile(gravity, (second, 1)), drawn.accel]))
 
 
+@pytest.fixture(scope="session")
+def converter():
+    """Packages of the export. Without them a test is skipped."""
+    for name in PACKAGES:
+        pytest.importorskip(name, reason="needs pip install 'gnio-jax[onnx]'")
+
+
 @pytest.fixture(scope="package")
-def models(run):
+def models(converter, run):
     """Folder of the ONNX models, and what the command printed."""
-    pytest.importorskip("jax2onnx", reason="needs pip install 'gnio-jax[onnx]'")
-    pytest.importorskip("onnxruntime", reason="needs pip install 'gnio-jax[onnx]'")
     out = run.parent / "models"
     with pytest.MonkeyPatch.context() as patch:
         # jax2onnx checks itself after each operation over the whole graph: half of its time.

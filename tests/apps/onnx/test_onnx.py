@@ -169,7 +169,7 @@ WINDOWED = ["ctin", "imot", "ionext", "ridi", "o2_frame", "so2_frame"]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WINDOWED)
-def test_the_network_alone_gives_the_displacements_of_the_package(name):
+def test_the_network_alone_gives_the_displacements_of_the_package(converter, name):
     import onnxruntime
 
     from gnio_jax.apps.onnx import conversion
@@ -195,9 +195,7 @@ def test_the_network_alone_gives_the_displacements_of_the_package(name):
         np.testing.assert_allclose(value, expected[key], atol=1e-4, err_msg=key)
 
 
-def test_an_operation_that_cannot_be_converted_is_named_in_one_line():
-    for name in PACKAGES:
-        pytest.importorskip(name, reason="needs pip install 'gnio-jax[onnx]'")
+def test_an_operation_that_cannot_be_converted_is_named_in_one_line(converter):
     from gnio_jax.apps.onnx import conversion
 
     def draw(arrays):
@@ -212,10 +210,8 @@ def test_an_operation_that_cannot_be_converted_is_named_in_one_line():
 
 
 @pytest.fixture(scope="module", params=["gru", "state_space", "ronin_lstm", "ronin_tcn"])
-def remembering(request, tmp_path_factory):
+def remembering(request, converter, tmp_path_factory):
     """A network with memory, whose weights are drawn, and the folder of its models."""
-    for name in PACKAGES:
-        pytest.importorskip(name, reason="needs pip install 'gnio-jax[onnx]'")
     folder = tmp_path_factory.mktemp(request.param)
     windows = DataConfig(rate=50.0, stride_seconds=0.2)
     options = dict(SMALL[request.param])
