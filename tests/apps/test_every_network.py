@@ -103,7 +103,8 @@ def test_from_training_to_live(
     if recipe == "ridi":
         pytest.importorskip("sklearn", reason="needs gnio-jax[ridi]")
     monkeypatch.chdir(tmp_path)
-    root = tlio_files.write_splits(tmp_path_factory.mktemp("data"))
+    folder = tmp_path_factory.mktemp("data")
+    root = tlio_files.write_splits(folder, spoil=tlio_files.add_noise)
     network = NAMED.get(recipe, recipe)
     words = OTHERS.get(recipe, ("--config", f"baselines/{recipe}"))
     words = (*words, "--model.name", network, *smallest(network), *CHANGED)
