@@ -51,7 +51,7 @@ SMALL_CAR += ("--set", "through_filter.displacement_weight=1.0")
 
 def smallest(network):
     """The words of the smallest options of a network."""
-    for option, value in SMALL[network].items():
+    for option, value in SMALL[network.removesuffix("_text")].items():
         name = option if option in IN_CONFIG else f"options.{option}"
         yield from ("--set", f"model.{name}={value}")
 
