@@ -534,8 +534,8 @@ class FilterOptions:
     Barrau and Bonnabel). additive: it is not, as in TLIO. By default additive where
     `window_rotation` is tlio, else invariant."""
     speed_limit: Positive = 100.0
-    """Largest plausible speed, m/s: an estimate that exceeds it has diverged, and is not `healthy`
-    from then on (ours)."""
+    """Largest plausible speed, m/s. A displacement that is faster is rejected. An estimate that
+    exceeds it has diverged, and is not `healthy` from then on (ours)."""
 
 
 @dataclass(frozen=True)

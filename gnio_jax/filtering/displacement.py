@@ -69,27 +69,32 @@ class Displacement:
     name: ClassVar[str] = "displacement"
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
-        """Nothing changes without a measurement, before the ring is full, at gimbal lock, or where
-        the χ² gate rejects it. With `mahalanobis_fail_scale` or `gate_softness` it is applied with
-        a larger covariance instead."""
+        """Nothing changes without a measurement, before the ring is full, at gimbal lock, where
+        the χ² gate rejects it, or where it is faster than `FilterConfig.speed_limit`. With
+        `mahalanobis_fail_scale` or `gate_softness` what the gate rejects is applied with a larger
+        covariance instead."""
         config = step.config
         linear, defined = linearise_displacement(self, state, step)
         linear = linear._replace(residual=jnp.where(self.present, linear.residual, jnp.nan))
         outcome, correction = project(state, linear, step)
         tested = outcome.present & defined
-        gate, weight = innovation_gate(state.gate, config, state.step, outcome.nis, tested)
+        # The gate is open at the start and after a series of rejections.
+        longest = config.speed_limit * config.window * config.dt
+        plausible = jnp.sum(self.displacement**2) <= longest**2
+        possible = tested & plausible
+        gate, weight = innovation_gate(state.gate, config, state.step, outcome.nis, possible)
         accepted, factor = weight > 0, None
         if config.mahalanobis_fail_scale > 0:
-            failed = tested & ~accepted
+            failed = possible & ~accepted
             factor = jnp.where(failed, config.mahalanobis_fail_scale, 1.0).astype(weight.dtype)
         elif config.gate_softness > 0:
-            factor = 1 / jnp.clip(jnp.where(tested, weight, 1.0), LEAST_WEIGHT)
+            factor = 1 / jnp.clip(jnp.where(possible, weight, 1.0), LEAST_WEIGHT)
         if factor is not None:  # applied with a larger covariance
             weaker = linear._replace(covariance=linear.covariance + (factor - 1) * self.covariance)
             _, correction = project(state, weaker, step)
-            accepted = tested
+            accepted = possible
         # A matrix that is no covariance must spoil the state, and `healthy` then reports it.
-        accepted = accepted | (outcome.present & jnp.isnan(outcome.nis))
+        accepted = accepted | (outcome.present & plausible & jnp.isnan(outcome.nis))
         outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
         return correct(state._replace(gate=gate), outcome, correction, step)
 

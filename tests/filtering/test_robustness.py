@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -110,3 +111,26 @@ def test_a_negative_variance_is_not_healthy():
     assert np.isfinite(history.covariance_diagonal).all() and np.isfinite(history.velocity).all()
     assert (np.delete(history.covariance_diagonal, 10, axis=1) >= 0).all()
     assert not np.any(history.healthy) and not final.healthy
+
+
+@pytest.mark.parametrize("fail_scale", [0.0, 10.0])
+@pytest.mark.parametrize("leap", [60.0, 1e9, 1e200])
+def test_a_displacement_that_nothing_makes_is_rejected_before_the_gate_begins_too(leap, fail_scale):
+    """A network that has learnt little may say anything. 0.4 s at 100 m/s are 40 m."""
+    config = dataclasses.replace(
+        PLAIN, convergence_seconds=100.0, mahalanobis_fail_scale=fail_scale
+    )
+    begin, gyro, accel, displacement, covariance = WALK
+    state, ekf = filtering.initial_state(filtering.Filter(config), *begin), filtering.Filter(config)
+    rows = slice(10, 14)
+    without, leaping = displacement.copy(), displacement.copy()
+    without[rows], leaping[rows, 1] = np.nan, leap
+    _, wanted = FILTER(ekf, state, gyro, accel, without, covariance)
+    _, history = FILTER(ekf, state, gyro, accel, leaping, covariance)
+    for name in ("position", "velocity", "covariance_diagonal", "healthy"):
+        np.testing.assert_array_equal(getattr(history, name), getattr(wanted, name))
+    assert (history.accepted[rows] == 0).all() and history.healthy.all()
+    believed = displacement.copy()
+    believed[rows, 1] += 30.0
+    _, history = FILTER(ekf, state, gyro, accel, believed, covariance)
+    assert (history.accepted[rows] == 1).all()
