@@ -55,41 +55,6 @@ def spoil(name, rows, value):
     return change
 
 
-def add_noise(parts):
-    """White noise of a phone's IMU. Some networks normalise a window's changes, and of a circle at
-    a constant pace these are the rounding alone."""
-    random = np.random.default_rng(7)
-    for name, std in (("gyr", 0.005), ("acc", 0.05)):
-        values = parts[f"{name}_compensated_rotated_in_World"]
-        values += random.normal(0.0, std, values.shape)
-
-
-def write_csv(path, seconds=6.0):
-    """The same head as it starts: a second at rest, a second in which it speeds up, and the circle;
-    gyro and accel in the body, with the noise of `add_noise`."""
-    time = np.arange(0.0, seconds, 1 / 200)
-    share = np.clip(time - 1.0, 0.0, 1.0)  # of the speed
-    turned = np.where(time < 2.0, 0.5 * share**2, time - 1.5)
-    yaw = TURN * turned
-    gain = np.where((time > 1.0) & (time < 2.0), SPEED, 0.0)
-    along = np.column_stack([np.cos(yaw), np.sin(yaw), 0 * yaw])
-    left = np.column_stack([-np.sin(yaw), np.cos(yaw), 0 * yaw])
-    force = gain[:, None] * along + (SPEED * TURN * share**2)[:, None] * left + [0, 0, 9.81]
-    rate = np.column_stack([0 * yaw, 0 * yaw, TURN * share])
-    attitude = Rotation.from_euler("z", yaw[:, None]) * Rotation.from_euler("y", TILT)
-    parts = {
-        "gyr_compensated_rotated_in_World": attitude.inv().apply(rate),
-        "acc_compensated_rotated_in_World": attitude.inv().apply(force),
-    }
-    add_noise(parts)
-    table = np.column_stack([time, *parts.values()])
-    axes = (f"{name}_{axis}" for name in ("gyro", "accel") for axis in "xyz")
-    units = ["rad/s"] * 3 + ["m/s^2"] * 3
-    names = (f"{axis} [{unit}]" for axis, unit in zip(axes, units, strict=True))
-    header = ",".join(["time [s]", *names])
-    np.savetxt(path, table, "%.6f", ",", header=header, comments="")
-
-
 def write_splits(root, train="ab", **options):
     """A folder of three short walks: two to train with, one for validation and test."""
     for name in "abc":
