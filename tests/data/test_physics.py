@@ -64,6 +64,19 @@ def test_units_and_clocks_are_found(scale, clock, words):
         physics.check_turning(imu, "walk")
 
 
+def test_a_short_recording_is_warned_of_and_a_shorter_one_is_not():
+    for seconds in (20, 7, 4):
+        rows = TIME <= seconds
+        imu = ImuSamples(TIME[rows], -GYRO[rows], FORCE[rows])
+        if seconds == 20:
+            with pytest.raises(InputError, match="gravity turns against the gyro"):
+                physics.check_turning(imu, "walk")
+            continue
+        warnings = physics.check_turning(imu, "walk")
+        assert len(warnings) == (1 if seconds == 7 else 0)
+        assert all("gravity turns against the gyro" in text for text in warnings)
+
+
 def test_a_clock_in_doubt_is_supported_if_no_other_one_explains_gravity_better():
     assert physics.is_clock_supported(WALK)
     for pace in (0.2, 0.4, 0.5, 2.0, 2.5, 5.0):

@@ -847,6 +847,12 @@ def test_a_gyro_may_read_zero_at_rest(tmp_path):
     ]
     found = imported(put(tmp_path, table(values=values)), gyro_unit="rad/s")
     assert found.sequence.imu_valid is None and not any("repeats" in w for w in found.warnings)
+    values = WALK + noise
+    values[600:660, :3] = 0.0  # while it is shaken, a gyro that reads 0 hangs
+    found = imported(put(tmp_path, table(values=values)), gyro_unit="rad/s")
+    assert any("gyro repeats the same values in 59 of 1400 rows" in w for w in found.warnings)
+    valid = found.sequence.imu_valid
+    assert valid is not None and not valid[610:650].any() and valid[:600].all()
 
 
 def test_a_sensor_slower_than_its_rows_runs_at_its_own_rate(tmp_path):
