@@ -92,6 +92,13 @@ def test_what_cannot_be_told_is_no_contradiction():
         assert physics.contradiction(imu) is None
 
 
+def test_nothing_is_turned_over_a_hole():
+    time = np.arange(12000) / 100
+    time = time[time % 7.0 < 4.0]
+    imu = ImuSamples(time, known_walk.rate(time), known_walk.force(time))
+    assert physics.agreement(imu)[0] < 2 * physics.agreement(WALK)[0]
+
+
 def test_a_day_of_stamps_takes_no_memory():
     """One stamp may be far from all others."""
     time = TIME.copy()
@@ -108,8 +115,10 @@ def test_runs_of_equal_rows_are_no_samples_of_a_fine_sensor():
     assert not slower
     rows, slower = physics.repeats(TIME, (GYRO + noise)[np.arange(3000) // 4 * 4])
     assert slower and rows.sum() == 2250
-    coarse = np.round(FORCE * 0 + 9.81 + noise, 1)  # a table of a coarse sensor at rest
-    assert not physics.repeats(TIME, coarse)[0].any()
+    # Coarse sensors at rest: one that always reads the same, and one whose axes change one by one.
+    for spread in (1.0, 2.5):
+        coarse = np.round(np.array([0.0, 0.0, 9.8]) + spread * noise, 1)
+        assert not physics.repeats(TIME, coarse)[0].any()
 
 
 def test_the_check_of_own_recordings_asks_the_same(tmp_path):
