@@ -150,7 +150,7 @@ def rows_by_sensor(file: LogFile) -> list[LogFile]:
     groups: dict[str, list[str]] = {}
     comments = (cells_of(without_mark(line), layout.separator) for line in layout.preamble)
     for cells in (layout.labels, *layout.subheaders, *comments):
-        if len(cells) > index and labels.sensor_named(cells[index]):
+        if len(cells) > index and cells[index] in words and labels.sensor_named(cells[index]):
             groups[cells[index]] = [layout.separator.join(cells)]
     for _, cells in rows_of(file.path, layout, content):
         tag = tags.get(cells[index], cells[index]) if len(cells) > index else ""

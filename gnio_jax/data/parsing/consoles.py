@@ -4,6 +4,7 @@ console puts the time before each line. Limits are ours."""
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ FEWEST_PAIRS, SHARE = 3, 0.9
 """Smallest number of names in a line, and share of the lines that are of one form."""
 
 
-class Console(NamedTuple):
+class ConsoleForm(NamedTuple):
     """The form of the lines."""
 
     separator: bytes
@@ -40,17 +41,17 @@ class Console(NamedTuple):
         return self.separator.join([*stamp, *(number for _, number in pairs)])
 
 
-def console_of(head: bytes, separator_of: Callable[[bytes], str]) -> Console | None:
+def console_of(head: bytes, separator_of: Callable[[bytes], str]) -> ConsoleForm | None:
     """The form of the lines of a console by its first bytes; None if it is a table.
 
     `separator_of` gives the separator of a table by its first bytes.
     """
     lines = [line for line in head.splitlines() if line.strip()]
     is_stamped = sum(bool(STAMP.match(line)) for line in lines) > SHARE * len(lines)
-    rests = [STAMP.sub(b"", line) for line in lines] if is_stamped else lines
-    forms = [tuple(name.decode() for name, _ in PAIR.findall(line)) for line in rests]
-    names = max(set(forms), key=forms.count, default=())
+    texts = [STAMP.sub(b"", line) for line in lines] if is_stamped else lines
+    forms = Counter(tuple(name.decode() for name, _ in PAIR.findall(line)) for line in texts)
+    names, count = max(forms.items(), key=lambda form: form[1], default=((), 0))
     is_named = len(set(names)) == len(names) >= FEWEST_PAIRS
-    if is_named and forms.count(names) > SHARE * len(lines) - 1:  # the last line may be cut
-        return Console(b",", ("time",) * is_stamped + names)
-    return Console(separator_of(b"\n".join(rests)).encode()) if is_stamped else None
+    if is_named and count > SHARE * len(lines) - 1:  # the last line may be cut
+        return ConsoleForm(b",", ("time",) * is_stamped + names)
+    return ConsoleForm(separator_of(b"\n".join(texts)).encode()) if is_stamped else None

@@ -721,6 +721,14 @@ def test_rows_that_name_their_sensor(tmp_path):
     swapped = [",".join([c[1], c[0], *c[2:]]) for c in cells]
     check(put(tmp_path, lines("time,sensor,x,y,z", *swapped)))
     check(put(tmp_path, lines("time,x,y,z,sensor", *(",".join([*c[1:], c[0]]) for c in cells))))
+    head = [  # Indoor Location's recorder describes the chips above its rows
+        f"#\ttype:{n}\tname:BMI160 {name}\tversion:2062600"
+        for n, name in ((1, "Accelerometer"), (4, "Gyroscope"), (35, "Accelerometer Uncalibrated"))
+    ]
+    kinds = {"accelerometer": "TYPE_ACCELEROMETER", "gyroscope": "TYPE_GYROSCOPE"}
+    typed = ["\t".join([c[1], kinds[c[0]], *c[2:], "3"]) for c in cells]
+    typed[50:50] = ["0.250\tTYPE_WIFI\tssid\tbssid\t-60\t2412"]
+    check(put(tmp_path, lines("#\tstartTime:1574658290986", *head, *typed), "site.txt"))
     for first in (0, 1):  # values by their numbers
         names = ",".join(f"v{n + first}" for n in range(3))
         check(put(tmp_path, lines(f"time,sensor,{names}", *swapped)))
