@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Mapping
 from itertools import chain
 
 GYRO = ("gyro_x", "gyro_y", "gyro_z")
@@ -40,6 +40,8 @@ _SPELLINGS = {
     "ns": "ns nsec nsecs nanosecs nanos nanosec nanoseconds",
 }
 """Our names of units, and their names in headers as `unit_of` compares them."""
+CLOCK_UNITS = ("s", "ms", "us", "ns")
+"""Those of stamps."""
 _NAMED = {name: unit for unit, names in _SPELLINGS.items() for name in names.split()}
 _BRACKETS = re.compile(r"\s*[(\[]([^\[\]]*)[)\]]\s*$")
 _TAIL = re.compile(
@@ -67,8 +69,17 @@ _ALIASES = {
     ),
 }
 """Names of the columns of a sensor, as `plain_name` writes them, the surest first."""
-_ALONE = r"(measurement|value|raw|data)?" + _AXIS
-"""Names of the axes in a table of one sensor."""
+_ALONE = (r"(measurement|value|raw|data)?" + _AXIS, r"(v|val|value|values|data)_?{number}")
+"""Names of the axes in a table of one sensor, the second ones numbered from 0 or from 1."""
+_IN_UNITS = {
+    "gyro": (("rad/s", "deg/s", "mdps", "mrad/s"), r"(?!.*(bias|offset))(.*_)?{axis}"),
+    "accel": (
+        ("m/s2", "g", "mg", "cm/s2", "mm/s2"),
+        r"(?!.*(user|lin|grav|mag|field|bias|offset))(.*_)?{axis}",
+    ),
+}
+"""Units by which the axes of a sensor are known, whatever its name is, and the names that they may
+have."""
 _SECOND = r"(s|sec|secs|seconds|ms|msec|millis|us|usec|micros|ns|nsec|nanos|unix)"
 _TIMES = (
     r"(field_)?header_stamp",
@@ -76,9 +87,11 @@ _TIMES = (
     r"time|time_?stamp|stamp|t",
     r"(unix|epoch|utc|sys|system|host|device|log|logging|local)?_?(time|time_?stamp|stamp|t|epoch)"
     rf"(_?{_SECOND}|_txt)?",
-    r"seconds_elapsed|elapsed(_time)?(_?s|_?ms)?|millis|micros|nanos|date_?time|ms|us|epoc",
+    r"seconds_elapsed|elapsed(_time)?(_?s|_?ms)?|millis|micros|nanos|date_?time|ms|us|epoc|ticks?",
     r"(?!.*(gps|frame|zone)).*time.*",
 )
+_NO_CLOCK = r".*(dt|delta|interval|period|duration|delay|latency|exposure).*"
+"""Names of times that are no stamps."""
 _TAGS = {"gyro": r".*(gyr|rotation_?rate)", "accel": r"(?!.*(lin|user|gravity)).*acc(?!u)"}
 """Names of files, or tags of rows, of one sensor."""
 # --- units
@@ -116,7 +129,7 @@ def are_units(cells: Iterable[str]) -> bool:
 def plain_name(label: str) -> str:
     """The name of a column without unit, in small letters, with words joined by _."""
     name = _TAIL.sub("", _BRACKETS.sub("", label))
-    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.replace("ω", "omega"))
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
 
@@ -126,19 +139,33 @@ def sensor_named(name: str) -> str | None:
     return sensors[0] if len(sensors) == 1 else None
 
 
-def resolve_labels(labels: Iterable[str], alone: str | None = None) -> dict[str, str]:
-    """Our name → label of the columns whose names are known. `alone` is the sensor of a table of
+def resolve_labels(
+    labels: Iterable[str],
+    alone: str | None = None,
+    units: Mapping[str, str | None] | None = None,
+) -> dict[str, str]:
+    """Our name → label of the columns whose names are known, or whose `units` (label → text; None:
+    those in the labels) only one sensor or the time has. `alone` is the sensor of a table of
     one."""
     plain = {str(label): plain_name(str(label)) for label in labels}
+    texts = {label: unit_text(label) for label in plain} | dict(units or {})
 
-    def fitting(pattern: str) -> list[str]:
-        return [label for label, name in plain.items() if re.fullmatch(pattern, name)]
+    def fitting(pattern: str, units: Container[str | None] | None = None) -> list[str]:
+        names = [label for label, name in plain.items() if re.fullmatch(pattern, name)]
+        return [n for n in names if units is None or unit_of(texts[n]) in units]
 
     names: dict[str, str] = {name: name for name in NAMES if name in plain}
+    first = 0 if fitting(_ALONE[1].format(number=0)) else 1
     for sensor, axes in AXES.items():
-        patterns = (*_ALIASES[sensor], _ALONE) if alone == sensor else _ALIASES[sensor]
-        for pattern in () if alone not in (None, sensor) or set(axes) <= set(names) else patterns:
-            columns = [fitting(pattern.format(axis=axis)) for axis in "xyz"]
+        if alone not in (None, sensor) or set(axes) <= set(names):
+            continue
+        patterns = [(p, None) for p in (*_ALIASES[sensor], *(_ALONE if alone == sensor else ()))]
+        known_units, pattern_of_axes = _IN_UNITS[sensor]
+        for pattern, units_of_axes in (*patterns, (pattern_of_axes, known_units)):
+            columns = [
+                fitting(pattern.format(axis=axis, number=number), units_of_axes)
+                for number, axis in enumerate("xyz", first)
+            ]
             if all(len(column) == 1 for column in columns):
                 names |= {axis: column[0] for axis, column in zip(axes, columns, strict=True)}
             if any(columns):
@@ -151,6 +178,9 @@ def resolve_labels(labels: Iterable[str], alone: str | None = None) -> dict[str,
             if plain[label].rpartition("_")[0] == plain[fraction].rpartition("_")[0]
         ]
         stamps = next((columns for columns in map(fitting, _TIMES) if columns), [])
+        if len(stamps) > 1:  # t (°C) is a temperature
+            stamps = [label for label in stamps if unit_of(texts[label]) in CLOCK_UNITS] or stamps
+        stamps = stamps or fitting(rf"(?!{_NO_CLOCK}).*", CLOCK_UNITS)
         stamps = pairs if pairs and not fitting(_TIMES[0]) else stamps
         names |= {"time": stamps[0]} if len(stamps) == 1 else {}
     return names

@@ -74,6 +74,19 @@ def test_the_kind_of_motion_is_told_at_any_rate_and_on_any_side(name):
             assert gait.has_steps == (shares[0] > 0)
 
 
+def test_a_step_shakes_and_turns_the_device():
+    """A device that only bounces, and one of which one sensor alone repeats itself, do not walk."""
+    time = np.arange(0.0, 40.0, 0.01)
+    wave = np.sin(2 * np.pi * 1.8 * time)[:, None] * [1.0, 0.0, 0.0]
+    turning, force = noise(time, 7, 2.0, 0.7)
+    steady = noise(time, 8, 0.05, 0.02)
+    bounce = steady[1] + 2.0 * wave[:, [1, 2, 0]]
+    assert detect_gait(steady[0] + wave, bounce, 100.0).walking.all()
+    assert not detect_gait(steady[0] + 0.08 * wave, bounce, 100.0).walking.any()
+    assert not detect_gait(turning + wave, force, 100.0).walking.any()
+    assert not detect_gait(turning, force + 3.0 * wave, 100.0).walking.any()
+
+
 def test_a_slow_logger_shows_steps_too():
     gait = detect_gait(*walk(np.arange(0.0, 40.0, 0.1)), rate=10.0)
     assert gait.walking.all() and not detect_gait(*ride(np.arange(0.0, 40.0, 0.1)), 10.0).has_steps

@@ -64,6 +64,19 @@ def test_units_and_clocks_are_found(scale, clock, words):
         physics.check_turning(imu, "walk")
 
 
+def test_a_short_recording_is_warned_of_and_a_shorter_one_is_not():
+    for seconds in (20, 7, 4):
+        rows = TIME <= seconds
+        imu = ImuSamples(TIME[rows], -GYRO[rows], FORCE[rows])
+        if seconds == 20:
+            with pytest.raises(InputError, match="gravity turns against the gyro"):
+                physics.check_turning(imu, "walk")
+            continue
+        warnings = physics.check_turning(imu, "walk")
+        assert len(warnings) == (1 if seconds == 7 else 0)
+        assert all("gravity turns against the gyro" in text for text in warnings)
+
+
 def test_a_clock_in_doubt_is_supported_if_no_other_one_explains_gravity_better():
     assert physics.is_clock_supported(WALK)
     for pace in (0.2, 0.4, 0.5, 2.0, 2.5, 5.0):
@@ -77,6 +90,13 @@ def test_what_cannot_be_told_is_no_contradiction():
     gap = WALK._replace(time=np.where(np.arange(3000) % 100 < 99, TIME, TIME + 50.0).cumsum())
     for imu in (still, still._replace(gyro=-noise), short._replace(gyro=-GYRO[:300]), gap):
         assert physics.contradiction(imu) is None
+
+
+def test_nothing_is_turned_over_a_hole():
+    time = np.arange(12000) / 100
+    time = time[time % 7.0 < 4.0]
+    imu = ImuSamples(time, known_walk.rate(time), known_walk.force(time))
+    assert physics.agreement(imu)[0] < 2 * physics.agreement(WALK)[0]
 
 
 def test_a_day_of_stamps_takes_no_memory():
@@ -95,8 +115,10 @@ def test_runs_of_equal_rows_are_no_samples_of_a_fine_sensor():
     assert not slower
     rows, slower = physics.repeats(TIME, (GYRO + noise)[np.arange(3000) // 4 * 4])
     assert slower and rows.sum() == 2250
-    coarse = np.round(FORCE * 0 + 9.81 + noise, 1)  # a table of a coarse sensor at rest
-    assert not physics.repeats(TIME, coarse)[0].any()
+    # Coarse sensors at rest: one that always reads the same, and one whose axes change one by one.
+    for spread in (1.0, 2.5):
+        coarse = np.round(np.array([0.0, 0.0, 9.8]) + spread * noise, 1)
+        assert not physics.repeats(TIME, coarse)[0].any()
 
 
 def test_the_check_of_own_recordings_asks_the_same(tmp_path):

@@ -216,8 +216,8 @@ def _unwrap(stamps: Real[np.ndarray, " n"]) -> tuple[Real[np.ndarray, " n"], int
 
 
 def _strays(stamps: Real[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Up to a `few` rows whose stamps are far before or after all others: the first one, before the
-    clock was set, or what was buffered before."""
+    """A few rows (`most_damaged_rows`) whose stamps are far before or after all others: the first
+    one, before the clock was set, or what was buffered before."""
     longest = LONGEST_PAUSE * usual_step(stamps)
     strays = np.zeros(len(stamps), dtype=bool)
     if np.abs(np.diff(stamps)).max(initial=0) > longest:

@@ -150,7 +150,7 @@ def rows_by_sensor(file: LogFile) -> list[LogFile]:
     groups: dict[str, list[str]] = {}
     comments = (cells_of(without_mark(line), layout.separator) for line in layout.preamble)
     for cells in (layout.labels, *layout.subheaders, *comments):
-        if len(cells) > index and labels.sensor_named(cells[index]):
+        if len(cells) > index and cells[index] in words and labels.sensor_named(cells[index]):
             groups[cells[index]] = [layout.separator.join(cells)]
     for _, cells in rows_of(file.path, layout, content):
         tag = tags.get(cells[index], cells[index]) if len(cells) > index else ""
@@ -249,8 +249,9 @@ def _columns(
     needed = [] if options.sample_rate is not None else [*times]
     needed += [axis for sensor in sensors for axis in AXES[sensor]]
     is_numbered = headings == [str(index) for index in range(len(headings))]
-    guesses = _by_place(frame, alone) if is_numbered else labels.resolve_labels(headings, alone)
-    dated = [label for label in headings if frame[label].dtype.kind == "M"]
+    guesses = labels.resolve_labels(headings, alone, log.texts)
+    guesses = _by_place(frame, alone) if is_numbered else guesses
+    dated = [label for label, dtype in frame.dtypes.items() if dtype.kind == "M"]
     names_of = ({"time": dated[0]} if len(dated) == 1 else {}) | guesses | names
     columns = {name: names_of.get(name, name) for name in needed}
     _check_one_imu(frame, columns, path)
@@ -287,6 +288,7 @@ def _by_place(frame: pd.DataFrame, sensor: str | None) -> dict[str, str]:
 def _check_one_imu(frame: pd.DataFrame, columns: dict[str, str], path: Path) -> None:
     """Raise `InputError` if the rows of several sensors take turns or follow each other: a column
     of a few values that is not used changes with most rows, or whenever the stamps go back."""
+    frame = frame.loc[:, ~frame.columns.duplicated()]
     stamps = frame.get(columns.get("time", ""))
     back = np.zeros(len(frame), bool) if stamps is None else (stamps < stamps.shift()).to_numpy()
     for label in frame.columns.difference(list(columns.values())):

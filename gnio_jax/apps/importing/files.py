@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from gnio_jax.data.parsing import text as parsing
+from gnio_jax.data.parsing.consoles import console_of
 from gnio_jax.data.parsing.tables import Table, parsing_as
 from gnio_jax.errors import InputError, require_packages
 
@@ -59,12 +60,22 @@ def log_file(
     name: str, path: Path, content: _Content = lambda: None, head: bytes | None = None
 ) -> LogFile:
     """A table with the shape that its first bytes `head` have (None: those of `content`)."""
-    layout = parsing.layout_of(path, content() if head is None else head)
+    head = parsing.head_of(path, content() if head is None else head)
+    console = console_of(head, lambda rows: parsing.layout_of(path, rows).separator)
+    if console is not None:
+        text = content()
+        rows = console.rows(path.read_bytes() if text is None else text)
+        content, head = partial(bytes, rows), rows
+    layout = parsing.layout_of(path, head)
+    if console is not None and console.names:
+        layout = layout._replace(labels=console.names)
 
     @functools.cache
     def read() -> tuple[Table, list[str]]:
         notes: list[str] = []
         frame, rows = parsing.tolerant_frame(path, layout, content(), notes)
+        if console is not None:
+            notes.append(f"{path.name}: lines of a serial console are read as rows")
         if words := [line for line in layout.preamble if parsing.is_row(line)]:
             problem = f"{len(words)} lines above the header are not rows"
             notes.append(f"{path.name}: {problem} ('{parsing.shorten(words[0], 40)}')")

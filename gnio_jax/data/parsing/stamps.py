@@ -176,12 +176,14 @@ def most_damaged_rows(count: int) -> float:
 
 def parse_times(cells: pd.Series) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Stamps of times of day, and which cells are one: ns since 1970, or since midnight if there is
-    no date, in UTC if there is no zone. Examples are 2024-05-03 09:15:02.250, 09:15:02:250,
-    15:02.250 and 5/3/2024 9:15:02 AM. A time without a date that is earlier by half a day than the
-    one before is of the next day, and minutes without an hour are of the next hour."""
+    no date, in UTC if there is no zone. Examples are 2024-05-03 09:15:02.250, 20240503_091502.250,
+    09:15:02:250, 15:02.250 and 5/3/2024 9:15:02 AM. A time without a date that is earlier by half
+    a day than the one before is of the next day, and minutes without an hour are of the next
+    hour."""
     text = cells.astype(str).str.strip(" \"'[]")
-    text = text.str.replace(r"(:\d+)[:, ]((?:\d{3})+)(?!\d)", r"\1.\2", regex=True)
-    text = text.str.replace(r"^(\d{4}-?\d\d-?\d\d)[_T-](?=\d\d)", r"\1 ", regex=True)
+    date = r"^(\d{4})-?(\d\d)-?(\d\d)[ _T-](\d\d)[:-]?(\d\d)[:-]?(\d\d)"
+    text = text.str.replace(date, r"\1-\2-\3 \4:\5:\6", regex=True)
+    text = text.str.replace(r"(:\d+)[:, -]((?:\d{3})+)(?!\d)", r"\1.\2", regex=True)
     clock = text.str.extract(r"^((?:\d+:)?\d+:\d+(?:\.\d+)?) ?([AaPp][Mm])?$")
     if clock[0].notna().mean() > 0.5:
         has_hours = bool((clock[0].str.count(":") > 1).any())

@@ -13,7 +13,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Iterator
-from itertools import islice
+from itertools import accumulate, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -182,6 +182,10 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
     preamble = [lines[n] for n in range(data[0]) if n not in headers and lines[n].strip()]
     header = max(headers, key=lambda number: len(set(headers[number]) - {""}), default=-1)
     labels = headers.pop(header, ())
+    for groups in headers.values():  # names of sensors over their axes: each holds up to the next
+        upper = accumulate(groups, lambda before, group: group or before)
+        joined = tuple(f"{a} {b}".strip() for a, b in zip(upper, labels, strict=True))
+        labels = joined if len(set(joined)) > len(set(labels)) else labels
     is_comma = any(re.search(r"\d,\d", cell) for n in data for cell in rows[n])
     others, decimal = tuple(headers.values()), "," if is_comma else "."
     return Layout(encoding, mark, decimal, labels, others, data[0], width, tuple(preamble))
@@ -242,9 +246,10 @@ def strict_frame(path: Path, layout: Layout, content: bytes | None = None) -> pd
 def tolerant_frame(
     path: Path, layout: Layout, content: bytes | None, notes: list[str]
 ) -> tuple[pd.DataFrame, Int[np.ndarray, " n"]]:
-    """The rows of a table without a `few` damaged ones, which are named in `notes`, and their
-    numbers among the rows of the file, from 0. Columns of numbers are numbers, times of day are
-    datetime64 in ns, others remain as they are. Raises `InputError` if more are damaged."""
+    """The rows of a table without a few damaged ones (`most_damaged_rows`), which are named in
+    `notes`, and their numbers among the rows of the file, from 0. Columns of numbers are numbers,
+    times of day are datetime64 in ns, others remain as they are. Raises `InputError` if more are
+    damaged."""
     frame, is_mixed, width = None, False, layout.width
     with contextlib.suppress(UnicodeDecodeError, pd.errors.ParserError):
         frame = _parse(path, layout, content)

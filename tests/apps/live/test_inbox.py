@@ -42,7 +42,8 @@ def test_what_waits_is_bounded_and_what_is_lost_is_said(monkeypatch, bound):
     stage = inbox.arrivals(parse_lines, 0.05)
     assert kept == 5
     assert next(stage).notice.startswith("7 datagrams are lost: they came faster than")
-    assert len(samples_of(stage)) == 5
+    rest = list(stage)
+    assert len(samples_of(rest)) == 5 and texts_of(rest, "notice") == []  # it is said once
     assert inbox.put(line, 20)  # what was read makes place
 
 
