@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,12 +9,11 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from gnio_jax import config as configuration
 from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.reporting import Reporter, Silence
 from gnio_jax.tables.experiments import TableRow
-from gnio_jax.tables.runs import finished_epochs, run_state
+from gnio_jax.tables.runs import finished_epochs, unfinished_runs
 from gnio_jax.training import loop
 from gnio_jax.training.recordings import set_up
 
@@ -28,9 +26,7 @@ def announce(rows: Sequence[TableRow], out: Path, seeds: int, reporter: Reporter
     is nothing to estimate. Rows that are fitted without steps are named without a time."""
     unfinished, texts, total = [], [], 0.0
     for row in rows:
-        config = dataclasses.replace(row.config, workdir=str(out / "runs" / row.name))
-        runs = configuration.with_seeds(config, range(seeds))
-        runs = [run for run in runs if run_state(run) != "finished"]
+        runs = unfinished_runs(row, out, seeds)
         epochs = [finished_epochs(Path(run.workdir or "")) for run in runs]
         if runs:
             unfinished.append((row, len(runs) - sum(epochs) / row.config.optim.epochs))

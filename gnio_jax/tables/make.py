@@ -28,7 +28,8 @@ from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments
 from gnio_jax.tables.duration import announce
 from gnio_jax.tables.experiments import Experiment
-from gnio_jax.tables.runs import RowResult, run_row
+from gnio_jax.tables.runs import RowResult, run_row, unfinished_runs
+from gnio_jax.training import loop
 
 METRICS = (
     *("ate", "ate_2d", "ate_ronin", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
@@ -66,6 +67,9 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
         experiment = experiments.comparison(base, options.split, networks(options))
     if options.table == "trajectories":
         options = dataclasses.replace(options, seeds=1)
+    for row in experiment.rows:  # before hours go into the rows before it
+        if unfinished_runs(row, Path(options.out), options.seeds):
+            loop.refuse_untrainable(row.config)
     if options.table == "comparison":
         announce(experiment.rows, Path(options.out), options.seeds, reporter)
     results = [run_row(row, options, reporter, workers) for row in experiment.rows]

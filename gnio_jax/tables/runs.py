@@ -90,6 +90,13 @@ def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers
             raise Interrupted(outcomes[-1].stopped_by)
 
 
+def unfinished_runs(row: TableRow, out: Path, seeds: int) -> list[TrainConfig]:
+    """The runs of a row that are not trained to their end. Raises `InputError` as `run_state`."""
+    config = dataclasses.replace(row.config, workdir=str(out / "runs" / row.name))
+    runs = configuration.with_seeds(config, range(seeds))
+    return [run for run in runs if run_state(run) != "finished"]
+
+
 def run_state(config: TrainConfig) -> str:
     """State of the run of `config`: new, begun or finished. Raises `InputError` if its folder has a
     run with other settings or of other recordings."""
