@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from gnio_jax.config.schema import Bound, Count
 from gnio_jax.models.heads import LinearHead, UncertaintyHead
-from gnio_jax.models.layers import checked_windows, linear
+from gnio_jax.models.layers import checked_windows, fourier_waves, linear
 from gnio_jax.models.resnet import ResNet18
 from gnio_jax.types import Prediction
 
@@ -62,7 +62,10 @@ def spectrum(windows: Float[Array, "b n 6"]) -> Float[Array, "b f"]:
     Shorter windows have zeros where there is no frequency."""
     squared = jnp.sum(windows.reshape(*windows.shape[:2], 2, 3) ** 2, axis=-1)
     size = jnp.sqrt(jnp.maximum(squared, 1e-12))
-    lines = jnp.fft.rfft(size, axis=1)[:, :FREQUENCIES] / windows.shape[1]
-    power = jnp.log(jnp.real(lines * jnp.conj(lines)) + 1e-6).astype(jnp.float32)
+    cosines, sines = (waves[:, :FREQUENCIES] for waves in fourier_waves(windows.shape[1]))
+    real, imaginary = (
+        jnp.einsum("bnk,nf->bfk", size, waves) / windows.shape[1] for waves in (cosines, sines)
+    )
+    power = jnp.log(real**2 + imaginary**2 + 1e-6)
     power = jnp.pad(power, ((0, 0), (0, FREQUENCIES - power.shape[1]), (0, 0)))
     return power.reshape(len(windows), -1)

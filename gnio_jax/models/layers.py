@@ -8,6 +8,7 @@ from typing import Any, Literal
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
@@ -90,6 +91,14 @@ def unpadded_conv(features: int, size: int, stride: int, train: bool, name: str)
     in_training = convolve if train else convolve_forward
     options = {"conv_general_dilated": in_training, "name": name} | FLOAT32
     return nn.Conv(features, (size,), (stride,), [(0, 0)], **options)
+
+
+def fourier_waves(length: int) -> tuple[Float[np.ndarray, "n f"], Float[np.ndarray, "n f"]]:
+    """Cosines and sines of the frequencies of `length` real numbers: x @ cosines and −x @ sines are
+    the real and the imaginary part of their spectrum. (The export cannot write JAX's transform.)"""
+    turns = np.outer(np.arange(length), np.arange(length // 2 + 1)) % length / length
+    angle = 2 * np.pi * turns
+    return np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
 
 
 def layer_norm(name: str) -> nn.LayerNorm:

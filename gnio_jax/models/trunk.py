@@ -21,7 +21,7 @@ from gnio_jax.models.bins import BinHead
 from gnio_jax.models.convolution import convolve_depthwise
 from gnio_jax.models.deepils import ChannelAttention, TimeAttention
 from gnio_jax.models.heads import ConstantUncertainty, GatedHead, LinearHead, UncertaintyHead
-from gnio_jax.models.layers import checked_windows, conv, conv_norm, linear
+from gnio_jax.models.layers import checked_windows, conv, conv_norm, fourier_waves, linear
 from gnio_jax.types import GRAVITY, Prediction
 
 STAGES, BLOCKS = 3, 2
@@ -154,12 +154,17 @@ class FourierBlock(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "b n c"], train: bool) -> Float[Array, "b n c"]:
         channels = x.shape[-1]
-        spectrum = jnp.fft.rfft(x, axis=-1)
-        shape = (spectrum.shape[-1],)
-        gain = self.param("gain", nn.initializers.normal(1.0), shape, jnp.float32)
-        phase = self.param("quadrature", nn.initializers.normal(1.0), shape, jnp.float32)
-        y = jnp.fft.irfft(spectrum * (gain + 1j * phase)[None, None], channels, axis=-1)
-        return x + nn.relu(conv_norm(y.astype(jnp.float32), channels, 3, 1, train, "conv"))
+        cosines, sines = fourier_waves(channels)
+        lines = cosines.shape[1]
+        gain = self.param("gain", nn.initializers.normal(1.0), (lines,), jnp.float32)[None, None]
+        phase = self.param("quadrature", nn.initializers.normal(1.0), (lines,), jnp.float32)
+        phase = phase[None, None]
+        real, imaginary = x @ cosines, -(x @ sines)
+        # A line stands for its conjugate too, except the first, and the last of an even number.
+        weight = np.where(2 * np.arange(lines) % channels, 2, 1).astype(np.float32) / channels
+        cosines, sines = (weight[:, None] * waves.T for waves in (cosines, sines))
+        y = (real * gain - imaginary * phase) @ cosines - (real * phase + imaginary * gain) @ sines
+        return x + nn.relu(conv_norm(y, channels, 3, 1, train, "conv"))
 
 
 class Shrinkage(nn.Module):

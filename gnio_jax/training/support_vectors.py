@@ -47,9 +47,8 @@ def labelled_windows(sequences: Iterable[Sequence], config: TrainConfig) -> Labe
     parts, names = [], []
     for sequence in sequences:
         source = window_source([sequence], config.data, config.data.train_stride)
-        part = jax.device_get(
-            gather(source, jnp.asarray(source.visited), config.data.input_samples)
-        )
+        source = jax.tree.map(jnp.asarray, source)
+        part = jax.device_get(gather(source, source.visited, config.data.input_samples))
         parts.append(part)
         names += [str(sequence.attributes.get("placement", ""))] * len(part.imu)
     windows, displacement = (np.concatenate([part[k] for part in parts]) for k in (0, 1))

@@ -61,6 +61,9 @@ def test_what_the_router_sees_does_not_turn_and_short_windows_are_filled_up():
     seen = see(jnp.asarray(windows))
     np.testing.assert_allclose(see(jnp.asarray(turned)), seen, atol=1e-5)
     assert seen.shape == (1, 32) and not np.any(seen[0, 22:])
+    sizes = np.linalg.norm(windows[0].reshape(20, 2, 3), axis=-1)
+    power = np.abs(np.fft.rfft(sizes, axis=0) / 20) ** 2
+    np.testing.assert_allclose(seen[0, :22], np.log(power + 1e-6).ravel(), atol=1e-4)
 
 
 def test_the_loss_has_the_balance_of_the_shares():

@@ -1,4 +1,4 @@
-"""Attention by fewer passes against its definition."""
+"""Attention by fewer passes against its definition, and the spectrum by products."""
 
 import functools
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gnio_jax.models.layers import attend
+from gnio_jax.models.layers import attend, fourier_waves
 from tests.support.compiling import quick
 
 
@@ -36,3 +36,10 @@ def test_attention_and_its_gradient_against_the_definition(keys, causal):
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
     for one, other in zip(gradient, of_wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("length", [1, 2, 7, 64, 201])
+def test_the_waves_give_numpys_spectrum(length):
+    x = np.random.default_rng(length).standard_normal((3, length))
+    cosines, sines = fourier_waves(length)
+    np.testing.assert_allclose(x @ cosines - 1j * (x @ sines), np.fft.rfft(x), atol=1e-5)

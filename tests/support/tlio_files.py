@@ -55,6 +55,15 @@ def spoil(name, rows, value):
     return change
 
 
+def add_noise(parts):
+    """White noise of a phone's IMU. Some networks normalise a window's changes, and of a circle at
+    a constant pace these are the rounding alone."""
+    random = np.random.default_rng(7)
+    for name, std in (("gyr", 0.005), ("acc", 0.05)):
+        values = parts[f"{name}_compensated_rotated_in_World"]
+        values += random.normal(0.0, std, values.shape)
+
+
 def write_splits(root, train="ab", **options):
     """A folder of three short walks: two to train with, one for validation and test."""
     for name in "abc":

@@ -163,7 +163,12 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(
     assert not (tmp_path / "exports").exists()
 
 
-WINDOWED = ["ctin", "imot", "ionext", "ridi", "o2_frame", "so2_frame"]
+WINDOWED = {name: (name, SMALL[name]) for name in ("ctin", "experts", "imot", "ionext", "ridi")}
+WINDOWED["fourier"] = ("trunk", SMALL["trunk"] | {"block": "fourier"})
+WINDOWED |= {
+    frame: ("ronin_resnet", {"width": 4, "equivariance": frame})
+    for frame in ("o2_frame", "so2_frame")
+}
 """Networks with an operation of their own that a conversion has lost, and EqNIO's frames."""
 
 
@@ -174,9 +179,8 @@ def test_the_network_alone_gives_the_displacements_of_the_package(converter, nam
 
     from gnio_jax.apps.onnx import conversion
 
-    frame = {"width": 4, "equivariance": name}
-    network = ("ronin_resnet", frame) if name.endswith("_frame") else (name, SMALL[name])
-    model = registry.create(network[0], **network[1])
+    network, options = WINDOWED[name]
+    model = registry.create(network, **options)
     variables = registry.initialise(model, jax.random.key(0), CONFIG.data.input_samples)
     ekf = filtering.make_filter(CONFIG.data, CONFIG.filter)
     deployed = deploy_network(Network.of(model, variables), ekf)
