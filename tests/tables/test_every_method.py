@@ -23,8 +23,9 @@ def smallest(network, base):
     config = METHOD(network, base)
     if network == "ridi":  # it keeps as many support vectors as it needs
         return config
-    fields = {name: value for name, value in SMALL[network].items() if name in IN_CONFIG}
-    others = {name: value for name, value in SMALL[network].items() if name not in IN_CONFIG}
+    options = SMALL[network.removesuffix("_text")]
+    fields = {name: value for name, value in options.items() if name in IN_CONFIG}
+    others = {name: value for name, value in options.items() if name not in IN_CONFIG}
     return dataclasses.replace(
         config, model=dataclasses.replace(config.model, **fields, options=others)
     )
