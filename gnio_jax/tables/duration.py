@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,12 +9,11 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from gnio_jax import config as configuration
 from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.reporting import Reporter, Silence
 from gnio_jax.tables.experiments import TableRow
-from gnio_jax.tables.runs import run_state
+from gnio_jax.tables.runs import finished_epochs, unfinished_runs
 from gnio_jax.training import loop
 from gnio_jax.training.recordings import set_up
 
@@ -24,23 +22,22 @@ STEPS = 3
 
 
 def announce(rows: Sequence[TableRow], out: Path, seeds: int, reporter: Reporter) -> float | None:
-    """Say how long the seeds that are not trained yet will take, and return it in s; None if there
+    """Say how long the epochs that are not trained yet will take, and return it in s; None if there
     is nothing to estimate. Rows that are fitted without steps are named without a time."""
     unfinished, texts, total = [], [], 0.0
     for row in rows:
-        config = dataclasses.replace(row.config, workdir=str(out / "runs" / row.name))
-        runs = configuration.with_seeds(config, range(seeds))
-        count = sum(run_state(run) != "finished" for run in runs)
-        if count:
-            unfinished.append((row, count))
+        runs = unfinished_runs(row, out, seeds)
+        epochs = [finished_epochs(Path(run.workdir or "")) for run in runs]
+        if runs:
+            unfinished.append((row, len(runs) - sum(epochs) / row.config.optim.epochs))
     if not unfinished:
         return None
-    for number, (row, count) in enumerate(unfinished):
+    for number, (row, remaining_runs) in enumerate(unfinished):
         reporter.progress("timing a step of each network", number / len(unfinished))
         if models.trained_by(models.from_experiment(row.config)) != "gradient":
             texts.append(f"{row.label} without steps")
             continue
-        seconds = count * training_seconds(row.config)
+        seconds = remaining_runs * training_seconds(row.config)
         total += seconds
         texts.append(f"{row.label} {spell(seconds)}")
     reporter.line(

@@ -22,14 +22,14 @@ from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.folder import read_views
-from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Cell, MetricSummary
 from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments
 from gnio_jax.tables.duration import announce
 from gnio_jax.tables.experiments import Experiment
-from gnio_jax.tables.runs import RowResult, run_row
+from gnio_jax.tables.runs import RowResult, run_row, unfinished_runs
+from gnio_jax.training import loop
 
 METRICS = (
     *("ate", "ate_2d", "ate_ronin", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
@@ -67,6 +67,9 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
         experiment = experiments.comparison(base, options.split, networks(options))
     if options.table == "trajectories":
         options = dataclasses.replace(options, seeds=1)
+    for row in experiment.rows:  # before hours go into the rows before it
+        if unfinished_runs(row, Path(options.out), options.seeds):
+            loop.refuse_untrainable(row.config)
     if options.table == "comparison":
         announce(experiment.rows, Path(options.out), options.seeds, reporter)
     results = [run_row(row, options, reporter, workers) for row in experiment.rows]
@@ -124,6 +127,7 @@ def _words(text: str) -> tuple[str, ...]:
 
 def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> str:
     """Notes that explain the figures."""
+    on_core = " on one core" if jax.devices()[0].platform == "cpu" else ""
     calibrated = f", gnio calibrate on {base.data.val_split}" if options.calibrate else ""
     return (
         f"{base.datasets[0]} {options.split}, {options.estimator}; every row: "
@@ -131,7 +135,8 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> s
         f"{base.optim.learning_rate:g}, width {base.model.width or 64}, {base.data.rate:g} Hz, "
         f"{options.seeds} {'seed' if options.seeds == 1 else 'seeds'}{calibrated}; on "
         f"{hardware()}. ± is the standard deviation over seeds; the difference to the first "
-        "row is over sequences.\n\n"
+        f"row is over sequences. ms / interval is the median time of network and filter for "
+        f"{base.data.stride_seconds:g} s of a simulated walk{on_core}.\n\n"
         f"Published: {experiment.source}; the paper does not define its ATE."
     )
 
@@ -168,11 +173,18 @@ def make_table(
         figures |= _over_seeds("entropy of a window", [entropy[:, 0] for entropy in entropies])
         figures |= _over_seeds("entropy of their mean", [entropy[:, 1] for entropy in entropies])
     plots.save(with_ending(path, ".png"), plots.table(experiment, results, figures["ate"]))
-    table = render(experiment, figures, results[0].reports[0])
+    table = render(experiment, figures, results)
     text = f"## {experiment.title}\n\n{remarks}\n\n{table}"
     heads = [
-        {"row": row.name, "label": row.label, "seeds": options.seeds, "published": row.published}
-        for row in experiment.rows
+        {
+            "row": row.name,
+            "label": row.label,
+            "seeds": options.seeds,
+            "published": row.published,
+            "interval_ms": result.cost.interval_ms,
+            "parameters": result.cost.parameters,
+        }
+        for row, result in zip(experiment.rows, results, strict=True)
     ]
     tabulate.write(path, text, tabulate.records(heads, figures))
     return f"{text}\nresults: {path}.md, .csv, .png"
@@ -212,15 +224,18 @@ def figures_of(results: list[RowResult]) -> dict[str, list[Cell]]:
     }
 
 
-def render(experiment: Experiment, figures: Mapping[str, list[Cell]], report: Report) -> str:
+def render(
+    experiment: Experiment, figures: Mapping[str, list[Cell]], results: list[RowResult]
+) -> str:
     """The table as Markdown, followed by the meaning of its marks.
 
-    Its last rows are those to compare with: never moving, and perfect displacements in the filter
-    of `report`, the first evaluation.
+    Its last rows are those to compare with, of the first evaluation: never moving, and perfect
+    displacements in its filter.
     """
     columns = {name: TITLES.get(name) or tabulate.column(name) for name in figures}
     header = ["", *(column.title for column in columns.values()), "median ATE (m)", "change of ATE"]
-    header += ["difference of ATE, m (95 %)", "published (m)", "its change"]
+    header += ["difference of ATE, m (95 %)", "ms / interval", "parameters"]
+    header += ["published (m)", "its change"]
     table, first = [], experiment.rows[0].published
     for index, row in enumerate(experiment.rows):
         summary, difference = figures["ate"][index]
@@ -230,8 +245,11 @@ def render(experiment: Experiment, figures: Mapping[str, list[Cell]], report: Re
         gain = arrow(difference and difference.gain) if index else ""
         published_gain = 100 * (1 - row.published / first) if row.published and first else None
         measured = [tabulate.number(summary.median, 2), gain, tabulate.difference(difference, 2)]
+        cost = results[index].cost
+        measured += [tabulate.number(cost.interval_ms, 2), f"{cost.parameters:,}"]
         printed = [tabulate.number(row.published, 2), arrow(published_gain) if index else ""]
         table.append([row.label, *means, *measured, *printed])
+    report = results[0].reports[0]
     for name in report.reference_rows:
         summaries = report.summary(name)
         means = [
@@ -239,7 +257,7 @@ def render(experiment: Experiment, figures: Mapping[str, list[Cell]], report: Re
             for x, column in columns.items()
         ]
         median = tabulate.number(summaries["ate"].median, 2) if "ate" in summaries else "–"
-        table.append([name.replace("_", " "), *means, median, "", "", "", ""])
+        table.append([name.replace("_", " "), *means, median, *[""] * 6])
     marks = "".join(f"\n{line}\n" for line in tabulate.marks(figures["ate"]))
     return tabulate.markdown(header, table) + marks
 
@@ -308,7 +326,7 @@ def make_standing(
             picture = plots.attention(*activities.attention_by_activity(seeds[0]), words)
             plots.save(path.with_name(f"{stem}_attention.png"), picture)
     plots.save(with_ending(path, ".png"), plots.standing(by_method))
-    table = render(experiment, figures_of(results), results[0].reports[0])
+    table = render(experiment, figures_of(results), results)
     head = f"## {experiment.title}\n\n{remarks}\n\n{''.join(lines)}"
     text = f"{head}{table}\n{activities.render(by_method)}"
     write_text(with_ending(path, ".md"), text)

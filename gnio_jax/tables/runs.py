@@ -1,5 +1,6 @@
-"""The runs of a table's row: its seeds are trained, then calibrated and evaluated one after the
-other. Nothing is done twice, and interrupted work continues."""
+"""The runs of a table's row: its seeds are trained, its network is timed, then its seeds are
+calibrated and evaluated one after the other. Nothing is done twice, and interrupted work
+continues."""
 
 from __future__ import annotations
 
@@ -18,6 +19,7 @@ from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Scores
 from gnio_jax.networks.folder import WEIGHTS, read_settings
 from gnio_jax.reporting import Reporter
+from gnio_jax.tables.cost import RunCost, load_or_measure
 from gnio_jax.tables.experiments import TableRow
 from gnio_jax.training import loop, run_folder
 
@@ -36,6 +38,7 @@ class RowResult(NamedTuple):
     """Work folders of the seeds."""
     folders: list[Path]
     """Reports of their evaluations."""
+    cost: RunCost
 
     @property
     def seeds(self) -> list[Scores]:
@@ -48,10 +51,10 @@ def run_row(
     """Train, calibrate if the options ask for it, and evaluate a row with seeds 0 … seeds−1 below
     OUT/runs.
 
-    A finished run is not trained again, an interrupted one continues, and an existing calibration
-    or evaluation is read. Raises `InputError` if a folder holds a run with other settings or of
-    other recordings, and `Interrupted` after a signal. `workers` processes read recordings that are
-    slow to read.
+    A finished run is not trained again, an interrupted one continues, and an existing cost,
+    calibration or evaluation is read. Raises `InputError` if a folder holds a run with other
+    settings or of other recordings, and `Interrupted` after a signal. `workers` processes read
+    recordings that are slow to read.
     """
     workdir = Path(options.out) / "runs" / row.name
     config, seeds = dataclasses.replace(row.config, workdir=str(workdir)), range(options.seeds)
@@ -59,13 +62,15 @@ def run_row(
     runs = [
         Path(seed_config.workdir or "") for seed_config in configuration.with_seeds(config, seeds)
     ]
+    cost = load_or_measure(runs[0], reporter)
     if options.calibrate:
         runs = [calibrate_run(run, reporter, workers) for run in runs]
     settings = {"split": options.split, "estimator": options.estimator, "plots": False}
     requests = [EvaluateConfig(str(run), data_root=config.data_root, **settings) for run in runs]
     evaluations = [reuse.find_existing(request) for request in requests]
     reports = [reuse.load_or_evaluate(evaluation, reporter, workers) for evaluation in evaluations]
-    return RowResult(row, reports, runs, [evaluation.folder for evaluation in evaluations])
+    folders = [evaluation.folder for evaluation in evaluations]
+    return RowResult(row, reports, runs, folders, cost)
 
 
 def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers: int = 1) -> None:
@@ -83,6 +88,13 @@ def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers
         outcomes = loop.train_all(configs, state == "begun", reporter, workers)
         if outcomes[-1].stopped_by:
             raise Interrupted(outcomes[-1].stopped_by)
+
+
+def unfinished_runs(row: TableRow, out: Path, seeds: int) -> list[TrainConfig]:
+    """The runs of a row that are not trained to their end. Raises `InputError` as `run_state`."""
+    config = dataclasses.replace(row.config, workdir=str(out / "runs" / row.name))
+    runs = configuration.with_seeds(config, range(seeds))
+    return [run for run in runs if run_state(run) != "finished"]
 
 
 def run_state(config: TrainConfig) -> str:
@@ -104,9 +116,13 @@ def run_state(config: TrainConfig) -> str:
             raise InputError(file, problem, "give another --out")
     if models.trained_by(models.from_experiment(config)) != "gradient":  # has no epochs
         return "finished" if (workdir / WEIGHTS).exists() else "new"
+    return "finished" if finished_epochs(workdir) >= config.optim.epochs else "begun"
+
+
+def finished_epochs(workdir: Path) -> int:
+    """The number of epochs in the log of a run."""
     log = workdir / "metrics.jsonl"
-    rows = log.read_text(encoding="utf-8").count("\n") if log.exists() else 0
-    return "finished" if rows >= config.optim.epochs else "begun"
+    return log.read_text(encoding="utf-8").count("\n") if log.exists() else 0
 
 
 def calibrate_run(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:

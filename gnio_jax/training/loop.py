@@ -140,6 +140,15 @@ def train_all(
     return results
 
 
+def refuse_untrainable(config: TrainConfig) -> None:
+    """Raise `InputError` for an experiment that cannot be trained, before anything is read: as
+    `choose_task` does, and for a library that is missing."""
+    if models.trained_by(models.from_experiment(config)) == "support_vectors":
+        support_vectors.require_library()
+    else:
+        choose_task(config)
+
+
 def choose_task(config: TrainConfig) -> type[Task]:
     """The task of an experiment. Raises `InputError` for segments without a network with memory,
     and for strides that do not fit such a network."""

@@ -59,6 +59,7 @@ def train(config: TrainConfig, workdir: Path, reporter: Reporter, workers: int =
     """Fit the recordings of the training split and write the run. Returns the mean squared error on
     the validation split, m², summed over both axes. Raises `InputError` as `fit` does, and for
     missing data."""
+    require_library()
     parts = []
     for split in (config.data.train_split, config.data.val_split):
         sequences = itertools.chain.from_iterable(
@@ -73,12 +74,17 @@ def train(config: TrainConfig, workdir: Path, reporter: Reporter, workers: int =
     return float(np.sum(np.exp(2 * log_std[:2])))
 
 
+def require_library() -> None:
+    """Raise `InputError` without scikit-learn."""
+    require_packages("network 'ridi'", "ridi", "sklearn")
+
+
 def fit(data: LabelledWindows, held_out: LabelledWindows, config: TrainConfig) -> TrainedNetwork:
     """The network of these windows: a machine for each placement and axis, chosen by three folds,
     and one that tells the placements apart. The constant uncertainty is that of the windows that
     are held out. Raises `InputError` without scikit-learn, or for a placement with fewer than 9
     windows."""
-    require_packages("network 'ridi'", "ridi", "sklearn")
+    require_library()
     from sklearn.model_selection import GridSearchCV  # pyright: ignore[reportMissingImports]
     from sklearn.svm import SVC, SVR  # pyright: ignore[reportMissingImports]
 

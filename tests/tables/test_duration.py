@@ -5,27 +5,27 @@ from pathlib import Path
 
 import pytest
 
-from gnio_jax.config import ModelConfig, TrainConfig
+from gnio_jax.config import ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.reporting import Lines
-from gnio_jax.tables import duration
+from gnio_jax.tables import duration, runs
 from gnio_jax.tables.experiments import TableRow
 from tests.support import tiny_run, tlio_files
 
 
-def test_the_time_is_that_of_a_step_for_all_steps_of_the_seeds_that_are_left(
+def test_the_time_is_that_of_a_step_for_all_steps_of_the_epochs_that_are_left(
     tmp_path, monkeypatch, capsys
 ):
-    config = TrainConfig(model=ModelConfig("tlio", width=4))
+    config = TrainConfig(model=ModelConfig("tlio", width=4), optim=OptimConfig(epochs=40))
     rows = [TableRow("a", "a", config), TableRow("b", "b", config)]
     rows.append(TableRow("c", "c", dataclasses.replace(config, model=ModelConfig("ridi"))))
     states = {"a_s0": "finished", "a_s1": "begun"}
-    monkeypatch.setattr(
-        duration, "run_state", lambda run: states.get(Path(run.workdir).name, "new")
-    )
+    monkeypatch.setattr(runs, "run_state", lambda run: states.get(Path(run.workdir).name, "new"))
     monkeypatch.setattr(duration, "training_seconds", lambda config: 3000.0)
-    assert duration.announce(rows, tmp_path, 2, Lines()) == 9000.0
-    assert "about 2 h 30 min (a 50 min, b 100 min, c without steps)" in capsys.readouterr().err
-    monkeypatch.setattr(duration, "run_state", lambda run: "finished")
+    (tmp_path / "runs" / "a_s1").mkdir(parents=True)
+    (tmp_path / "runs" / "a_s1" / "metrics.jsonl").write_text("{}\n" * 10)
+    assert duration.announce(rows, tmp_path, 2, Lines()) == 0.75 * 3000.0 + 6000.0
+    assert "about 2 h 18 min (a 38 min, b 100 min, c without steps)" in capsys.readouterr().err
+    monkeypatch.setattr(runs, "run_state", lambda run: "finished")
     assert duration.announce(rows, tmp_path, 2, Lines()) is None
 
 

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -142,6 +143,21 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
 def test_mistakes_are_named(made, more, words):
     with pytest.raises(InputError, match=words):
         gnio("tables", "comparison", *made[1], *more)
+
+
+def test_a_row_that_cannot_be_trained_is_refused_before_any_other_is(made, monkeypatch):
+    """At 50 Hz an interval of 0.1 s has 5 samples. Of scikit-learn there is none."""
+    root, arguments = made
+    monkeypatch.setattr(make, "announce", None)
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    out = ["--out", str(root / "refused")]
+    for methods, words in (
+        ("gnio,gru", r"data\.stride_seconds: is 5 samples; 'gru' takes 10"),
+        ("gnio,ridi", r"network 'ridi'.*pip install"),
+    ):
+        with pytest.raises(InputError, match=words):
+            gnio("tables", "comparison", *arguments, "--methods", methods, *out)
+    assert not (root / "refused").exists()
 
 
 def test_all_methods_are_the_networks_with_displacements_each_with_a_sound_configuration():

@@ -7,9 +7,12 @@ import pytest
 
 from gnio_jax.evaluation import tabulate
 from gnio_jax.tables import make, plots
+from gnio_jax.tables.cost import RunCost
 from gnio_jax.tables.experiments import Experiment, TableRow
 from gnio_jax.tables.runs import RowResult
 from tests.support.reports import BASE, LOST, measures, report_of
+
+COST = RunCost(12_345, 1.234, "cpu")
 
 
 def result(name, ates, published=None, groups="xyz"):
@@ -18,7 +21,7 @@ def result(name, ates, published=None, groups="xyz"):
     of = dict(zip(names, groups, strict=False))
     reports = [report_of(dict(zip(names, row, strict=True)), of) for row in ates]
     runs = [f"{name}_s{seed}" for seed in range(len(ates))]
-    return RowResult(TableRow(name, name.upper(), BASE, published), reports, runs, runs)
+    return RowResult(TableRow(name, name.upper(), BASE, published), reports, runs, runs, COST)
 
 
 def table_of(*results):
@@ -33,13 +36,14 @@ def test_a_table_by_hand():
     figures = make.figures_of(results)
     assert list(figures) == ["ate", "rpe_1s"]
     figures |= make._over_seeds("more", [np.zeros(0), np.array([0.25, 0.75])])
-    first = results[0].reports[0]
-    rows = {"never_moves": {name: measures(ate=7.0) for name in first.scores}}
-    text = make.render(table_of(*results), figures, first._replace(reference_rows=rows))
-    assert "| never moves | 7.00 | – | – | 7.00 |  |  |  |  |" in text
+    reports = results[0].reports
+    rows = {"never_moves": {name: measures(ate=7.0) for name in reports[0].scores}}
+    reports[0] = reports[0]._replace(reference_rows=rows)
+    text = make.render(table_of(*results), figures, results)
+    assert "| never moves | 7.00 | – | – | 7.00 |  |  |  |  |  |  |" in text
     means = "| B | 1.50 ± 0.71 | 0.150 ± 0.071 | 0.500 ± 0.354 | 1.50 | ↓ 50.0 % "
-    assert means + "| -1.50 (-5.80 to +2.80) | 1.80 | ↓ 25.0 % |" in text
-    assert "| A | 3.00 ± 0.00 | 0.300 ± 0.000 | – | 2.50 |  |  | 2.40 |  |" in text
+    assert means + "| -1.50 (-5.80 to +2.80) | 1.23 | 12,345 | 1.80 | ↓ 25.0 % |" in text
+    assert "| A | 3.00 ± 0.00 | 0.300 ± 0.000 | – | 2.50 |  |  | 1.23 | 12,345 | 2.40 |  |" in text
     assert "there are 3." in text and "†" not in text
     found = [make.arrow(gain) for gain in (12.34, -5.0, 0.01, None)]
     assert found == ["↓ 12.3 %", "↑ 5.0 %", "0 %", "–"]
@@ -54,7 +58,7 @@ def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
         result("d", [[0.5, 1.0, LOST]]),
     ]
     experiment, figures = table_of(*results), make.figures_of(results)
-    text = make.render(experiment, figures, results[0].reports[0])
+    text = make.render(experiment, figures, results)
     assert "| B | 8.00 † 2/3 |" in text and "| ↑ 100.0 % | +4.00 over 1 |" in text
     assert "| C | – † 3/3 | – † 3/3 | ∞ | – | – |" in text and "| – | – ‡ |" in text
     for mark in ("† This number", "‡ Its remaining", "A difference is over"):

@@ -1,0 +1,62 @@
+"""What a table's networks cost, measured once."""
+
+import dataclasses
+import json
+import os
+
+import pytest
+
+from gnio_jax.evaluation import speed
+from gnio_jax.networks import read_network
+from gnio_jax.reporting import Lines
+from gnio_jax.tables import cost
+from tests.support import tiny_run
+from tests.support.networks import count
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of the smallest network at 50 Hz."""
+    with tiny_run.known():
+        config = dataclasses.replace(tiny_run.CONFIGURED, data=tiny_run.config(None, "x").data)
+        yield tiny_run.save(tmp_path_factory.mktemp("cost") / "tiny_s0", config)
+
+
+def test_an_interval_has_the_median_of_the_runs_over_a_walk(run, monkeypatch):
+    """On one core, which the process leaves afterwards."""
+    trained, calls = read_network(run), []
+    real = speed.estimate
+
+    def estimate(recordings, *rest):
+        affinity = {os.sched_getaffinity(int(name)) == {min(usable)} for name in threads()}
+        calls.append((recordings[0].strides, affinity))
+        return real(recordings, *rest)
+
+    def threads():
+        return os.listdir("/proc/self/task")
+
+    usable = os.sched_getaffinity(0)
+    clock = iter([0.0, 1.0, 1.0, 1.2, 1.2, 1.5, 1.5, 1.9, 1.9, 4.9])
+    monkeypatch.setattr(speed.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(speed, "estimate", estimate)
+    seconds = speed.interval_seconds(trained)
+    strides = calls[0][0]
+    assert strides == pytest.approx(300, abs=1)
+    assert seconds == pytest.approx(0.4 / strides)
+    assert len(calls) == 6 and all(pinned == {True} for _, pinned in calls[1:])
+    assert {frozenset(os.sched_getaffinity(int(name))) for name in threads()} == {frozenset(usable)}
+
+
+def test_a_cost_is_measured_once_for_a_device(run, monkeypatch, capsys):
+    times = iter([0.002, 0.003, 0.004])
+    monkeypatch.setattr(cost, "interval_seconds", lambda trained: next(times))
+    first = cost.load_or_measure(run, Lines())
+    assert first.interval_ms == pytest.approx(2.0)
+    assert first.parameters == count(read_network(run).variables["params"])
+    assert cost.load_or_measure(run, Lines()) == first
+    assert capsys.readouterr().err == "timing tiny_s0 with the filter\n"
+    file = run / cost.FILE
+    file.write_text(json.dumps(first._replace(device="TPU")._asdict()))
+    assert cost.load_or_measure(run, Lines()).interval_ms == pytest.approx(3.0)
+    file.write_text('{"parameters": 3}')
+    assert cost.load_or_measure(run, Lines()).interval_ms == pytest.approx(4.0)
