@@ -96,7 +96,10 @@ class Trunk(nn.Module):
 
 
 class StarBlock(nn.Module):
-    """x + D(σ(A u) ⊙ B u) of u, a depthwise convolution of x, then the mean of both attentions."""
+    """x + D(σ(A u) ⊙ B u) of u, a depthwise convolution of x, then the mean of both attentions.
+
+    σ is ReLU6, as in the block of "Rewrite the Stars" (Ma et al., CVPR 2024). Without this bound
+    every block squares what a window exceeds the usual by, and the output overflows."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "b n c"], train: bool) -> Float[Array, "b n c"]:
@@ -112,7 +115,7 @@ class StarBlock(nn.Module):
             kernel_init=nn.initializers.variance_scaling(2.0, "fan_in", "normal"),
         )(x)
         first, second = (linear(2 * channels, name)(u) for name in ("first", "second"))
-        y = conv_norm(nn.relu(first) * second, channels, 1, 1, train, "conv")
+        y = conv_norm(nn.relu6(first) * second, channels, 1, 1, train, "conv")
         wings = ChannelAttention(name="channels")(y), TimeAttention(name="time")(y, train)
         return x + 0.5 * (wings[0] + wings[1])
 

@@ -21,7 +21,7 @@ def star(x, q, s):
         for k in range(7):
             if 0 <= t + k - 3 < len(x):
                 u[t] += x[t + k - 3] * q["depthwise"]["kernel"][k, 0]
-    y = relu(linear(u, q["first"])) * linear(u, q["second"])
+    y = np.clip(linear(u, q["first"]), 0, 6) * linear(u, q["second"])
     y = conv_norm(y, "conv", q, s)
     squeeze, excite = (q["channels"][name]["kernel"] for name in ("squeeze", "excite"))
     channels = sigmoid(sum(relu(part @ squeeze) @ excite for part in (y.mean(0), y.max(0))))
