@@ -18,7 +18,16 @@ from jax.tree_util import GetAttrKey, keystr, tree_leaves_with_path
 
 from gnio_jax.config import DataConfig, FilterOptions, FilterSettings
 from gnio_jax.config.files import check_value
-from gnio_jax.config.schema import Count, Entries, Location, NonNegative, NonNegativeCount, Positive
+from gnio_jax.config.schema import (
+    LARGEST_FACTOR,
+    LEAST_FACTOR,
+    Count,
+    Entries,
+    Location,
+    NonNegative,
+    NonNegativeCount,
+    Positive,
+)
 from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
 _NUMBERS = ("noise", "start", "considered", "measurements")
@@ -212,8 +221,11 @@ SIGNED = {
 }
 """Numbers that may have any sign, and 0, with the unit in which they are free, rad and m. A step of
 the optimizer is a share of this unit."""
-LARGEST_SHARE = 0.9999
-"""Largest share that is written to a file: rounding must not make it 1."""
+FACTORS = "noise.measurement_scale", *(f"noise.std_factor.{axis}" for axis in range(3))
+"""Factors of covariances and standard deviations."""
+LIMITS = {SHARE: (0.0, 0.9999)} | dict.fromkeys(FACTORS, (LEAST_FACTOR, LARGEST_FACTOR))
+"""Smallest and largest value that is written to a file. Rounding must not make a share 1, and where
+errors are all but 0, a fitted factor may have any size."""
 
 
 def free_parameters(settings: FilterSettings, paths: Iterable[str]) -> dict[str, float]:
@@ -257,11 +269,12 @@ def with_written_parameters(
     settings: FilterSettings, free: Mapping[str, Any], digits: int
 ) -> FilterSettings:
     """The settings with the values of these free parameters as they are written to a file: floats
-    rounded to `digits` digits."""
+    rounded to `digits` digits, within `LIMITS`."""
     names = _numbers(with_free_parameters(settings, free))
     for name in names.keys() & free.keys():
         written = float(f"{float(names[name]):.{digits}g}")
-        names[name] = min(written, LARGEST_SHARE) if name == SHARE else written
+        low, high = LIMITS.get(name, (-math.inf, math.inf))
+        names[name] = min(max(written, low), high)
     return jax.tree.unflatten(jax.tree.structure(settings), names.values())
 
 

@@ -4,9 +4,11 @@ import dataclasses
 
 import jax
 import numpy as np
+import pytest
 
+from gnio_jax import config as configuration
 from gnio_jax import filtering
-from gnio_jax.config import DataConfig, FilterSettings
+from gnio_jax.config import DataConfig, FilterSettings, TrainConfig
 from gnio_jax.filtering.settings import (
     FIXED,
     filter_config,
@@ -80,6 +82,16 @@ def test_written_numbers_are_rounded_and_a_share_stays_below_1():
     assert noise.accel_density == settings.noise.accel_density
     share = with_written_parameters(settings, {"noise.correlation.share": 0.1234}, 3)
     assert share.noise.correlation == (0.531, 2.0)
+
+
+@pytest.mark.parametrize("fitted, written", [(-30.0, 1e-6), (30.0, 1e6), (0.0, 1.0)])
+def test_a_factor_that_no_error_bounds_is_written_as_a_file_takes_it(fitted, written):
+    """Displacements without any error make the likelihood of a factor grow to 0."""
+    names = ["noise.measurement_scale", *(f"noise.std_factor.{axis}" for axis in range(3))]
+    settings = with_written_parameters(FilterSettings(), dict.fromkeys(names, fitted), 4)
+    assert settings.noise.measurement_scale == written
+    assert settings.noise.std_factor == (written,) * 3
+    configuration.validate(TrainConfig(filter=settings))
 
 
 def test_every_setting_of_the_filter_is_reachable_from_a_file_or_fixed_by_name():
