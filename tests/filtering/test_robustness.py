@@ -115,7 +115,7 @@ def test_a_negative_variance_is_not_healthy():
 
 
 @pytest.mark.parametrize("fail_scale", [0.0, 10.0])
-@pytest.mark.parametrize("leap", [60.0, 1e9, 1e200])
+@pytest.mark.parametrize("leap", [60.0, 1e9, 1e200, 1e308])
 def test_a_displacement_that_nothing_makes_is_rejected_before_the_gate_begins_too(leap, fail_scale):
     """A network that has learnt little may say anything. 0.4 s at 100 m/s are 40 m."""
     config = dataclasses.replace(
@@ -131,6 +131,10 @@ def test_a_displacement_that_nothing_makes_is_rejected_before_the_gate_begins_to
     for name in ("position", "velocity", "covariance_diagonal", "healthy"):
         np.testing.assert_array_equal(getattr(history, name), getattr(wanted, name))
     assert (history.accepted[rows] == 0).all() and history.healthy.all()
+    no_covariance = covariance.copy()
+    no_covariance[rows] = -np.eye(3)  # which spoils the state only where it is used
+    _, history = FILTER(ekf, state, gyro, accel, leaping, no_covariance)
+    np.testing.assert_array_equal(history.position, wanted.position)
     believed = displacement.copy()
     believed[rows, 1] += 30.0
     _, history = FILTER(ekf, state, gyro, accel, believed, covariance)

@@ -45,7 +45,7 @@ class ConsoleForm(NamedTuple):
     def _row(self, line: bytes) -> bytes:
         stamp, pairs = STAMP.match(line), _named_numbers(STAMP.sub(b"", line))
         names = tuple(name.decode() for name, _ in pairs)
-        if names != self.names or (stamp is None) == self.is_stamped:
+        if names != self.names:
             return line
         stamps = [stamp.expand(rb"\1.\2")] if stamp else []
         return self.separator.join([*stamps, *(number for _, number in pairs)])
