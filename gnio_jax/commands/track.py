@@ -91,7 +91,7 @@ def track(request: TrackOptions, call: options.Call) -> None:
         console.say(f"warning: {warning}")
     if not first:  # what was measured are whole walks
         measured = summary.measured or "its error was not measured (gnio evaluate)"
-        console.say(f"network {summary.network}: {measured}")
+        console.say(f"network {summary.network} on recordings with a reference: {measured}")
     console.say(f"results: {result.folder} (open report.html, or look at track.png)")
 
 

@@ -270,7 +270,8 @@ def _space_evenly(
         drift = [(time[block] - line[block]).mean() for block in blocks]
         line += np.interp(index, [block.mean() for block in blocks], drift)
         if np.abs(time - line).max() <= grain:
-            problem = f"stamps of {name} are rounded to {grain:.3g} s and {shared} are the same"
+            problem = f"stamps of {name} are rounded to {grain:.3g} s"
+            problem += f" and {shared} are the same" if shared else ""
             notes.append(f"{problem}: its samples are spread evenly at {1 / step:.4g} Hz")
             return line - line[0]
     crowded = steps < CROWDED * mean
