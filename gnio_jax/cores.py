@@ -5,6 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
+
+THREADS = Path("/proc/self/task")
+"""A folder for each thread of this process (Linux)."""
 
 
 def usable_cores() -> int:
@@ -15,11 +19,23 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def can_choose_cores() -> bool:
+    """Whether the system lets a process choose the cores of its threads. Linux does, unless a
+    container forbids it; macOS does not."""
+    if not hasattr(os, "sched_setaffinity") or not THREADS.is_dir():
+        return False
+    try:
+        os.sched_setaffinity(0, os.sched_getaffinity(0))
+    except OSError:
+        return False
+    return True
+
+
 @contextmanager
 def one_core() -> Iterator[None]:
     """Let all threads of this process run on one of its cores only, where the system can do this
-    (Linux)."""
-    if not hasattr(os, "sched_setaffinity"):
+    (`can_choose_cores`)."""
+    if not can_choose_cores():
         yield
         return
     cores = os.sched_getaffinity(0)
@@ -31,6 +47,6 @@ def one_core() -> Iterator[None]:
 
 
 def _run_threads_on(cores: set[int]) -> None:
-    for thread in os.listdir("/proc/self/task"):
+    for thread in THREADS.iterdir():
         with suppress(ProcessLookupError):  # it has ended
-            os.sched_setaffinity(int(thread), cores)
+            os.sched_setaffinity(int(thread.name), cores)

@@ -87,11 +87,13 @@ _TIMES = (
     r"time|time_?stamp|stamp|t",
     r"(unix|epoch|utc|sys|system|host|device|log|logging|local)?_?(time|time_?stamp|stamp|t|epoch)"
     rf"(_?{_SECOND}|_txt)?",
-    r"seconds_elapsed|elapsed(_time)?(_?s|_?ms)?|millis|micros|nanos|date_?time|ms|us|epoc|ticks?",
+    r"seconds_elapsed|elapsed(_time)?(_?s|_?ms)?|millis|micros|nanos|date_?time|ms|us|epoc",
     r"(?!.*(gps|frame|zone)).*time.*",
 )
 _NO_CLOCK = r".*(dt|delta|interval|period|duration|delay|latency|exposure).*"
 """Names of times that are no stamps."""
+_NO_TIME = re.compile(r"[(\[]?(°|º|deg|m)? ?([cfkv]|celsius|kelvin|volts?)[)\]]?", re.IGNORECASE)
+"""Units of what is called t and is no time: a temperature, a voltage."""
 _TAGS = {"gyro": r".*(gyr|rotation_?rate)", "accel": r"(?!.*(lin|user|gravity)).*acc(?!u)"}
 """Names of files, or tags of rows, of one sensor."""
 # --- units
@@ -143,10 +145,11 @@ def resolve_labels(
     labels: Iterable[str],
     alone: str | None = None,
     units: Mapping[str, str | None] | None = None,
+    clocks: Container[str] | None = None,
 ) -> dict[str, str]:
     """Our name → label of the columns whose names are known, or whose `units` (label → text; None:
-    those in the labels) only one sensor or the time has. `alone` is the sensor of a table of
-    one."""
+    those in the labels) only one sensor or the time has. `alone` is the sensor of a table of one.
+    `clocks` are the columns whose values may be stamps, if no name says which are (None: all)."""
     plain = {str(label): plain_name(str(label)) for label in labels}
     texts = {label: unit_text(label) for label in plain} | dict(units or {})
 
@@ -177,10 +180,15 @@ def resolve_labels(
             for fraction in fitting(r"(.*_)?(nsecs?|nanosecs?|nanoseconds|usecs?)")
             if plain[label].rpartition("_")[0] == plain[fraction].rpartition("_")[0]
         ]
-        stamps = next((columns for columns in map(fitting, _TIMES) if columns), [])
-        if len(stamps) > 1:  # t (°C) is a temperature
+        timed = (
+            [label for label in fitting(pattern) if not _NO_TIME.fullmatch(texts[label] or "")]
+            for pattern in _TIMES
+        )
+        stamps = next((columns for columns in timed if columns), [])
+        if len(stamps) > 1:
             stamps = [label for label in stamps if unit_of(texts[label]) in CLOCK_UNITS] or stamps
-        stamps = stamps or fitting(rf"(?!{_NO_CLOCK}).*", CLOCK_UNITS)
+        others = fitting("ticks?") or fitting(rf"(?!{_NO_CLOCK}).*", CLOCK_UNITS)
+        stamps = stamps or [label for label in others if clocks is None or label in clocks]
         stamps = pairs if pairs and not fitting(_TIMES[0]) else stamps
         names |= {"time": stamps[0]} if len(stamps) == 1 else {}
     return names

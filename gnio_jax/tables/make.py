@@ -18,7 +18,7 @@ from jaxtyping import Float
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import ModelConfig, TablesConfig, TrainConfig
-from gnio_jax.cores import usable_cores
+from gnio_jax.cores import can_choose_cores, usable_cores
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.folder import read_views
@@ -127,7 +127,8 @@ def _words(text: str) -> tuple[str, ...]:
 
 def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> str:
     """Notes that explain the figures."""
-    on_core = " on one core" if jax.devices()[0].platform == "cpu" else ""
+    on_cpu = jax.devices()[0].platform == "cpu"
+    on_core = " on one core" if on_cpu and can_choose_cores() else ""
     calibrated = f", gnio calibrate on {base.data.val_split}" if options.calibrate else ""
     return (
         f"{base.datasets[0]} {options.split}, {options.estimator}; every row: "

@@ -157,6 +157,16 @@ for name in ("walk", "w\\0lk"):
     assert not entry.exists()
 
 
+def test_a_cache_entry_with_nothing_in_it_is_none(tmp_path):
+    """It neither gives a recording nor says why there is none, so the recording is read again."""
+    entry = tmp_path / "a-b.h5"
+    hdf5.write_reading(entry, hdf5.Reading([], notes=("a remark",)))
+    assert entry.exists() and hdf5.read_reading(entry) is None
+    hdf5.write_reading(entry, hdf5.Reading([], refusals=("it has no gyro",)))
+    refused = hdf5.read_reading(entry)
+    assert refused is not None and refused.refusals == ("it has no gyro",)
+
+
 @pytest.mark.parametrize("name", ["w\0lk", "w\udcfflk"])
 def test_a_text_that_hdf5_cannot_store_is_named(tmp_path, name):
     path = tmp_path / "walk.h5"

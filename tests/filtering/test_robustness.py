@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -114,7 +115,7 @@ def test_a_negative_variance_is_not_healthy():
 
 
 @pytest.mark.parametrize("fail_scale", [0.0, 10.0])
-@pytest.mark.parametrize("leap", [60.0, 1e9, 1e200])
+@pytest.mark.parametrize("leap", [60.0, 1e9, 1e200, 1e308])
 def test_a_displacement_that_nothing_makes_is_rejected_before_the_gate_begins_too(leap, fail_scale):
     """A network that has learnt little may say anything. 0.4 s at 100 m/s are 40 m."""
     config = dataclasses.replace(
@@ -130,7 +131,57 @@ def test_a_displacement_that_nothing_makes_is_rejected_before_the_gate_begins_to
     for name in ("position", "velocity", "covariance_diagonal", "healthy"):
         np.testing.assert_array_equal(getattr(history, name), getattr(wanted, name))
     assert (history.accepted[rows] == 0).all() and history.healthy.all()
+    no_covariance = covariance.copy()
+    no_covariance[rows] = -np.eye(3)  # which spoils the state only where it is used
+    _, history = FILTER(ekf, state, gyro, accel, leaping, no_covariance)
+    np.testing.assert_array_equal(history.position, wanted.position)
     believed = displacement.copy()
     believed[rows, 1] += 30.0
     _, history = FILTER(ekf, state, gyro, accel, believed, covariance)
     assert (history.accepted[rows] == 1).all()
+
+
+def test_displacements_that_nothing_makes_do_not_open_the_gate():
+    """They say nothing about the filter, as none would. After a second of them the gate refuses a
+    displacement that is wrong by 5 m, which it would take if the last success were old."""
+    begin, gyro, accel, displacement, covariance = WALK
+    ekf = filtering.Filter(PLAIN)
+    state = filtering.initial_state(ekf, *begin)
+    rows, runs = slice(30, 40), []
+    for leap in (np.nan, 1e6):
+        changed = displacement.copy()
+        changed[rows], changed[40:42] = leap, displacement[40:42] + 5.0
+        runs.append(FILTER(ekf, state, gyro, accel, changed, covariance))
+    (final, history), (of_leaps, leaping) = runs
+    np.testing.assert_array_equal(leaping.accepted[rows], 0.0)
+    assert np.isnan(history.accepted[rows]).all()
+    for name in ("position", "covariance_diagonal"):
+        np.testing.assert_array_equal(getattr(leaping, name), getattr(history, name))
+    np.testing.assert_array_equal(leaping.accepted[40:], history.accepted[40:])
+    np.testing.assert_array_equal(leaping.accepted[40:42], 0.0)
+    assert leaping.accepted[42:].all()
+    assert jax.tree.all(jax.tree.map(np.array_equal, of_leaps.gate, final.gate))
+
+
+@pytest.mark.parametrize("leap", [60.0, 1e9, 1e100])
+def test_a_displacement_that_nothing_makes_has_no_gradient_in_training(leap):
+    """With the gate's slope, open and active; the other gradients are those without it."""
+    begin, gyro, accel, displacement, covariance = WALK
+    ekf = filtering.Filter(dataclasses.replace(PLAIN, gate_softness=2.0))
+    state = filtering.initial_state(ekf, *begin)
+    rows = [8, 9, 40]
+    without, leaping = displacement.copy(), displacement.copy()
+    without[rows], leaping[rows, 1] = np.nan, leap
+
+    def loss(measured, covariance):
+        _, history = filtering.run_filter(ekf, state, gyro, accel, measured, covariance)
+        return (history.position**2).sum()
+
+    gradients = quick(jax.value_and_grad(loss, argnums=(0, 1)))
+    wanted, expected = gradients(without, covariance)
+    value, gradient = gradients(leaping, covariance)
+    assert value == wanted
+    for one, other in zip(gradient, expected, strict=True):
+        assert not np.any(one[np.array(rows)]) and np.any(one)
+        others = np.setdiff1d(np.arange(ROWS), rows)
+        np.testing.assert_allclose(one[others], other[others], rtol=1e-9, atol=1e-12)

@@ -6,10 +6,12 @@ import os
 
 import pytest
 
+from gnio_jax import cores
+from gnio_jax.config import TablesConfig, TrainConfig
 from gnio_jax.evaluation import speed
 from gnio_jax.networks import read_network
 from gnio_jax.reporting import Lines
-from gnio_jax.tables import cost
+from gnio_jax.tables import cost, experiments, make
 from tests.support import tiny_run
 from tests.support.networks import count
 
@@ -22,6 +24,7 @@ def run(tmp_path_factory):
         yield tiny_run.save(tmp_path_factory.mktemp("cost") / "tiny_s0", config)
 
 
+@pytest.mark.skipif(not cores.can_choose_cores(), reason="the system does not let one choose")
 def test_an_interval_has_the_median_of_the_runs_over_a_walk(run, monkeypatch):
     """On one core, which the process leaves afterwards."""
     trained, calls = read_network(run), []
@@ -45,6 +48,31 @@ def test_an_interval_has_the_median_of_the_runs_over_a_walk(run, monkeypatch):
     assert seconds == pytest.approx(0.4 / strides)
     assert len(calls) == 6 and all(pinned == {True} for _, pinned in calls[1:])
     assert {frozenset(os.sched_getaffinity(int(name))) for name in threads()} == {frozenset(usable)}
+
+
+def refuse_cores(*_):
+    raise PermissionError(1, "Operation not permitted")
+
+
+@pytest.mark.parametrize("lacking", ["the call", "the permission", "the list of threads"])
+def test_where_cores_cannot_be_chosen_all_are_used_and_no_note_says_one(
+    lacking, monkeypatch, tmp_path
+):
+    """As on macOS, or in a container."""
+    for name in ("sched_setaffinity", "sched_getaffinity"):
+        if lacking == "the call":
+            monkeypatch.delattr(os, name, raising=False)
+    if lacking == "the permission":
+        monkeypatch.setattr(os, "sched_setaffinity", refuse_cores, raising=False)
+    if lacking == "the list of threads":
+        monkeypatch.setattr(cores, "THREADS", tmp_path / "task")
+    assert not cores.can_choose_cores() and cores.usable_cores() >= 1
+    with cores.one_core():
+        pass
+    base = TrainConfig(dataset="tlio")
+    options = TablesConfig("comparison")
+    text = make.notes(base, options, experiments.comparison(base, "test", ()))
+    assert "ms / interval" in text and "on one core" not in text
 
 
 def test_a_cost_is_measured_once_for_a_device(run, monkeypatch, capsys):

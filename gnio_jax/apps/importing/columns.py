@@ -169,16 +169,16 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
     names = named_by(options.columns)
     if len(files) == 1 and not (names or options.accel_path or options.where):
         files = rows_by_sensor(files[0]) or files
-    whole = [
-        file for file in files if {*GYRO, *ACCEL} <= set(labels.resolve_labels(file.layout.labels))
-    ]
+    by_sensor = {s: [f for f in files if labels.sensor_named(f.location.name) == s] for s in AXES}
+    whole = [file for file in files if _has_both(file, dict.fromkeys(file.layout.labels))]
+    if not (whole or all(by_sensor.values())):  # units say less than names
+        whole = [file for file in files if _has_both(file)]
     if options.accel_path is not None:
         groups = {("gyro",): files, ("accel",): files_of(options.accel_path)}
     elif len(files) == 1 or len(whole) == 1:
         groups = {("gyro", "accel"): whole or files}
     else:
-        named = labels.sensor_named
-        groups = {(s,): [f for f in files if named(f.location.name) == s] for s in AXES}
+        groups = {(sensor,): tables for sensor, tables in by_sensor.items()}
         for group, tables in groups.items():  # without the uncalibrated one if there is another
             groups[group] = [f for f in tables if "uncal" not in f.name.lower()] or tables
     if any(len(tables) != 1 for tables in groups.values()):
@@ -222,6 +222,12 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
     return recording._replace(track=track, others=tuple(others.values()))
 
 
+def _has_both(file: LogFile, units: dict[str, None] | None = None) -> bool:
+    """Whether a table has columns of both sensors, by their names or by `units` (None: those of the
+    header)."""
+    return {*GYRO, *ACCEL} <= set(labels.resolve_labels(file.layout.labels, units=units))
+
+
 def _others_of(file: LogFile, notes: list[str]) -> dict[str, RawReadings]:
     """The sensors beside the IMU in a table of their own; none if it cannot be read, or has no
     stamps."""
@@ -249,9 +255,10 @@ def _columns(
     needed = [] if options.sample_rate is not None else [*times]
     needed += [axis for sensor in sensors for axis in AXES[sensor]]
     is_numbered = headings == [str(index) for index in range(len(headings))]
-    guesses = labels.resolve_labels(headings, alone, log.texts)
-    guesses = _by_place(frame, alone) if is_numbered else guesses
     dated = [label for label, dtype in frame.dtypes.items() if dtype.kind == "M"]
+    clocks = [] if dated else [str(label) for label, column in frame.items() if _rises(column)]
+    guesses = labels.resolve_labels(headings, alone, log.texts, clocks)
+    guesses = _by_place(frame, alone) if is_numbered else guesses
     names_of = ({"time": dated[0]} if len(dated) == 1 else {}) | guesses | names
     columns = {name: names_of.get(name, name) for name in needed}
     _check_one_imu(frame, columns, path)
@@ -271,6 +278,13 @@ def _columns(
         key = "places" if is_numbered else "names"
         notes.append(f"{path.name}: columns taken by their {key}: {' '.join(words)}")
     return columns
+
+
+def _rises(column: pd.Series) -> bool:
+    """Whether the values may be stamps: they increase, which a duration or a latency does not."""
+    values = column.dropna()
+    rises = values.dtype.kind in "iuf" and values.is_monotonic_increasing
+    return bool(rises and len(values) and values.iloc[0] < values.iloc[-1])
 
 
 def _by_place(frame: pd.DataFrame, sensor: str | None) -> dict[str, str]:

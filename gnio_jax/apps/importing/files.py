@@ -68,7 +68,7 @@ def log_file(
         content, head = partial(bytes, rows), rows
     layout = parsing.layout_of(path, head)
     if console is not None and console.names:
-        layout = layout._replace(labels=console.names)
+        layout = layout._replace(labels=console.columns)
 
     @functools.cache
     def read() -> tuple[Table, list[str]]:

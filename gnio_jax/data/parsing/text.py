@@ -185,7 +185,8 @@ def layout_of(path: Path, content: bytes | None = None, separator: str | None = 
     for groups in headers.values():  # names of sensors over their axes: each holds up to the next
         upper = accumulate(groups, lambda before, group: group or before)
         joined = tuple(f"{a} {b}".strip() for a, b in zip(upper, labels, strict=True))
-        labels = joined if len(set(joined)) > len(set(labels)) else labels
+        # Three axes more; a title over a column that is written twice is no sensor.
+        labels = joined if len(set(joined)) > len(set(labels)) + 2 else labels
     is_comma = any(re.search(r"\d,\d", cell) for n in data for cell in rows[n])
     others, decimal = tuple(headers.values()), "," if is_comma else "."
     return Layout(encoding, mark, decimal, labels, others, data[0], width, tuple(preamble))

@@ -249,6 +249,15 @@ def test_a_zip_with_two_files_of_one_name_is_refused(tmp_path):
     refused(path, "walk.zip: holds Gyroscope.csv twice; leave one of them")
 
 
+@pytest.mark.parametrize("name", ["Gyroscope.csv", "Accelerometer.csv", "Metadata.csv"])
+def test_a_table_of_sensor_logger_that_is_there_twice_is_refused(tmp_path, name):
+    """Which of them is meant, its name does not say."""
+    members = sensor_logger("android", False)
+    members[name.replace(".csv", ".txt")] = members[name]
+    words = rf"holds a sensor twice \(.*{name.partition('.')[0]}\.txt.*\); leave one of them"
+    refused(zipped(tmp_path / "walk.zip", members), words)
+
+
 def test_phyphox_that_was_paused_is_refused(tmp_path):
     """Its clock stands meanwhile: the samples show no hole."""
     events = [("START", 0.0, 100.0), ("PAUSE", 4.0, 104.0), ("START", 4.0, 107.5)]

@@ -3,6 +3,7 @@ sentence."""
 
 import gzip
 import re
+import time
 import zipfile
 
 import numpy as np
@@ -280,6 +281,44 @@ def test_units_name_a_sensor_only_where_nothing_else_can_be_meant():
     assert names["time"] == "Time(s)"  # the others are a temperature and a voltage
 
 
+def test_a_duration_and_a_count_of_a_wheel_are_no_clock_beside_one(tmp_path):
+    """A unit says less than a date, and a name less than values that never increase."""
+    dates = clock_text(33_302_250 + ROWS * 10, "2024-05-03 {h:02d}:{m:02d}:{s:02d}.{ms:03d}")
+    jitter = np.random.default_rng(2).integers(400, 900, COUNT) / 100
+    header, others = rows(table(dates, ("Uhrzeit", *AXES)))
+    for name, values in (("Zyklus (ms)", jitter), ("ticks", 7 * ROWS), ("Leistung (mS)", ROWS)):
+        whole = [f"{row},{value}" for row, value in zip(others, values, strict=True)]
+        check(put(tmp_path, lines(f"{header},{name}", *whole)), "time=Uhrzeit")
+    named = [f"{row},{7 * n}" for n, row in enumerate(rows(table(ROWS * 10))[1])]
+    check(put(tmp_path, lines(",".join(("millis", *AXES, "ticks")), *named)), "time=millis")
+    bare = [f"{value},{row.partition(',')[2]}" for value, row in zip(jitter, others, strict=True)]
+    path = put(tmp_path, lines(",".join(("Zyklus (ms)", *AXES)), *bare))
+    refused(path, "'time' .*missing.*--sample-rate")
+
+
+@pytest.mark.parametrize("unit", ["°C", "degC", "V", "mV", "K"])
+def test_t_is_no_time_in_a_unit_of_something_else(unit):
+    assert "time" not in resolve_labels([f"T ({unit})", *AXES])
+    assert resolve_labels([f"T ({unit})", "Zeit (ms)", *AXES])["time"] == "Zeit (ms)"
+    units = {"T": f"[{unit}]", "Zeit": "[ms]"} | dict.fromkeys(AXES)
+    assert resolve_labels(units, units=units)["time"] == "Zeit"
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "hh:mm:ss", "UTC"])
+def test_t_is_a_time_in_a_unit_of_time(unit):
+    assert resolve_labels([f"t ({unit})", *AXES])["time"] == f"t ({unit})"
+
+
+def test_files_with_the_names_of_the_sensors_come_before_a_table_with_their_units(tmp_path):
+    cells = [row.split(",") for row in rows(table())[1]]
+    for name, first in (("gyro", 1), ("accel", 4)):
+        part = [",".join([c[0], *c[first : first + 3]]) for c in cells]
+        put(tmp_path / "log", lines("time,x,y,z", *part), f"{name}.csv")
+    units = [f"model {a} ({unit})" for unit in ("rad/s", "m/s2") for a in "xyz"]
+    put(tmp_path / "log", table(header=("time", *units), gyro=2.0), "fused.csv")
+    check(tmp_path / "log")
+
+
 def test_a_row_of_units_names_the_sensors(tmp_path):
     header = ("when", *(f"{n} {a}" for n in ("Rotation", "Beschleunigung") for a in "XYZ"))
     units = "[µs],[°/s],[°/s],[°/s],[g],[g],[g]"
@@ -292,6 +331,24 @@ def test_names_of_sensors_above_those_of_their_axes(tmp_path):
     for upper in ("Time,Gyroscope,,,Accelerometer,,", "Time" + 3 * ",Gyro" + 3 * ",Acc"):
         check(put(tmp_path, lines(upper, header, *others)), "gyro_x=Gyro")
     refused(put(tmp_path, lines(header, *others)), "'gyro_x', .* are missing; found: ms, x, y, z")
+
+
+def test_a_title_over_a_column_that_is_written_twice_is_no_sensor(tmp_path):
+    header, others = rows(table(ROWS * 10, ("time", *AXES)))
+    twice = [f"{row},{row.partition(',')[0]}" for row in others]
+    title = "Subject: Bob,,,,Date: Monday,,,"
+    check(put(tmp_path, lines(title, f"{header},time", *twice)))
+
+
+def test_sensors_of_two_boards_under_the_same_names_are_refused(tmp_path):
+    _, others = rows(table(ROWS * 10))
+    cells = [row.split(",") for row in others]
+    both = [",".join([*c, *(f"{2 * float(x):.6f}" for x in c[1:])]) for c in cells]
+    upper = "Time" + 2 * ",Gyro,,,Acc,,"
+    refused(
+        put(tmp_path, lines(upper, "ms" + 4 * ",x,y,z", *both)),
+        "'Gyro x' is there 2 times; leave one",
+    )
 
 
 def test_columns_without_a_name_do_not_matter(tmp_path):
@@ -626,7 +683,6 @@ def test_the_time_that_a_console_puts_before_each_line(tmp_path):
 def test_names_that_a_board_prints_before_its_numbers(tmp_path):
     names = ("t", *(f"{sensor}{axis}" for sensor in "ga" for axis in "xyz"))
     texts = clock_text(33_302_250 + ROWS * 10, "{h:02d}:{m:02d}:{s:02d}.{ms:03d} -> ")
-    stamped = ("time", *names[1:])
     for form, separator in (("{}:{}", ","), ("{} = {}", "  "), ("{}:{}", "\t")):
         cells = [row.split(",") for row in rows(table(ROWS * 10))[1]]
         named = [
@@ -639,7 +695,52 @@ def test_names_that_a_board_prints_before_its_numbers(tmp_path):
         rest = [
             before + row.split(separator, 1)[1] for before, row in zip(texts, named, strict=True)
         ]
-        check(put(tmp_path, lines(*rest)), f"time={stamped[0]}|gyro_x=gx")
+        check(put(tmp_path, lines(*rest)), "time=console_time gyro_x=gx")
+
+
+def test_a_clock_that_the_board_prints_comes_before_that_of_the_console(tmp_path):
+    """Whatever it is called; the console's stamps are those of the arrival."""
+    late = 33_302_250 + ROWS * 10 + np.random.default_rng(1).integers(0, 9, COUNT)
+    texts = clock_text(np.sort(late), "{h:02d}:{m:02d}:{s:02d}.{ms:03d} -> ")
+    for clock in ("time", "t", "millis"):
+        names = (clock, *AXES)
+        named = [
+            " ".join(f"{n}:{c}" for n, c in zip(names, row.split(","), strict=True))
+            for row in rows(table(ROWS * 10))[1]
+        ]
+        whole = [before + row for before, row in zip(texts, named, strict=True)]
+        whole[500] = named[500]  # a line without its stamp is no row, nor is it cut
+        found = check(put(tmp_path, lines(*whole)), "row 501 .*1 such rows are left out")
+        assert len(found.time) == COUNT
+
+
+def test_no_number_without_a_name_is_lost(tmp_path):
+    """A word before three numbers names no column."""
+    cells = [row.split(",") for row in rows(table(ROWS * 10))[1]]
+    named = [" ".join(["T:", c[0], "G:", *c[1:4], "A:", *c[4:]]) for c in cells]
+    places = ("1", "3", "4", "5", "7", "8", "9")
+    path = put(tmp_path, lines(*named))
+    found, _ = import_recording(path, dict(zip(("time", *AXES), places, strict=True)))
+    compare_imu(found, atol=2e-3)
+    names = ("gx", "gy", "gz", "ax", "ay", "az")
+    for first in ("{}", "T:12:00:{}"):  # the time would be lost, or be the hour
+        rest = [
+            " ".join([first.format(c[0]), *(f"{n}:{v}" for n, v in zip(names, c[1:], strict=True))])
+            for c in cells
+        ]
+        with pytest.raises(InputError):
+            imported(put(tmp_path, lines(*rest)), sample_rate=100.0)
+    forms = [f"t={{}}, {', '.join(f'{n}={{}} rad/s' for n in names[:3])}"]
+    forms += [f"{n}={{}} m/s^2" for n in names[3:]]
+    with_units = [", ".join(forms).format(*c) for c in cells]
+    check(put(tmp_path, lines(*with_units)), "serial console")
+
+
+def test_a_long_word_takes_no_longer_than_a_table(tmp_path):
+    start = time.process_time()
+    for word in ("a" * 100_000, "1a" * 50_000, "a_" * 50_000 + ":"):
+        refused(put(tmp_path, word), "holds no row")
+    assert time.process_time() - start < 10.0
 
 
 def test_a_date_and_a_time_are_one_stamp(tmp_path):
