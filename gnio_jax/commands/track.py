@@ -90,8 +90,9 @@ def track(request: TrackOptions, call: options.Call) -> None:
     for warning in summary.warnings[len(first) :]:
         console.say(f"warning: {warning}")
     if not first:  # what was measured are whole walks
-        measured = summary.measured or "its error was not measured (gnio evaluate)"
-        console.say(f"network {summary.network} on recordings with a reference: {measured}")
+        on_others = f" on recordings with a reference: {summary.measured}"
+        measured = on_others if summary.measured else ": its error was not measured (gnio evaluate)"
+        console.say(f"network {summary.network}{measured}")
     console.say(f"results: {result.folder} (open report.html, or look at track.png)")
 
 

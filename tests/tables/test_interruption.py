@@ -26,6 +26,14 @@ def options(tmp_path, monkeypatch):
         yield TablesConfig("comparison", base=str(file), calibrate=True, seeds=2, methods="tiny")
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c():
+    """A shell starts what is in the background with Ctrl-C ignored, and Python leaves it so."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def figures(options, out):
     """The lines of the table's CSV, without the times."""
     make.make(dataclasses.replace(options, out=out), Silence())
