@@ -92,8 +92,10 @@ class Entries(Mapping[str, Any]):
 
 ABOVE_ZERO = Bound(lambda value: 0 < value < math.inf, "must be positive and finite")
 NOT_NEGATIVE = Bound(lambda value: 0 <= value < math.inf, "must be finite and not negative")
-LEAST_FACTOR, LARGEST_FACTOR = 1e-6, 1e6
-FACTOR = Bound(lambda value: LEAST_FACTOR <= value <= LARGEST_FACTOR, "must be from 1e-6 to 1e6")
+FACTOR_LIMITS = (1e-6, 1e6)
+FACTOR = Bound(
+    lambda value: FACTOR_LIMITS[0] <= value <= FACTOR_LIMITS[1], "must be from 1e-6 to 1e6"
+)
 FINITE = Bound(math.isfinite, "must be finite")
 SHARE = Bound(lambda value: 0 <= value < 1, "must be at least 0 and below 1")
 PACE = Bound(lambda value: 0.1 <= value <= 10, "must be from 0.1 to 10")

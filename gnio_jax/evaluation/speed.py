@@ -1,4 +1,4 @@
-"""How long network and filter take for an interval of a recording, on one core."""
+"""How long network and filter take for an interval of a recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ LEAST, SECONDS = 5, 3.0
 
 def interval_seconds(trained: TrainedNetwork) -> float:
     """Time of network and filter for a clone interval, s: the median over several runs over a
-    simulated walk, each divided by its number of intervals. On a CPU they run on one core.
+    simulated walk, each divided by its number of intervals. On a CPU they run on one core, where
+    the system can do this (`one_core`).
 
     The program is that of `estimate` for a single recording, compiled before. It has the
     measurements of the network's settings, but not the consider covariance, which is computed after

@@ -19,8 +19,7 @@ from jax.tree_util import GetAttrKey, keystr, tree_leaves_with_path
 from gnio_jax.config import DataConfig, FilterOptions, FilterSettings
 from gnio_jax.config.files import check_value
 from gnio_jax.config.schema import (
-    LARGEST_FACTOR,
-    LEAST_FACTOR,
+    FACTOR_LIMITS,
     Count,
     Entries,
     Location,
@@ -223,7 +222,7 @@ SIGNED = {
 the optimizer is a share of this unit."""
 FACTORS = "noise.measurement_scale", *(f"noise.std_factor.{axis}" for axis in range(3))
 """Factors of covariances and standard deviations."""
-LIMITS = {SHARE: (0.0, 0.9999)} | dict.fromkeys(FACTORS, (LEAST_FACTOR, LARGEST_FACTOR))
+LIMITS = {SHARE: (0.0, 0.9999)} | dict.fromkeys(FACTORS, FACTOR_LIMITS)
 """Smallest and largest value that is written to a file. Rounding must not make a share 1, and where
 errors are all but 0, a fitted factor may have any size."""
 

@@ -23,8 +23,7 @@ class RunCost(NamedTuple):
     parameters: int
     """Numbers that were trained; for support vectors, those that were kept."""
     interval_ms: float
-    """Time of network and filter for a clone interval, ms, on one core of a CPU
-    (`evaluation.speed`)."""
+    """Time of network and filter for a clone interval, ms (`evaluation.speed`)."""
     device: str
     """Kind of the device."""
 

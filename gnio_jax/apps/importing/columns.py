@@ -256,9 +256,11 @@ def _columns(
     needed += [axis for sensor in sensors for axis in AXES[sensor]]
     is_numbered = headings == [str(index) for index in range(len(headings))]
     dated = [label for label, dtype in frame.dtypes.items() if dtype.kind == "M"]
-    clocks = [] if dated else [str(label) for label, column in frame.items() if _rises(column)]
-    guesses = labels.resolve_labels(headings, alone, log.texts, clocks)
-    guesses = _by_place(frame, alone) if is_numbered else guesses
+    if is_numbered:
+        guesses = _by_place(frame, alone)
+    else:
+        clocks = [] if dated else [str(label) for label, column in frame.items() if _rises(column)]
+        guesses = labels.resolve_labels(headings, alone, log.texts, clocks)
     names_of = ({"time": dated[0]} if len(dated) == 1 else {}) | guesses | names
     columns = {name: names_of.get(name, name) for name in needed}
     _check_one_imu(frame, columns, path)
