@@ -105,8 +105,12 @@ class TablesConfig:
     """complexity, comparison, components, gates, bank-size, trajectories or standing."""
     base: str = "quickstart"
     """Config that gives every row its recordings, budget and augmentation (not for complexity)."""
+    dataset: str | None = None
+    """Dataset that is measured; by default the config's. If the config has several, name one."""
     data_root: str | None = None
-    """Folder of the dataset; by default the config's, $GNIO_DATA/<dataset>, or data/<dataset>."""
+    """Folder of the measured dataset; by default the config's (for its own dataset),
+    $GNIO_DATA/<dataset>, or data/<dataset>. Another folder of the config's own dataset is the one
+    to learn from, too."""
     split: str = "test"
     """Split that is measured."""
     estimator: Literal["ekf", "integrate"] = "ekf"

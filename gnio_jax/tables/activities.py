@@ -22,6 +22,14 @@ HORIZONTAL = slice(0, 2)
 DIAGNOSTICS = ("gate", "scale", "attention")
 
 
+class Recordings(NamedTuple):
+    """A split of a dataset."""
+
+    dataset: str
+    data_root: str | None
+    split: str
+
+
 class PredictedWindows(NamedTuple):
     """Every window of a split with a trusted reference, cut with the reference's attitude."""
 
@@ -39,16 +47,16 @@ class PredictedWindows(NamedTuple):
     """Number in ACTIVITIES."""
 
 
-def predict_split(workdir: Path, split: str) -> PredictedWindows:
-    """The predictions of the network of a run for the windows of a split of its dataset."""
+def predict_split(workdir: Path, recordings: Recordings) -> PredictedWindows:
+    """The predictions of the network of a run for the windows of a split of a dataset."""
     run = read_network(workdir)
     config = run.config.data
-    sequences = data.load(run.config.datasets[0], run.config.data_root, split)
-    recordings, _ = evaluation.prepare(sequences, config, orientation="reference")
+    sequences = data.load(*recordings)
+    prepared, _ = evaluation.prepare(sequences, config, orientation="reference")
     network = Network.of(run.model, run.variables)
-    predicted = evaluation.infer(network, recordings, config, diagnostics=DIAGNOSTICS)
+    predicted = evaluation.infer(network, prepared, config, diagnostics=DIAGNOSTICS)
     # There is a row for each stride; rows before the end of the first window have neither.
-    references = [evaluation.reference_displacements(recording, 0.0) for recording in recordings]
+    references = [evaluation.reference_displacements(recording, 0.0) for recording in prepared]
     truth, displacement = (
         np.concatenate([rows.value for rows in parts]) for parts in (references, predicted)
     )

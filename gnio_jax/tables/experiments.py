@@ -6,14 +6,12 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from gnio_jax import models
-from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, SegmentTraining, TrainConfig
+from gnio_jax.models.gnio import GNIO
+from gnio_jax.models.memory import NetworkWithMemory
 
 METHODS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "gnio")
 """The networks of table II, and RoNIN's, which it leaves out."""
-
-SCALED = ("gnio", "tlio", "ronin_resnet", "deepils", "airio")
-"""Networks whose `width` means channels of the first group: an experiment at half the width halves
-all of them."""
 
 TLIO_HELD, TLIO_BATCH, PAPER_EPOCHS = 10.0, 1024, 200
 """TLIO's uncertainty does not learn in its first 10 epochs of batches of 1,024; the paper trains
@@ -79,14 +77,24 @@ class Experiment(NamedTuple):
 def method(network: str, base: TrainConfig) -> TrainConfig:
     """`base` with another network, its loss and regularisation: the same recordings, augmentation,
     equivariance, batches, epochs and learning rate. A network that sees the body has its axes in
-    its windows, and the filter measures the velocity of one that predicts it. Losses differ, so
-    every row's checkpoint is the one with the smallest squared error on the validation split."""
-    width = base.model.width if network in SCALED else None
+    its windows, and the filter measures the velocity of one that predicts it. A network with memory
+    learns on the segments of `base`, if it has any, in batches with as many seconds of walks. Losses
+    differ, so every row's checkpoint is the one with the smallest squared error on the validation
+    split."""
+    width = scaled_width(network, base)
     model = ModelConfig(name=network, width=width, equivariance=base.model.equivariance)
     regularisation = REGULARISATION.get(network, {})
     optim = dataclasses.replace(base.optim, best_by="squared_error", **regularisation)
     config = dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)
     built = models.from_config(model)
+    if not isinstance(built, NetworkWithMemory):
+        config = dataclasses.replace(config, segments=SegmentTraining())
+    elif base.segments.seconds:
+        seconds = base.optim.batch_size * base.data.window_seconds
+        optim = dataclasses.replace(
+            optim, batch_size=max(round(seconds / base.segments.seconds), 1)
+        )
+        config = dataclasses.replace(config, optim=optim)
     if models.channels(built) == 12:
         rotated = dataclasses.replace(base.data, window_rotation="body_axes")
         config = dataclasses.replace(config, data=rotated)
@@ -94,6 +102,16 @@ def method(network: str, base: TrainConfig) -> TrainConfig:
         settings = dataclasses.replace(base.filter, measures="velocity")
         config = dataclasses.replace(config, filter=settings)
     return config
+
+
+def scaled_width(network: str, base: TrainConfig) -> int | None:
+    """The width of a network at the share of its published width that `base` has of GNIO's. None,
+    the published one, for networks without a width, and for those with memory, which are small."""
+    default = models.create(network)
+    small = isinstance(default, NetworkWithMemory) or not hasattr(default, "width")
+    if small or base.model.width is None:
+        return None
+    return max(round(base.model.width / GNIO.width * default.width), 1)
 
 
 def loss(network: str, base: TrainConfig) -> LossConfig:
@@ -136,12 +154,14 @@ def variant(base: TrainConfig, **options: Any) -> TrainConfig:
 # --- the tables
 
 
-def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHODS) -> Experiment:
-    """All networks; the others are compared with the first."""
-    published = PUBLISHED.get((base.datasets[0], split), {})
+def comparison(
+    base: TrainConfig, dataset: str, split: str, networks: tuple[str, ...] = METHODS
+) -> Experiment:
+    """All networks, measured on a split of a dataset; the others are compared with the first."""
+    published = PUBLISHED.get((dataset, split), {})
     source = "no published figure for this split"
     if published:
-        source = f"paper, table II: ATE on {base.datasets[0]} {split}"
+        source = f"paper, table II: ATE on {dataset} {split}"
     rows = [TableRow(name, name, method(name, base), published.get(name)) for name in networks]
     return Experiment("Networks", source, rows)
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax import config as configuration
-from gnio_jax import models
+from gnio_jax import data, models
 from gnio_jax.config import ModelConfig, TablesConfig, TrainConfig
 from gnio_jax.cores import can_choose_cores, usable_cores
 from gnio_jax.errors import InputError
@@ -64,7 +64,10 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
     if options.table in ABLATIONS:
         experiment = ABLATIONS[options.table](base)
     else:
-        experiment = experiments.comparison(base, options.split, networks(options))
+        names = networks(options)
+        experiment = experiments.comparison(
+            base, measured_dataset(options, base), options.split, names
+        )
     if options.table == "trajectories":
         options = dataclasses.replace(options, seeds=1)
     for row in experiment.rows:  # before hours go into the rows before it
@@ -73,8 +76,7 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
     if options.table == "comparison":
         announce(experiment.rows, Path(options.out), options.seeds, reporter)
     results = [run_row(row, options, reporter, workers) for row in experiment.rows]
-    name = f"{options.table}_{options.split}_{options.estimator}"
-    path = Path(options.out) / (f"{name}_calibrated" if options.calibrate else name)
+    path = Path(options.out) / file_name(options)
     remarks = notes(base, options, experiment)
     if options.table == "trajectories":
         return make_trajectories(path, options, results)
@@ -83,22 +85,45 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
     return make_table(path, options, experiment, results, remarks)
 
 
+def file_name(options: TablesConfig) -> str:
+    """The name of a table's files, without their endings. Of a dataset that is named, tables of
+    two folders have two names."""
+    parts = [options.table]
+    if options.dataset:
+        parts.append(options.dataset)
+        parts += [Path(options.data_root).resolve().name] if options.data_root else []
+    parts += [options.split, options.estimator]
+    return "_".join([*parts, *["calibrated"] * options.calibrate])
+
+
 def base_config(options: TablesConfig) -> TrainConfig:
     """The experiment from which the rows are derived. Raises `InputError` if that is not
     possible."""
     base = configuration.load(options.base)
+    learns_from_it = options.dataset is None or base.datasets == (options.dataset,)
     base = dataclasses.replace(
         base,
-        data_root=options.data_root or base.data_root,
+        data_root=(options.data_root if learns_from_it else None) or base.data_root,
         workdir=None,
         optim=dataclasses.replace(base.optim, epochs=options.epochs or base.optim.epochs),
     )
     if base.model.name != "gnio":
         remedy = "give a config of the network gnio; those of the others are derived from it"
         raise InputError(options.base, f"is of the network '{base.model.name}'", remedy)
-    if len(base.datasets) > 1:
-        raise InputError(options.base, "has several datasets", "give a config of one")
-    return configuration.validate(base, options.base)
+    base = configuration.validate(base, options.base)
+    measured_dataset(options, base)
+    return base
+
+
+def measured_dataset(options: TablesConfig, base: TrainConfig) -> str:
+    """The dataset that is measured. Raises `InputError` if it is unknown, or if none is named and
+    there are several to learn from."""
+    if options.dataset is None and len(base.datasets) > 1:
+        remedy = f"name the one to measure, e.g. --dataset {base.datasets[0]}"
+        raise InputError(options.base, f"has several datasets: {', '.join(base.datasets)}", remedy)
+    dataset = options.dataset or base.datasets[0]
+    data.get(dataset)
+    return dataset
 
 
 def networks(options: TablesConfig) -> tuple[str, ...]:
@@ -131,8 +156,8 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> s
     on_core = " on one core" if on_cpu and can_choose_cores() else ""
     calibrated = f", gnio calibrate on {base.data.val_split}" if options.calibrate else ""
     return (
-        f"{base.datasets[0]} {options.split}, {options.estimator}; every row: "
-        f"{base.optim.epochs} epochs of batches of {base.optim.batch_size}, learning rate "
+        f"{measured_dataset(options, base)} {options.split}, {options.estimator}; every row: "
+        f"{' and '.join(base.datasets)}, {base.optim.epochs} epochs of batches of {base.optim.batch_size}, learning rate "
         f"{base.optim.learning_rate:g}, width {base.model.width or 64}, {base.data.rate:g} Hz, "
         f"{options.seeds} {'seed' if options.seeds == 1 else 'seeds'}{calibrated}; on "
         f"{hardware()}. ± is the standard deviation over seeds; the difference to the first "
@@ -170,7 +195,7 @@ def make_table(
         figures |= _over_seeds("gradient of the scale, mean", [norm.mean(1) for norm in norms])
         figures |= _over_seeds("gradient of the scale, largest", [norm.max(1) for norm in norms])
     if options.table == "bank-size":
-        entropies = [_entropies(result, options.split) for result in results]
+        entropies = [_entropies(result) for result in results]
         figures |= _over_seeds("entropy of a window", [entropy[:, 0] for entropy in entropies])
         figures |= _over_seeds("entropy of their mean", [entropy[:, 1] for entropy in entropies])
     plots.save(with_ending(path, ".png"), plots.table(experiment, results, figures["ate"]))
@@ -197,12 +222,17 @@ def scale_gradients(run: Path) -> list[float]:
     return [json.loads(line)["gradient_norm/head/scale"] for line in lines]
 
 
-def _entropies(result: RowResult, split: str) -> Float[np.ndarray, "seeds 2"]:
+def _entropies(result: RowResult) -> Float[np.ndarray, "seeds 2"]:
     """Entropies of the attention of each run; none for a network without a bank."""
     runs = result.runs if result.row.config.model.bank_size != 0 else []
-    predictions = [activities.predict_split(run, split) for run in runs]
+    predictions = [activities.predict_split(run, _measured(result)) for run in runs]
     entropies = [activities.entropy(windows.diagnostics["attention"]) for windows in predictions]
     return np.array(entropies).reshape(-1, 2)
+
+
+def _measured(result: RowResult) -> activities.Recordings:
+    settings = result.reports[0].settings
+    return activities.Recordings(*(settings[name] for name in activities.Recordings._fields))
 
 
 def _over_seeds(name: str, rows: list[Float[np.ndarray, "_"]]) -> dict[str, list[Cell]]:
@@ -314,7 +344,7 @@ def make_standing(
 
     lines, by_method = [], {}
     for result in results:
-        seeds = [activities.predict_split(run, options.split) for run in result.runs]
+        seeds = [activities.predict_split(run, _measured(result)) for run in result.runs]
         by_method[result.row.name] = activities.mean_over_seeds(seeds)
         stem = f"{path.name}_{result.row.name}"
         if "gate" in seeds[0].diagnostics:

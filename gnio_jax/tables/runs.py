@@ -65,8 +65,9 @@ def run_row(
     cost = load_or_measure(runs[0], reporter)
     if options.calibrate:
         runs = [calibrate_run(run, reporter, workers) for run in runs]
-    settings = {"split": options.split, "estimator": options.estimator, "plots": False}
-    requests = [EvaluateConfig(str(run), data_root=config.data_root, **settings) for run in runs]
+    measured = {"dataset": options.dataset, "data_root": options.data_root, "split": options.split}
+    settings = {**measured, "estimator": options.estimator, "plots": False}
+    requests = [EvaluateConfig(str(run), **settings) for run in runs]
     evaluations = [reuse.find_existing(request) for request in requests]
     reports = [reuse.load_or_evaluate(evaluation, reporter, workers) for evaluation in evaluations]
     folders = [evaluation.folder for evaluation in evaluations]
@@ -105,8 +106,7 @@ def run_state(config: TrainConfig) -> str:
     if not file.exists():
         return "new"
     run_folder.refuse_other_run(config, resume=True)
-    (dataset,) = config.datasets
-    if data.get(dataset).needs_root:
+    for dataset in filter(lambda name: data.get(name).needs_root, config.datasets):
         trained_root = Path(configuration.load(file).data_root or data.find_root(dataset))
         root = data.find_root(dataset, config.data_root)
         if (

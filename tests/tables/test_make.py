@@ -118,7 +118,8 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
     assert run.model == trained.model
     assert float(after["nis"]) > 0 and after["nis"] != before["nis"]
     # What the windows are measured by has the factors that calibration found.
-    raw, fitted = (activities.predict_split(folder, "test").std for folder in folders)
+    recordings = activities.Recordings("tlio", str(root / "data"), "test")
+    raw, fitted = (activities.predict_split(folder, recordings).std for folder in folders)
     np.testing.assert_allclose(fitted, raw * run.filter.noise.std_factor, rtol=1e-6)
     assert abs(np.log(run.filter.noise.std_factor)).max() > 0.01
 
