@@ -1,14 +1,27 @@
-"""The number of usable cores."""
+"""The cores of the processor."""
 
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 THREADS = Path("/proc/self/task")
 """A folder for each thread of this process (Linux)."""
+CPU_INFO = Path("/proc/cpuinfo")
+"""The properties of every core (Linux)."""
+
+
+def processor_name() -> str:
+    """The name of the processor, or its architecture where the system gives no name."""
+    with suppress(OSError):
+        for line in CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name" and value.strip():
+                return value.strip()
+    return platform.processor() or platform.machine()
 
 
 def usable_cores() -> int:

@@ -30,8 +30,11 @@ def tables(request: TablesConfig, _call: options.Call) -> None:
 
     examples:
       {prog} complexity                              parameters, operations, latency
+      {prog} published                               what papers print, and what each figure is
       {prog} comparison --base quickstart            the networks side by side
       {prog} comparison --methods all --calibrate    every network, with calibrated filters
+      {prog} comparison --base tables/networks_walks --dataset oxiod --split unseen
+                                                     learn from several datasets, measure on one
       {prog} components --base gnio_oxiod_small --data-root DIR --split sessions_test
       {prog} gates --base ... --epochs 3             gate and scale functions, their gradients
       {prog} bank-size --base ...                    size of the Motion Bank, entropy of attention

@@ -12,6 +12,7 @@ from gnio_jax.config.schema import FILE_ONLY, Count, FilterSettings, Folder, Rat
 
 Table = Literal[
     "complexity",
+    "published",
     "comparison",
     "components",
     "gates",
@@ -102,9 +103,10 @@ class CalibrateConfig:
 @dataclass(frozen=True)
 class TablesConfig:
     table: Annotated[Table, Words("TABLE", named=False)]
-    """complexity, comparison, components, gates, bank-size, trajectories or standing."""
+    """complexity, published, comparison, components, gates, bank-size, trajectories or standing."""
     base: str = "quickstart"
-    """Config that gives every row its recordings, budget and augmentation (not for complexity)."""
+    """Config that gives every row its recordings, budget and augmentation (not for complexity
+    and published)."""
     dataset: str | None = None
     """Dataset that is measured; by default the config's. If the config has several, name one."""
     data_root: str | None = None

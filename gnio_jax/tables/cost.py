@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 
+from gnio_jax.cores import processor_name
 from gnio_jax.evaluation.speed import interval_seconds
 from gnio_jax.files import write_text
 from gnio_jax.networks import read_network
@@ -25,13 +26,19 @@ class RunCost(NamedTuple):
     interval_ms: float
     """Time of network and filter for a clone interval, ms (`evaluation.speed`)."""
     device: str
-    """Kind of the device."""
+    """Name of the device (`device_name`)."""
+
+
+def device_name() -> str:
+    """The name of the device on which networks run. JAX has one name for all processors."""
+    device = jax.devices()[0]
+    return processor_name() if device.platform == "cpu" else device.device_kind
 
 
 def load_or_measure(run: Path, reporter: Reporter) -> RunCost:
-    """The cost of a run's network. It is measured again on another kind of device, and if its file
-    cannot be read."""
-    device = jax.devices()[0].device_kind
+    """The cost of a run's network. It is measured again on another device, and if its file cannot
+    be read."""
+    device = device_name()
     try:
         cost = RunCost(**json.loads((run / FILE).read_text(encoding="utf-8")))
         if cost.device == device:

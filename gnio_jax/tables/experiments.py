@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from functools import partial
 from typing import Any, NamedTuple
 
 from gnio_jax import models
 from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, SegmentTraining, TrainConfig
+from gnio_jax.errors import InputError
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.memory import NetworkWithMemory
 
@@ -78,9 +81,9 @@ def method(network: str, base: TrainConfig) -> TrainConfig:
     """`base` with another network, its loss and regularisation: the same recordings, augmentation,
     equivariance, batches, epochs and learning rate. A network that sees the body has its axes in
     its windows, and the filter measures the velocity of one that predicts it. A network with memory
-    learns on the segments of `base`, if it has any, in batches with as many seconds of walks. Losses
-    differ, so every row's checkpoint is the one with the smallest squared error on the validation
-    split."""
+    learns on the segments of `base`, if there are any, in batches with as many seconds of walks.
+    Losses differ, so every row's checkpoint is the one with the smallest squared error on the
+    validation split."""
     width = scaled_width(network, base)
     model = ModelConfig(name=network, width=width, equivariance=base.model.equivariance)
     regularisation = REGULARISATION.get(network, {})
@@ -105,13 +108,24 @@ def method(network: str, base: TrainConfig) -> TrainConfig:
 
 
 def scaled_width(network: str, base: TrainConfig) -> int | None:
-    """The width of a network at the share of its published width that `base` has of GNIO's. None,
-    the published one, for networks without a width, and for those with memory, which are small."""
+    """The width of a network at the share of its published width that `base` has of GNIO's, or the
+    next one that the network can have. None, the published one, for networks without a width, and
+    for those with memory, which are small."""
     default = models.create(network)
     small = isinstance(default, NetworkWithMemory) or not hasattr(default, "width")
     if small or base.model.width is None:
         return None
-    return max(round(base.model.width / GNIO.width * default.width), 1)
+    width = max(round(base.model.width / GNIO.width * default.width), 1)
+    return next(filter(partial(accepts_width, network), itertools.count(width)))
+
+
+def accepts_width(network: str, width: int) -> bool:
+    """Whether a network can have this width: that of CTIN is a multiple of its heads."""
+    try:
+        models.create(network, width=width)
+    except InputError:
+        return False
+    return True
 
 
 def loss(network: str, base: TrainConfig) -> LossConfig:

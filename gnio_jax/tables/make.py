@@ -25,7 +25,8 @@ from gnio_jax.evaluation.folder import read_views
 from gnio_jax.evaluation.statistics import Cell, MetricSummary
 from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
-from gnio_jax.tables import activities, experiments
+from gnio_jax.tables import activities, experiments, published
+from gnio_jax.tables.cost import device_name
 from gnio_jax.tables.duration import announce
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.runs import RowResult, run_row, unfinished_runs
@@ -58,6 +59,8 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
     reporter = reporter or Lines()
     if options.table == "complexity":
         return make_complexity(Path(options.out), reporter)
+    if options.table == "published":
+        return published.make_published(Path(options.out))
     if options.seeds < 1:
         raise InputError("--seeds", f"must be at least 1, found {options.seeds}")
     base = base_config(options)
@@ -155,11 +158,15 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> s
     on_cpu = jax.devices()[0].platform == "cpu"
     on_core = " on one core" if on_cpu and can_choose_cores() else ""
     calibrated = f", gnio calibrate on {base.data.val_split}" if options.calibrate else ""
+    segments = ""
+    if base.segments.seconds:
+        segments = f"; networks with memory: segments of {base.segments.seconds:g} s"
     return (
         f"{measured_dataset(options, base)} {options.split}, {options.estimator}; every row: "
-        f"{' and '.join(base.datasets)}, {base.optim.epochs} epochs of batches of {base.optim.batch_size}, learning rate "
-        f"{base.optim.learning_rate:g}, width {base.model.width or 64}, {base.data.rate:g} Hz, "
-        f"{options.seeds} {'seed' if options.seeds == 1 else 'seeds'}{calibrated}; on "
+        f"{' and '.join(base.datasets)}, {base.optim.epochs} epochs of batches of "
+        f"{base.optim.batch_size}, learning rate {base.optim.learning_rate:g}, width "
+        f"{base.model.width or 64}, {base.data.rate:g} Hz, "
+        f"{options.seeds} {'seed' if options.seeds == 1 else 'seeds'}{segments}{calibrated}; on "
         f"{hardware()}. ± is the standard deviation over seeds; the difference to the first "
         f"row is over sequences. ms / interval is the median time of network and filter for "
         f"{base.data.stride_seconds:g} s of a simulated walk{on_core}.\n\n"
@@ -169,10 +176,10 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> s
 
 def hardware() -> str:
     """The hardware, as text."""
-    device, cores = jax.devices()[0], usable_cores()
-    if device.platform != "cpu":
-        return device.device_kind
-    return f"{cores} CPU core{'s' if cores > 1 else ''}"
+    cores, device = usable_cores(), device_name()
+    if jax.devices()[0].platform != "cpu":
+        return device
+    return f"{cores} core{'s' if cores > 1 else ''} of a CPU ({device})"
 
 
 # --- rows side by side

@@ -14,7 +14,7 @@ from gnio_jax.models.motion_bank import MotionBank
 from tests.support.compiling import quick
 from tests.support.networks import drawn, predicted, shapes
 from tests.support.numpy_layers import conv_norm as numpy_conv_norm
-from tests.support.numpy_layers import float64, linear, relu, resnet, sigmoid, softmax
+from tests.support.numpy_layers import float64, linear, motion_bank, relu, resnet, sigmoid
 from tests.support.tiny_network import Tiny
 
 
@@ -82,24 +82,12 @@ def numpy_forward(variables, windows):
     (p, s), results = float64(variables), []
     for x in np.asarray(windows, np.float64):
         f = resnet(x, p["encoder"], s["encoder"], block).mean(axis=0)
-        bank, context, weights = p["bank"], [], []
-        for h in range(bank["query"]["bias"].shape[0]):
-            q, k, v = (
-                x @ bank[name]["kernel"][:, h] + bank[name]["bias"][h]
-                for name, x in (
-                    ("query", f),
-                    ("key", bank["prototypes"]),
-                    ("value", bank["prototypes"]),
-                )
-            )
-            weights.append(softmax(k @ q / np.sqrt(len(q))))
-            context.append(weights[-1] @ v)
-        output = bank["output"]["kernel"].reshape(len(f), len(f))
-        h = f + np.concatenate(context) @ output + bank["output"]["bias"]
+        context, attention = motion_bank(f, p["bank"])
+        h = f + context
         gate = np.tanh(linear(h, p["head"]["gate"]))
         displacement = np.log1p(np.exp(linear(h, p["head"]["scale"]))) * gate
         log_std = linear(h, p["uncertainty"]["log_std"])
-        results.append((displacement, log_std, gate, np.array(weights)))
+        results.append((displacement, log_std, gate, attention))
     return tuple(map(np.array, zip(*results, strict=True)))
 
 

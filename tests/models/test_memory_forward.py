@@ -10,7 +10,15 @@ import pytest
 from gnio_jax import models
 from tests.support.compiling import quick
 from tests.support.networks import drawn
-from tests.support.numpy_layers import float64, layer_norm, linear, recurrence, relu, sigmoid
+from tests.support.numpy_layers import (
+    float64,
+    layer_norm,
+    linear,
+    motion_bank,
+    recurrence,
+    relu,
+    sigmoid,
+)
 
 EVERY, INTERVALS = 20, 15
 """Samples of an interval, and intervals of the recording: 300 samples, and RoNIN's TCN sees 253."""
@@ -22,6 +30,8 @@ OPTIONS = {
     "ronin_tcn": {"width": 2},
     "state_space": {"width": 6, "state": 5, "layers": 2},
 }
+GNIO = {"bank_size": 3, "head": "gated"}
+"""GNIO's bank and head, which sit on each of them."""
 
 
 def causal(x, size, dilation=1, stride=1):
@@ -126,7 +136,13 @@ def forward(name, x, variables):
     features = ENCODERS[name](x - [0, 0, 9.81, 0, 0, 0], q)
     step = len(features) // INTERVALS
     h = features[step - 1 :: step]
-    displacement = linear(h, q["head"]["displacement"])
+    if "bank" in q:
+        h = h + np.array([motion_bank(row, q["bank"])[0] for row in h])
+    if "gate" in q["head"]:
+        scale = np.log1p(np.exp(linear(h, q["head"]["scale"])))
+        displacement = scale * np.tanh(linear(h, q["head"]["gate"]))
+    else:
+        displacement = linear(h, q["head"]["displacement"])
     statistics = s.get("uncertainty", {})
     if "log_std" in statistics:  # a constant
         return displacement, np.tile(statistics["log_std"], (len(h), 1))
@@ -143,19 +159,23 @@ def random_variables(name, model):
     )
 
 
+@pytest.mark.parametrize("heads", [{}, GNIO], ids=["linear", "bank, gated"])
 @pytest.mark.parametrize("name", OPTIONS)
-def test_a_recording_at_once_and_in_pieces_against_numpy(name):
-    model = models.create(name, **OPTIONS[name])
+def test_a_recording_at_once_and_in_pieces_against_numpy(name, heads):
+    model = models.create(name, **OPTIONS[name], **heads)
     variables = random_variables(name, model)
     x = np.random.default_rng(8).standard_normal((EVERY * INTERVALS, 6)).astype(np.float32)
     x[:, 2] += 9.81
     expected = forward(name, np.float64(x), variables)
     assert np.ptp(expected[0], axis=0).min() > 0.05 and np.abs(expected[1]).max(axis=0).min() > 0.1
-    program = quick(functools.partial(model.apply, method="advance"), static_argnums=3)
+    constants = model.constants(variables)  # the bank's keys and values
+    assert bool(constants) == bool(heads)
+    advance = functools.partial(model.apply, method="advance", **constants)
+    program = quick(advance, static_argnums=3)
     for pieces in ((INTERVALS,), PIECES):
         state, rows = model.apply(variables, 1, method="begin"), []
         for piece in np.split(x, np.cumsum(pieces)[:-1] * EVERY):
             state, prediction = program(variables, state, jnp.asarray(piece)[None], EVERY)
             rows.append(jax.device_get((prediction.displacement[0], prediction.log_std[0])))
         for values, parts in zip(expected, zip(*rows, strict=True), strict=True):
-            np.testing.assert_allclose(np.concatenate(parts), values, atol=1e-5)
+            np.testing.assert_allclose(np.concatenate(parts), values, rtol=1e-5, atol=1e-5)

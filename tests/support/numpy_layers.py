@@ -77,6 +77,22 @@ def attention(query, key, value, q, causal=False):
     return out
 
 
+def motion_bank(feature, q):
+    """Context of one feature, and its attention (heads, prototypes)."""
+    context, attention = [], []
+    for head in range(q["query"]["bias"].shape[0]):
+        query, key, value = (
+            rows @ q[name]["kernel"][:, head] + q[name]["bias"][head]
+            for name, rows in zip(
+                ("query", "key", "value"), (feature, q["prototypes"], q["prototypes"]), strict=True
+            )
+        )
+        attention.append(softmax(key @ query / np.sqrt(len(query))))
+        context.append(attention[-1] @ value)
+    output = q["output"]["kernel"].reshape(len(feature), len(feature))
+    return np.concatenate(context) @ output + q["output"]["bias"], np.array(attention)
+
+
 def gelu(x):
     return np.array([0.5 * v * (1 + math.erf(v / math.sqrt(2))) for v in x.flat]).reshape(x.shape)
 

@@ -72,12 +72,12 @@ def test_where_cores_cannot_be_chosen_all_are_used_and_no_note_says_one(
         pass
     base = TrainConfig(dataset="tlio")
     options = TablesConfig("comparison")
-    text = make.notes(base, options, experiments.comparison(base, "test", ()))
+    text = make.notes(base, options, experiments.comparison(base, "tlio", "test", ()))
     assert "ms / interval" in text and "on one core" not in text
 
 
 def test_a_cost_is_measured_once_for_a_device(run, monkeypatch, capsys):
-    times = iter([0.002, 0.003, 0.004])
+    times = iter([0.002, 0.003, 0.004, 0.005])
     monkeypatch.setattr(cost, "interval_seconds", lambda trained: next(times))
     first = cost.load_or_measure(run, Lines())
     assert first.interval_ms == pytest.approx(2.0)
@@ -87,5 +87,18 @@ def test_a_cost_is_measured_once_for_a_device(run, monkeypatch, capsys):
     file = run / cost.FILE
     file.write_text(json.dumps(first._replace(device="TPU")._asdict()))
     assert cost.load_or_measure(run, Lines()).interval_ms == pytest.approx(3.0)
-    file.write_text('{"parameters": 3}')
+    monkeypatch.setattr(cost, "processor_name", lambda: "another CPU")
     assert cost.load_or_measure(run, Lines()).interval_ms == pytest.approx(4.0)
+    file.write_text('{"parameters": 3}')
+    assert cost.load_or_measure(run, Lines()).interval_ms == pytest.approx(5.0)
+
+
+def test_a_processor_has_its_name_where_the_system_has_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(cores, "CPU_INFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(cores.platform, "processor", lambda: "")
+    monkeypatch.setattr(cores.platform, "machine", lambda: "aarch64")
+    assert cores.processor_name() == "aarch64"  # there is no such file
+    (tmp_path / "cpuinfo").write_text("processor\t: 0\nBogoMIPS\t: 38.4\nmodel name\t:\n")
+    assert cores.processor_name() == "aarch64"
+    (tmp_path / "cpuinfo").write_text("processor\t: 0\nmodel name\t: Xeon: 2.1 GHz\n")
+    assert cores.processor_name() == "Xeon: 2.1 GHz"

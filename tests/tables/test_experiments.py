@@ -6,8 +6,8 @@ import pytest
 
 from gnio_jax import config as configuration
 from gnio_jax import models
-from gnio_jax.config import LossConfig
-from gnio_jax.tables import experiments
+from gnio_jax.config import LossConfig, SegmentTraining, TablesConfig
+from gnio_jax.tables import experiments, make
 from tests.support.reports import BASE
 
 
@@ -17,7 +17,7 @@ def test_rows_differ_in_the_network_alone():
     chosen = dataclasses.replace(BASE.optim, best_by="squared_error")
     same = dataclasses.replace(BASE, optim=chosen)
     made = [experiments.components, experiments.gates, experiments.bank_sizes]
-    tables = [make(BASE) for make in made] + [experiments.comparison(BASE, "test")]
+    tables = [make(BASE) for make in made] + [experiments.comparison(BASE, "tlio", "test")]
     rows, seen = [row for table in tables for row in table.rows], {}
     for row in rows:
         own = row.config
@@ -62,3 +62,40 @@ def test_losses_and_regularisation_are_those_of_the_published_recipes(network):
     for name in ("clip_norm", "weight_decay"):
         assert getattr(row.optim, name) == getattr(recipe.optim, name)
     assert models.from_config(recipe.model) is not None
+
+
+@pytest.mark.parametrize(
+    "width, widths", [(16, (16, 24, 24, 8)), (4, (4, 8, 6, 2)), (None, (None, None, None, None))]
+)
+def test_networks_on_windows_have_one_share_of_their_published_widths(width, widths):
+    """Those with memory are small as published, and iMoT has no width. CTIN's is a multiple of its
+    8 heads."""
+    base = dataclasses.replace(BASE, model=dataclasses.replace(BASE.model, width=width))
+    networks = ("tlio", "ctin", "ionet", "experts")
+    assert tuple(experiments.method(name, base).model.width for name in networks) == widths
+    for name in ("gru", "state_space", "ronin_lstm", "ronin_tcn", "imot"):
+        assert experiments.method(name, base).model.width is None
+
+
+def test_only_networks_with_memory_learn_on_segments_with_as_many_seconds_in_a_batch():
+    optim = dataclasses.replace(BASE.optim, batch_size=128)
+    base = dataclasses.replace(BASE, optim=optim, segments=SegmentTraining(6.0))
+    for name in make.networks(TablesConfig("comparison", methods="all")):
+        config = experiments.method(name, base)
+        remembers = name in ("gru", "state_space", "ronin_lstm", "ronin_tcn")
+        assert (config.segments.seconds, config.optim.batch_size) == (
+            (6.0, 21) if remembers else (0.0, 128)
+        )
+    few = dataclasses.replace(base, optim=dataclasses.replace(optim, batch_size=2))
+    assert experiments.method("gru", few).optim.batch_size == 1
+    without = dataclasses.replace(base, segments=SegmentTraining())
+    assert experiments.method("gru", without).optim.batch_size == 128
+
+
+def test_published_figures_are_those_of_the_measured_dataset():
+    names = ("gnio", "tlio")
+    rows = experiments.comparison(BASE, "oxiod", "unseen", names).rows
+    assert [row.published for row in rows] == [0.71, 2.54]
+    experiment = experiments.comparison(dataclasses.replace(BASE, dataset="oxiod"), "tyrex", "test")
+    assert {row.published for row in experiment.rows} == {None}
+    assert experiment.source == "no published figure for this split"

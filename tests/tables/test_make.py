@@ -24,6 +24,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import reuse
 from gnio_jax.tables import activities, experiments, make
 from gnio_jax.training import loop
+from tests.support import small_tables
 from tests.support.command_lines import run as gnio
 from tests.support.tlio_files import write_sequence
 
@@ -144,6 +145,45 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
 def test_mistakes_are_named(made, more, words):
     with pytest.raises(InputError, match=words):
         gnio("tables", "comparison", *made[1], *more)
+
+
+@pytest.mark.slow
+def test_networks_that_learn_from_two_datasets_are_measured_on_one_that_is_named(
+    made, tmp_path, monkeypatch
+):
+    """The second measurement trains nothing, and its files have another name."""
+    root, arguments = made
+    small_tables.patch(monkeypatch)
+    monkeypatch.setenv("GNIO_DATA", str(tmp_path))
+    (tmp_path / "tlio").symlink_to(root / "data")
+    base = configuration.load(root / "base.yaml")
+    configuration.save(
+        tmp_path / "both.yaml", dataclasses.replace(base, dataset=("tlio", "synthetic"))
+    )
+    arguments = ["tables", "comparison", "--base", str(tmp_path / "both.yaml"), "--seeds", "1"]
+    arguments += ["--methods", "gnio", "--out", str(tmp_path / "out"), "--estimator", "integrate"]
+    with pytest.raises(InputError, match="has several datasets: tlio, synthetic; name the one to"):
+        gnio(*arguments)
+    with pytest.raises(InputError, match="nosuch"):
+        gnio(*arguments, "--dataset", "nosuch")
+    gnio(*arguments, "--dataset", "synthetic")
+    trained = configuration.load(tmp_path / "out" / "runs" / "gnio_s0" / "config.yaml")
+    assert trained.datasets == ("tlio", "synthetic") and trained.data_root is None
+    monkeypatch.setattr(loop, "train_all", None)
+    gnio(*arguments, "--dataset", "tlio")
+    gnio(*arguments, "--dataset", "tlio", "--data-root", str(root / "data"))
+    settings = {}
+    for name in ("synthetic", "tlio", "tlio_data"):
+        text = (tmp_path / "out" / f"comparison_{name}_test_integrate.md").read_text("utf-8")
+        dataset = name.removesuffix("_data")
+        assert f"{dataset} test, integrate; every row: tlio and synthetic, 2 epochs" in text
+        folder = tmp_path / "out" / "runs" / "gnio_s0" / "eval" / f"{dataset}_test_integrate"
+        settings[name] = json.loads((folder / "metrics.json").read_text())["settings"]["dataset"]
+    assert settings == {"synthetic": "synthetic", "tlio": "tlio", "tlio_data": "tlio"}
+    arguments[1] = "standing"
+    gnio(*arguments, "--dataset", "synthetic")
+    text = (tmp_path / "out" / "standing_synthetic_test_integrate.md").read_text("utf-8")
+    assert "| gnio | walking |" in text
 
 
 def test_a_row_that_cannot_be_trained_is_refused_before_any_other_is(made, monkeypatch):
