@@ -4,9 +4,10 @@ a map.
 
 Layout: `<site>/<floor>/path_data_files/<id>.txt`. Lines that begin with '#' name device, sensors,
 start and end; every other is `unix ms, type, values` between tabs: TYPE_ACCELEROMETER (m/s²,
-Android's sign) and TYPE_GYROSCOPE (rad/s), each xyz and an accuracy, and TYPE_WAYPOINT, x and y in
-m of the floor's map. Other lines are ignored. If a newline is missing, two lines are joined; they
-are divided before the second stamp.
+Android's sign), TYPE_GYROSCOPE (rad/s) and TYPE_MAGNETIC_FIELD (µT, without what the system
+believes to be the phone's own), each xyz and an accuracy, and TYPE_WAYPOINT, x and y in m of the
+floor's map. Other lines are ignored, and a walk may have no field. If a newline is missing, two
+lines are joined; they are divided before the second stamp.
 
 Both sensors of the phone share their stamps, whole ms at about 50 Hz, and sequences have 50 Hz.
 Walkers are not named; a floor is a `group`.
@@ -29,9 +30,10 @@ import numpy as np
 from gnio_jax.data.assembly import Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.parsing.tables import Table, damage_error, shorten, text_of
+from gnio_jax.data.sensors import MAGNETOMETER
 from gnio_jax.data.validation import FARTHEST, FEWEST_WAYPOINTS
 from gnio_jax.errors import InputError
-from gnio_jax.types import Sequence
+from gnio_jax.types import Readings, Sequence
 
 RATE = 50.0
 """Hz."""
@@ -41,7 +43,8 @@ TAP_SECONDS = 1.0
 """Largest time before or after the IMU's samples at which a tap is accepted, s."""
 
 _GYRO, _ACCEL, _WAYPOINT = "TYPE_GYROSCOPE", "TYPE_ACCELEROMETER", "TYPE_WAYPOINT"
-_VALUES = {_GYRO: 3, _ACCEL: 3, _WAYPOINT: 2}
+_FIELD = "TYPE_MAGNETIC_FIELD"
+_VALUES = {_GYRO: 3, _ACCEL: 3, _WAYPOINT: 2, _FIELD: 3}
 """Number of values of a line that are read."""
 _MERGED = re.compile(r"(?<!^)(?=\d{13}\tTYPE_)")
 """Pattern of the beginning of a line inside another one; stamps of unix ms have 13 digits until the
@@ -81,7 +84,7 @@ def read(path: Path) -> list[Sequence]:
     """
     header, tables = read_lines(path)
     for kind, table in tables.items():
-        fewest = FEWEST_WAYPOINTS if kind == _WAYPOINT else 2
+        fewest = {_WAYPOINT: FEWEST_WAYPOINTS, _FIELD: 0}.get(kind, 2)
         if (count := len(table.stamps(kind))) < fewest:
             problem = f"field '{kind}' holds {count}, at least {fewest} are needed"
             raise Refusal(path, problem) if kind == _WAYPOINT else damage_error(path, problem)
@@ -91,7 +94,11 @@ def read(path: Path) -> list[Sequence]:
         time, _, rows = tables[kind].clock(kind, "ms", start, "dropped")
         return Samples(time, tables[kind].take("values", width=_VALUES[kind])[rows], str(path))
 
-    gyro, accel = samples(_GYRO), samples(_ACCEL)
+    gyro, accel, field = samples(_GYRO), samples(_ACCEL), samples(_FIELD)
+    readings = {}
+    if len(field.time):
+        unstated = np.full_like(field.values, np.nan)
+        readings[MAGNETOMETER] = Readings(field.time, field.values, unstated)
     device = re.search(r"Brand:(\S+)\s+Model:(\S+)", header)
     attributes = {
         "group": f"{path.parent.parent.parent.name}_{_floor(path)}",
@@ -109,6 +116,7 @@ def read(path: Path) -> list[Sequence]:
         attributes,
         start * 1e-3,
         waypoints=_taps(samples(_WAYPOINT), gyro, accel),
+        readings=readings,
     )
     return assemble(streams, RATE)
 
