@@ -99,8 +99,9 @@ def main() -> None:
     units = np.exp(1j * turns)
     angles = np.angle(units.sum() - units)  # of the other walks
     off = np.degrees(np.abs(np.angle(np.exp(1j * (turns - angles)))))
+    mean = np.degrees(np.angle(units.mean()))
     print(
-        f"{len(walks)} walks, field to map {np.degrees(np.angle(units.mean())):.1f} degrees, off by "
+        f"{len(walks)} walks, field to map {mean:.1f} degrees, off by "
         f"{np.median(off):.1f} in the median and by {np.percentile(off, 90):.1f} in one of ten"
     )
     table = {"each walk turned": [], "one angle": [], "one angle, field in the filter": []}

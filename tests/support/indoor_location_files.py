@@ -18,6 +18,11 @@ TAPS = np.array([-0.122, 6.0, 12.5, 18.25, 24.75, 30.004])
 """s; the first comes before the first sample."""
 
 
+def field(time: np.ndarray) -> np.ndarray:
+    """Readings of the magnetometer, µT."""
+    return np.stack([20 + 0.1 * time, 5 - 0.2 * time, -40 + 0.3 * time], axis=1)
+
+
 def lines(seconds: float = walk.SECONDS, taps: np.ndarray = TAPS) -> list[str]:
     """The lines of one walk, in the order of their stamps."""
     taps = taps[taps <= seconds]
@@ -25,7 +30,7 @@ def lines(seconds: float = walk.SECONDS, taps: np.ndarray = TAPS) -> list[str]:
     time, found = stamps / 1e3, []
     for kind, values in (
         ("ACCELEROMETER", walk.force(time)),
-        ("MAGNETIC_FIELD", 30.0 + 0.0 * walk.force(time)),
+        ("MAGNETIC_FIELD", field(time)),
         ("GYROSCOPE", walk.rate(time)),
     ):
         for stamp, (x, y, z) in zip(stamps, values.tolist(), strict=True):

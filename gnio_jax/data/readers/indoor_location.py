@@ -94,11 +94,10 @@ def read(path: Path) -> list[Sequence]:
         time, _, rows = tables[kind].clock(kind, "ms", start, "dropped")
         return Samples(time, tables[kind].take("values", width=_VALUES[kind])[rows], str(path))
 
-    gyro, accel, field = samples(_GYRO), samples(_ACCEL), samples(_FIELD)
-    readings = {}
-    if len(field.time):
-        unstated = np.full_like(field.values, np.nan)
-        readings[MAGNETOMETER] = Readings(field.time, field.values, unstated)
+    gyro, accel, readings = samples(_GYRO), samples(_ACCEL), dict[str, Readings]()
+    if len(tables[_FIELD].stamps(_FIELD)):
+        time, field, _ = samples(_FIELD)
+        readings[MAGNETOMETER] = Readings(time, field, np.full_like(field, np.nan))
     device = re.search(r"Brand:(\S+)\s+Model:(\S+)", header)
     attributes = {
         "group": f"{path.parent.parent.parent.name}_{_floor(path)}",

@@ -9,7 +9,7 @@ from gnio_jax.data.readers import indoor_location
 from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from tests.support import known_walk as walk
-from tests.support.indoor_location_files import NAME, START, TAPS, lines, write
+from tests.support.indoor_location_files import NAME, START, TAPS, field, lines, write
 
 
 def check_walk(sequence):
@@ -21,6 +21,10 @@ def check_walk(sequence):
     taps = sequence.waypoints
     np.testing.assert_allclose(taps.time, np.maximum(TAPS, 0.0), atol=1e-9)
     np.testing.assert_allclose(taps.position, walk.position(TAPS)[:, :2], atol=1e-6)
+    magnetometer = sequence.readings["magnetometer"]
+    assert len(magnetometer.time) > 1500 and (np.diff(magnetometer.time) > 0).all()
+    np.testing.assert_allclose(magnetometer.values, field(magnetometer.time), atol=1e-3)
+    assert np.isnan(magnetometer.std).all()
 
 
 def test_a_walk_comes_back_with_its_waypoints(tmp_path):
@@ -45,6 +49,17 @@ def test_lines_that_are_merged_repeated_or_out_of_order_come_back(tmp_path):
         text[row : row + 2] = [text[row] + text[row + 1]]
     (sequence,) = indoor_location.read(write(tmp_path, text))
     check_walk(sequence)
+
+
+def test_a_walk_may_have_no_magnetometer_but_no_damaged_one(tmp_path):
+    text = [line for line in lines() if "MAGNETIC" not in line]
+    (sequence,) = indoor_location.read(write(tmp_path, text))
+    assert sequence.readings == {}
+    text = lines()
+    row = next(i for i, line in enumerate(text) if "MAGNETIC" in line)
+    text[row] = "\t".join(text[row].split("\t")[:4])
+    with pytest.raises(InputError, match=f"'TYPE_MAGNETIC_FIELD' is cut short.* in line {row + 1}"):
+        indoor_location.read(write(tmp_path, text))
 
 
 def test_a_walk_of_few_waypoints_is_of_no_use(tmp_path):
