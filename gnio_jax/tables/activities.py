@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gnio_jax import data, evaluation
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
 from gnio_jax.models import Network
 from gnio_jax.networks import read_network
@@ -48,10 +49,16 @@ class PredictedWindows(NamedTuple):
 
 
 def predict_split(workdir: Path, recordings: Recordings) -> PredictedWindows:
-    """The predictions of the network of a run for the windows of a split of a dataset."""
+    """The predictions of the network of a run for the windows of a split of a dataset. Raises
+    `InputError` for recordings without poses."""
     run = read_network(workdir)
     config = run.config.data
     sequences = data.load(*recordings)
+    for sequence in sequences:
+        if sequence.waypoints is not None:
+            subject = f"{recordings.dataset} {recordings.split}"
+            problem = f"{sequence.name} has waypoints, no poses"
+            raise InputError(subject, problem, "name another --dataset or --split")
     prepared, _ = evaluation.prepare(sequences, config, orientation="reference")
     network = Network.of(run.model, run.variables)
     predicted = evaluation.infer(network, prepared, config, diagnostics=DIAGNOSTICS)

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from gnio_jax.errors import InputError
 from gnio_jax.tables import activities
+from tests.support import indoor_location_files, tiny_run
 
 
 def test_activities_by_speed():
@@ -49,3 +51,12 @@ def test_information_of_prototypes():
     assert names == ["standing", "slow", "walking", "running"]
     np.testing.assert_array_equal(lifts.argmax(1), [0, 1, 2, 3])
     np.testing.assert_allclose(lifts[:, 4:], 1.0)
+
+
+def test_walks_with_waypoints_have_no_true_windows(tmp_path):
+    with tiny_run.known():
+        run = tiny_run.save(tmp_path / "tiny_s0", tiny_run.CONFIGURED)
+        indoor_location_files.write(tmp_path)
+        recordings = activities.Recordings("indoor_location", str(tmp_path), "test")
+        with pytest.raises(InputError, match="has waypoints, no poses; name another --dataset"):
+            activities.predict_split(run, recordings)
