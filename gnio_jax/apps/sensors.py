@@ -121,8 +121,10 @@ def fuse(
     ekf: Filter,
     readings: dict[str, Readings],
     run: Run,
+    first_fixes: float = FIRST_FIXES,
 ) -> Fused:
-    """The track with the readings of other sensors, from the run without them.
+    """The track with the readings of other sensors, from the run without them. `first_fixes` is the
+    time of the fixes to which the path is aligned first, s.
 
     Sensors that cannot be used, and those of which the filter refuses most, are left out, and their
     text has the reason. If none remains, the first run is the result.
@@ -156,7 +158,8 @@ def fuse(
         fused = without_fixes
         if has_fixes:
             path = without_fixes.estimate if has_field else first
-            fused = _with_fixes(base, path, readings, fits, refused, run)
+            longest = math.inf if has_field else first_fixes
+            fused = _with_fixes(base, path, readings, fits, refused, run, longest)
             if fused is None or _refuse_one(fused, first, refused):
                 continue
         reasons = (
@@ -188,10 +191,10 @@ def _with_fixes(
     fits: dict[str, Measurement],
     refused: dict[str, str],
     run: Run,
+    longest: float,
 ) -> Fused | None:
     """The track with the receiver, too, which begins where the fixes place the path without them.
     None, with the reason in `refused`, if they do not show that."""
-    longest = math.inf if MAGNETOMETER in fits else FIRST_FIXES
     placement: Placement | None = _try(
         refused, GNSS, lambda: place_on_map(readings[GNSS], path, longest)
     ).get(GNSS)

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 
+from gnio_jax.apps import drive
 from gnio_jax.apps.importing import GAPS, Imported
 from gnio_jax.apps.publish import describe_data, describe_error
 from gnio_jax.apps.sensors import SensorUse
+from gnio_jax.config import TrainConfig
 from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.gait import Gait, detect_gait
 from gnio_jax.data.geodesy import Place
+from gnio_jax.data.sensors import GNSS
 from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, metrics
 from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.filtering import Filter
-from gnio_jax.filtering.zero_velocity import ZeroVelocity, quiet_samples
+from gnio_jax.filtering.zero_velocity import ZeroVelocity, is_quiet
 from gnio_jax.networks import TrainedNetwork
 from gnio_jax.numerics import spans
 
@@ -79,6 +83,8 @@ class Summary(NamedTuple):
     """Notes about what the import and the start detected, assumed or repaired."""
     sensors: tuple[SensorUse, ...] = ()
     """What the other sensors did."""
+    carrier: Literal["person", "car"] = "person"
+    """What carried the IMU."""
     origin: Place | None = None
     """The place of the start, if the axes of the world are east, north and up; None: they are those
     of the start."""
@@ -89,7 +95,7 @@ def summarise(
     errors: dict[str, float | None],
     ready: PreparedRecording,
     recording: Imported,
-    trained: TrainedNetwork,
+    source: TrainedNetwork | TrainConfig,
     ekf: Filter,
     sensors: tuple[SensorUse, ...] = (),
     origin: Place | None = None,
@@ -101,7 +107,8 @@ def summarise(
         errors: Metrics against the reference by their names; empty without a reference.
         ready: The recording as the filter took it.
         recording: The recording as it was imported, with its notes and warnings.
-        trained: The network, for its name, its training data and its measured error.
+        source: The network, for its name, its training data and its measured error; or the
+            configuration of a car's filter.
         ekf: The filter.
         sensors: What the other sensors did.
         origin: The place of the start, if a receiver shows it.
@@ -114,19 +121,18 @@ def summarise(
     used = filtered.accepted[:rows]
     used = used[np.isfinite(used)]
     error = float(np.sqrt(np.trace(filtered.covariance[rows - 1, :2, :2])))
+    about = describe_source(source)
     gait = detect_gait(ready.gyro, ready.accel, 1.0 / ekf.config.dt, ready.imu_valid)
     summary = Summary(
         recording=sequence.name,
-        network=trained.name,
-        trained_on=describe_data(trained),
-        measured=describe_error(trained),
+        **about,
         start_time=float(sequence.attributes.get("start_time", 0.0)),
         seconds=float(time[-1] - time[0]),
         path_length=0.0
         if rows < 2
         else metrics.path_length(position[:, :2], float(time[1] - time[0])),
         from_start=float(np.linalg.norm((position[-1] - position[0])[:2])),
-        expected_error=error if gait.has_steps and not has_diverged else np.nan,
+        expected_error=np.nan,
         steps=float(gait.walking.mean()) if len(gait.walking) else None,
         at_rest=_share_at_rest(ready, ekf),
         running=float(gait.running.mean()) if len(gait.running) else 0.0,
@@ -140,15 +146,47 @@ def summarise(
     )
     rate = 1.0 / float(np.median(np.diff(sequence.time)))
     recorded_rate = min(rate, float(sequence.attributes.get(RECORDED_RATE, rate)) or rate)
+    if summary.carrier == "car":
+        shown = any(use.sensor == GNSS and use.accepted is not None for use in sensors)
+        first, of_walk = _warnings_of_drive(summary, shown), []
+    else:
+        shown = gait.has_steps
+        first = _warnings_of_gait(gait, summary.steps)
+        of_walk = _warnings_of_walk(summary, recorded_rate, ekf)
     warnings = (
         *(note for note in estimate.notes if note not in ready.notes),  # of a divergence
-        *_warnings_of_gait(gait, summary.steps),
+        *first,
         *recording.warnings,
         *(f"{use.sensor}: {use.text}" for use in sensors if use.accepted is None),
-        *_warnings(summary, recorded_rate, ekf),
-        *_warnings_of_start(ready, recording, ekf),
+        *of_walk,
+        *_warnings_of_errors(summary),
+        *_warnings_of_start(ready, recording, ekf, summary.carrier),
     )
-    return summary._replace(warnings=warnings)
+    expected_error = error if shown and not has_diverged else np.nan
+    return summary._replace(expected_error=expected_error, warnings=warnings)
+
+
+def describe_source(source: TrainedNetwork | TrainConfig) -> dict[str, Any]:
+    """The fields of a `Summary` that say what estimated the path."""
+    if isinstance(source, TrainConfig):
+        return {
+            "network": "no network",
+            "trained_on": "",
+            "measured": drive.MEASURED,
+            "carrier": "car",
+        }
+    return {
+        "network": source.name,
+        "trained_on": describe_data(source),
+        "measured": describe_error(source),
+    }
+
+
+def _warnings_of_drive(summary: Summary, has_fixes: bool) -> list[str]:
+    """The warning about a drive without fixes, whose error grows with the way."""
+    if has_fixes:
+        return []
+    return [f"car: there are no fixes, so no error can be stated: {summary.measured}"]
 
 
 def _warnings_of_gait(gait: Gait, steps: float | None) -> list[str]:
@@ -157,7 +195,8 @@ def _warnings_of_gait(gait: Gait, steps: float | None) -> list[str]:
         share = f"no steps in {1.0 - steps:.0%} of the time" if steps else "no steps"
         return [
             f"no walk: there are {share}. The network reads the path from steps: in a vehicle, on "
-            "a trolley or in a hand that only moves, the path is wrong, and no error can be stated"
+            "a trolley or in a hand that only moves, the path is wrong, and no error can be "
+            "stated. For a car, give --carrier car"
         ]
     others = ~gait.walking & ~gait.quiet
     if not len(others) or others.mean() <= NOT_WALKED:
@@ -170,7 +209,9 @@ def _warnings_of_gait(gait: Gait, steps: float | None) -> list[str]:
     ]
 
 
-def _warnings_of_start(ready: PreparedRecording, recording: Imported, ekf: Filter) -> list[str]:
+def _warnings_of_start(
+    ready: PreparedRecording, recording: Imported, ekf: Filter, carrier: str = "person"
+) -> list[str]:
     """Warnings about missing samples and the start, and about a filter that was not calibrated."""
     has_holes = ready.imu_valid is not None
     where = "" if has_holes else " (see above)"
@@ -184,23 +225,22 @@ def _warnings_of_start(ready: PreparedRecording, recording: Imported, ekf: Filte
         "gyro: raw, and without a rest that shows its bias: the heading may be lost within a "
         "minute; hold the phone still for some seconds first": ready.start.raw_gyro,
         "start: it moves in its first second, so velocity and tilt are inaccurate": (
-            ready.start.std.velocity > ROUGH_START
+            ready.start.std.velocity > ROUGH_START and carrier == "person"
+        ),
+        "start: the car moves, and nothing shows its speed, so the path is wrong; begin at rest": (
+            ready.start.std.velocity >= drive.UNKNOWN_SPEED
         ),
         "calibration: the filter's covariances were not calibrated (gnio calibrate), so the real "
-        "error is probably larger than the expected one": ekf.considered is None,
+        "error is probably larger than the expected one": (
+            ekf.considered is None and carrier == "person"
+        ),
     }
     return [text for text, applies in conditions.items() if applies]
 
 
-def _warnings(summary: Summary, recorded_rate: float, ekf: Filter) -> list[str]:
-    """Warnings that limit the value of the figures."""
+def _warnings_of_walk(summary: Summary, recorded_rate: float, ekf: Filter) -> list[str]:
+    """Warnings that limit the value of the figures of a walk."""
     accepted = 1.0 if summary.accepted is None else summary.accepted
-    covered = {
-        "place": summary.errors.get("nees_coverage_2d"),
-        "place and height": summary.errors.get("nees_coverage"),
-    }
-    shares = {of: share for of, share in covered.items() if share is not None}
-    worst = min(shares, key=shares.__getitem__, default="")
     speed = summary.path_length / max(summary.seconds, 1e-9)
     rate = 1.0 / ekf.config.dt
     at_rest = "the filter holds the position"
@@ -223,18 +263,33 @@ def _warnings(summary: Summary, recorded_rate: float, ekf: Filter) -> list[str]:
         f"speed: {speed:.1f} m/s in the mean is faster than people walk: the track is wrong": (
             speed > FASTEST
         ),
-        f"errors: larger than the filter says: its 95 % region of {worst} holds the reference in "
-        f"{shares.get(worst, 0.0):.0f} % of the rows": shares.get(worst, 100.0) < COVERED,
     }
     return [text for text, applies in conditions.items() if applies]
+
+
+def _warnings_of_errors(summary: Summary) -> list[str]:
+    """A warning if the errors are larger than the filter's covariance says."""
+    covered = {
+        "place": summary.errors.get("nees_coverage_2d"),
+        "place and height": summary.errors.get("nees_coverage"),
+    }
+    shares = {of: share for of, share in covered.items() if share is not None}
+    worst = min(shares, key=shares.__getitem__, default="")
+    if shares.get(worst, 100.0) >= COVERED:
+        return []
+    return [
+        f"errors: larger than the filter says: its 95 % region of {worst} holds the reference in "
+        f"{shares[worst]:.0f} % of the rows"
+    ]
 
 
 def _share_at_rest(ready: PreparedRecording, ekf: Filter) -> float:
     """Share of the strides in which the IMU is as quiet as the filter's rest; strides across a gap
     do not count as rest."""
-    rate = ready.gyro - ready.start.gyro_bias
-    one_program = jax.jit(quiet_samples, static_argnames="config")
-    quiet = np.asarray(one_program(rate, ready.accel, config=ekf.config))
+    samples = ekf.config.samples_per_clone
+    strides = (ready.gyro - ready.start.gyro_bias, ready.accel)
+    rate, force = (part.reshape(-1, samples, 3) for part in strides)
+    quiet = np.asarray(jax.jit(jax.vmap(partial(is_quiet, config=ekf.config)))(rate, force))
     if ready.imu_valid is not None:
-        quiet = quiet & ready.imu_valid
-    return float(quiet.reshape(-1, ekf.config.samples_per_clone).all(axis=1).mean())
+        quiet = quiet & ready.imu_valid.reshape(-1, samples).all(axis=1)
+    return float(quiet.mean())

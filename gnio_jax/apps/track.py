@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax import config as configuration
-from gnio_jax.apps import export, rerun, sensors
+from gnio_jax.apps import drive, export, rerun, sensors
 from gnio_jax.apps.importing import Imported
 from gnio_jax.apps.summary import Summary, summarise
 from gnio_jax.config import TrainConfig
@@ -51,7 +51,7 @@ class Tracked(NamedTuple):
 
 def track(
     recording: Imported,
-    trained: TrainedNetwork,
+    source: TrainedNetwork | TrainConfig,
     out: str | Path,
     formats: tuple[str, ...] = (),
     progress: Progress = silent,
@@ -66,7 +66,7 @@ def track(
 
     Args:
         recording: The recording, on a uniform clock.
-        trained: The network.
+        source: The network; or the configuration of a car's filter (`drive.estimate_drive`).
         out: The folder. It is written whole or not at all and replaces an earlier track.
         formats: Further formats of the trajectory, of `export.FORMATS`.
         progress: A function that gets the finished share.
@@ -78,16 +78,22 @@ def track(
         InputError: The results could not be written, or the recording is too short or has a hole
             that is too long.
     """
-    out, sequence, config = Path(out), recording.sequence, trained.config
+    out, sequence = Path(out), recording.sequence
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check_results(out, formats, rerun_file, sequence.time + start_time)
     readings = sensors.usable_readings(sequence, without)
     if sensors.GNSS not in readings:
         export.check_map(formats)
-    result, ready, ekf, uses, origin = estimate_recording(sequence, readings, trained, progress)
+    if isinstance(source, TrainConfig):
+        _check_bridged(sequence)
+        config, fused = source, drive.estimate_drive(sequence, readings, source, progress)
+    else:
+        config = source.config
+        fused = estimate_recording(sequence, readings, source, progress)
+    result, ready, ekf, uses, origin = fused
     compared = np.isfinite(result.reference.position).any() or result.waypoints is not None
     errors = metrics.score([result])[result.name].values if compared else {}
-    summary = summarise(result, errors, ready, recording, trained, ekf, uses, origin)
+    summary = summarise(result, errors, ready, recording, source, ekf, uses, origin)
     with replacing_folder(out) as folder:
         _write_figures(folder, result, summary, formats)
         _draw(folder, result, summary, config, command)
@@ -212,7 +218,7 @@ def _draw(
     partly = f"known for {share:.0%} of the time: errors and ratios are of this part"
     facts = {
         "command": command,
-        "walked": f"{length}, ends {summary.from_start:.1f} m from the start",
+        "path": f"{length}, ends {summary.from_start:.1f} m from the start",
         "expected error at the end": "" if np.isnan(error) else f"{error:.1f} m",
         "steps": "" if summary.steps is None else f"{summary.steps:.0%} of the time",
         **{use.sensor: use.line for use in summary.sensors},

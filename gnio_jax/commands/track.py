@@ -37,6 +37,10 @@ class TrackOptions:
         tuple[Literal["magnetometer", "barometer", "gnss"], ...], Words(repeated=True)
     ] = ()
     """A sensor beside the IMU that is not used; may be repeated."""
+    carrier: str | None = None
+    """What carries the IMU: person, car, or a file with the filter of a car (as configs/drive.yaml,
+    that of car). By default person, and car if a recording without steps has the fixes of a
+    drive."""
     rerun: Path | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     recording: Annotated[ImportOptions, UNNAMED] = ImportOptions()  # noqa: RUF009 - it is frozen
@@ -56,27 +60,37 @@ def track(request: TrackOptions, call: options.Call) -> None:
       {prog} walk.bag --imu-topic /imu --network runs/mine --out tracks/walk
       {prog} walk.csv --accel-sign ios --format csv mcap
       {prog} walk.zip --without magnetometer --format gpx
+      {prog} drive.zip --carrier car --format geojson
       {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
           accel_z=az
     """
     if not request.file.exists():
         raise InputError(request.file, "no such file or folder")
+    if request.network and request.carrier not in (None, "person"):
+        problem = f"{request.network} is a network, and a car has none"
+        raise InputError("--network", problem, f"leave it out with --carrier {request.carrier}")
     console.compile_quickly()
     import jax  # late, so that mistakes do not wait for it
 
+    from gnio_jax import config as configuration
     from gnio_jax import networks
     from gnio_jax.apps import track as tracking
     from gnio_jax.apps.importing import read_imported
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     recording = read_imported(request.file, request.recording)
-    trained = networks.load(request.network)
+    carrier = request.carrier or recognise_carrier(recording.sequence, request.without)
+    if carrier == "person":
+        source: Any = networks.load(request.network)
+    else:
+        source = configuration.load("drive" if carrier == "car" else carrier)
+        source = configuration.validate(source, carrier)
     out = request.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)
         details: dict[str, Any] = {"command": str(call), "rerun_file": request.rerun}
         details["without"] = request.without
-        result = tracking.track(recording, trained, out, request.format, **details)
+        result = tracking.track(recording, source, out, request.format, **details)
     summary = result.summary
     first = summary.warnings[:1] if math.isnan(summary.expected_error) else ()
     for warning in first:  # it says why there is no expected error, before every figure
@@ -89,11 +103,24 @@ def track(request: TrackOptions, call: options.Call) -> None:
             console.say(f"{use.sensor}: {use.text}")
     for warning in summary.warnings[len(first) :]:
         console.say(f"warning: {warning}")
-    if not first:  # what was measured are whole walks
+    if summary.carrier == "car":
+        if not first:
+            console.say(f"{summary.measured}; with fixes, by what the filter expects")
+    elif not first:  # what was measured are whole walks
         on_others = f" on recordings with a reference: {summary.measured}"
         measured = on_others if summary.measured else ": its error was not measured (gnio evaluate)"
         console.say(f"network {summary.network}{measured}")
     console.say(f"results: {result.folder} (open report.html, or look at track.png)")
+
+
+def recognise_carrier(sequence: Any, without: tuple[str, ...]) -> str:
+    """car if the recording is a drive by its fixes, else person."""
+    from gnio_jax.apps import drive, sensors
+
+    is_drive = drive.is_drive(sequence, sensors.usable_readings(sequence, without))
+    if is_drive:
+        console.say("no steps, and fixes as fast as a car: tracked as a car (--carrier)")
+    return "car" if is_drive else "person"
 
 
 def _folder_name(name: str) -> str:

@@ -515,9 +515,12 @@ class FilterOptions:
     pause_seconds: NonNegative = 1.0
     """Length of such a pause, s."""
     rest_gyro: NonNegative = 0.05
-    """Bound of |gyro − b_g| in every sample of a quiet IMU, rad/s."""
+    """Bound of |gyro − b_g| of a quiet IMU, rad/s."""
     rest_accel: NonNegative = 0.3
-    """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
+    """Bound of | |accel − b_a| − g | of a quiet IMU, m/s²."""
+    rest_by: Literal["samples", "means"] = "samples"
+    """What these are bounds of: every sample, or the mean over each clone interval. An engine
+    shakes the samples of a car at rest, and hardly their mean."""
     rest_seconds: NonNegative = 0.5
     """How long the IMU must be quiet before it counts as at rest, s."""
     bridge_seconds: NonNegative = 0.1

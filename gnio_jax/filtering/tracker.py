@@ -63,7 +63,7 @@ from gnio_jax.filtering.state import (
     invariant_errors,
     unroll_clones,
 )
-from gnio_jax.filtering.zero_velocity import quiet_samples, unbiased_output
+from gnio_jax.filtering.zero_velocity import is_quiet, unbiased_output
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array, Memory
 
 
@@ -90,7 +90,7 @@ class Pose(NamedTuple):
     failure: str = ""
     """What made the first pose that is not healthy impossible; empty before it."""
     quiet: bool = False
-    """Whether the last clone interval was quiet (`zero_velocity.quiet_samples`) and complete."""
+    """Whether the last clone interval was quiet (`zero_velocity.is_quiet`) and complete."""
 
 
 class DevicePose(NamedTuple):
@@ -379,7 +379,7 @@ def advance(
     else:
         state, history, tangents = step_with_tangents(step, core.filter, core.tangents, measure)
     state = state._replace(imu=imu_memory._replace(quiet=state.imu.quiet))
-    quiet = jnp.all(valid) & jnp.all(quiet_samples(*unbiased_output(imu, state), config))
+    quiet = jnp.all(valid) & is_quiet(*unbiased_output(imu, state), config)
     flags = [history.accepted[0], history.nis[0], history.healthy[0]]
     flags = jnp.stack([*flags, quiet.astype(flags[0].dtype)])
     estimate = device_pose(ekf, state, flags, tangents)

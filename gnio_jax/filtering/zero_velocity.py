@@ -57,9 +57,9 @@ def detect_rest(
     """Whether the IMU has been quiet for `rest_seconds` (ours), and the state with the count of
     quiet intervals in a row.
 
-    An interval is quiet if no sample is missing and all are quiet (`quiet_samples`).
+    An interval is quiet as `is_quiet` says, if no sample is missing.
     """
-    quiet = jnp.all(quiet_samples(*unbiased_output(imu, state), config))
+    quiet = is_quiet(*unbiased_output(imu, state), config)
     if imu.gap is not None:
         quiet = quiet & jnp.all(imu.gap.gyro_variance == 0)
     count = jnp.where(quiet, state.imu.quiet + 1, 0).astype(state.imu.quiet.dtype)
@@ -76,11 +76,14 @@ def unbiased_output(
     return gyro - state.gyro_bias[None], accel - state.accel_bias[None]
 
 
-def quiet_samples(
+def is_quiet(
     rate: Float[Array, "n 3"], force: Float[Array, "n 3"], config: FilterConfig
-) -> Bool[Array, "n"]:
-    """Which samples are quiet: the rate without its bias, rad/s, is below `rest_gyro`, and the
-    specific force, m/s², differs from gravity by less than `rest_accel`."""
+) -> Bool[Array, ""]:
+    """Whether the samples of an interval are quiet, or with `rest_by: means` their mean: the rate
+    without its bias, rad/s, is below `rest_gyro`, and the specific force, m/s², differs from
+    gravity by less than `rest_accel`."""
+    if config.rest_by == "means":
+        rate, force = (jnp.mean(part, axis=0, keepdims=True) for part in (rate, force))
     size = jnp.sqrt(jnp.maximum(jnp.sum(force**2, axis=1), 1e-12))
     still = jnp.sum(rate**2, axis=1) < config.rest_gyro**2
-    return still & (jnp.abs(size - GRAVITY) < config.rest_accel)
+    return jnp.all(still & (jnp.abs(size - GRAVITY) < config.rest_accel))

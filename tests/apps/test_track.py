@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.apps.importing import Imported, import_recording
 from gnio_jax.apps.summary import (
     Summary,
-    _warnings,
+    _warnings_of_errors,
     _warnings_of_gait,
     _warnings_of_start,
+    _warnings_of_walk,
     summarise,
 )
 from gnio_jax.apps.track import estimate_recording, track
@@ -309,13 +310,16 @@ FILTER = make_filter(DataConfig(), FilterSettings(measurements={"zero_velocity":
     ],
 )
 def test_what_is_worth_a_warning(changes, words):
-    found = _warnings(SUMMARY._replace(**changes), 1.0 / FILTER.config.dt, FILTER)
+    summary = SUMMARY._replace(**changes)
+    found = _warnings_of_walk(summary, 1.0 / FILTER.config.dt, FILTER)
+    found += _warnings_of_errors(summary)
     assert [line[: len(words)] for line in found] == [words] if words else found == []
 
 
 def test_a_filter_that_does_not_measure_rest_is_not_said_to_hold_the_position():
     plain = make_filter(DataConfig(), FilterSettings())
-    (warning,) = _warnings(SUMMARY._replace(at_rest=0.97), 1.0 / plain.config.dt, plain)
+    summary = SUMMARY._replace(at_rest=0.97)
+    (warning,) = _warnings_of_walk(summary, 1.0 / plain.config.dt, plain)
     assert "rest: it lies still 97% of the time, and the filter does not measure this" in warning
     assert "holds" not in warning
 
@@ -357,6 +361,7 @@ def test_a_part_without_steps_is_named():
     assert _warnings_of_gait(gait._replace(quiet=~walking), 0.65) == []  # it lay on a table
     (none,) = _warnings_of_gait(gait._replace(walking=~walking & (np.arange(100) > 65)), 0.04)
     assert none.startswith("no walk: there are no steps in 96% of the time. The network")
+    assert none.endswith("For a car, give --carrier car")
 
 
 @pytest.mark.parametrize("network", ["mute", "walker"])

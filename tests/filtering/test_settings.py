@@ -106,6 +106,7 @@ def test_every_setting_of_the_filter_is_reachable_from_a_file_or_fixed_by_name()
         **{"gate_threshold": 7.0, "convergence_seconds": 3.0},
         **{"log_std_min": -5.0, "speed_limit": 9.0},
         **{"error": "additive", "window_rotation": "single", "measures": "velocity"},
+        **{"rest_by": "means"},
     }
     assert others.keys() | {"mahalanobis_fail_scale"} == options & fields
     config = filter_config(DataConfig(), FilterSettings(**others))

@@ -60,6 +60,24 @@ def test_rest_counts_only_after_its_time(seconds, intervals):
     assert found == expected and sum(found) == 4 * (6 - intervals)
 
 
+def test_a_shaken_imu_is_quiet_by_its_means_unless_it_turns():
+    """An engine: every sample is beyond both bounds, with changing signs. A mean beyond either of
+    them is no rest."""
+    signs = jnp.array([1.0, -1.0, 0.0, 1.0, -1.0])[:, None]
+    shaken = STILL._replace(
+        gyro=signs * jnp.array([[0.0, 0.2, -0.1]]),
+        accel=STILL.accel + signs * jnp.array([[0.0, 0.0, 2.0]]),
+    )
+    turning = shaken._replace(gyro=shaken.gyro + jnp.array([[0.0, 0.0, 0.051]]))
+    braking = shaken._replace(accel=shaken.accel - jnp.array([[0.0, 0.0, 0.31]]))
+    slow = shaken._replace(gyro=shaken.gyro + jnp.array([[0.0, 0.0, 0.049]]))
+    state = filtering.initial_state(filtering.Filter(CONFIG), np.eye(3), np.zeros(3), np.zeros(3))
+    for by, expected in (("samples", [False] * 4), ("means", [True, False, False, True])):
+        config = dataclasses.replace(CONFIG, rest_seconds=0.0, rest_by=by)
+        quiet = [detect_rest(state, imu, config)[1] for imu in (shaken, turning, braking, slow)]
+        assert [bool(flag) for flag in quiet] == expected
+
+
 def test_rest_is_seen_without_the_biases():
     """Which are larger than the bounds of rest; and not with them."""
     gyro_bias, accel_bias = 2 * CONFIG.rest_gyro, 2 * CONFIG.rest_accel

@@ -72,3 +72,38 @@ def drive(seed, runs, intervals, n, dt, noise, std, constraint, left_std, up_std
         position[:, n - 1 :: n],
         *biases,
     )
+
+
+SECONDS, RATE = 70.0, 100.0
+"""Length of `city_drive`, s, and its rate, Hz."""
+BIAS = np.array([0.02, -0.03, 0.015])
+"""Bias of the gyro in `city_drive`, rad/s."""
+ENGINE = 0.05, 0.8
+"""Amplitudes with which an engine shakes gyro and accelerometer, rad/s and m/s²."""
+
+
+def city_drive(mounting=(0.5, 0.1, -0.2), first=0.0):
+    """A car that stands for 8 s, drives through bends, stands from 40 to 46 s and drives on, from
+    `first` s on: `(time, gyro, accel, orientation, position)`. The angles of the mounting are yaw,
+    pitch and roll, and an engine shakes every sample."""
+    t = np.arange(0.0, SECONDS, 1 / RATE)
+    ramps = [(8, 14, 11.0), (25, 29, -4.0), (36, 40, -7.0), (46, 53, 13.0), (60, 64, -3.0)]
+    smooth = [np.clip((t - a) / (b - a), 0, 1) for a, b, _ in ramps]
+    speed = sum(change * x**2 * (3 - 2 * x) for x, (*_, change) in zip(smooth, ramps, strict=True))
+    speed = np.where((t < 8) | ((t > 40) & (t < 46)), 0.0, np.maximum(speed, 0.0))
+    turning = 0.03 * speed * np.sin(0.25 * t) + 0.002 * speed * np.sin(1.3 * t)
+    yaw = np.cumsum(turning) / RATE
+    pitch = 0.02 * np.sin(0.15 * np.cumsum(speed) / RATE / 10)
+    car = Rotation.from_euler("ZYX", np.stack([yaw, pitch, 0 * t], axis=1))
+    body = car * Rotation.from_euler("ZYX", mounting).inv()
+    velocity = speed[:, None] * car.as_matrix()[:, :, 0]
+    position = np.cumsum(velocity, axis=0) / RATE
+    turns = (body[:-1].inv() * body[1:]).as_rotvec() * RATE
+    force = body[:-1].inv().apply(np.diff(velocity, axis=0) * RATE - GRAVITY)
+    shake = np.array([1.0, -1.0, 0.5, -0.5])[np.arange(len(t) - 1) % 4][:, None]
+    gyro = turns + BIAS + ENGINE[0] * shake * [1.0, 0.3, -0.5]
+    accel = force + ENGINE[1] * shake * [0.2, -0.4, 1.0]
+    rows = slice(round(first * RATE), -1)
+    kept = slice(rows.start, None)
+    orientation = body.as_quat(scalar_first=True)
+    return t[rows] - t[rows][0], gyro[kept], accel[kept], orientation[rows], position[rows]

@@ -1,0 +1,238 @@
+"""The track of a car's drive (ours). No network predicts the path of a car, so the filter measures
+other things in its place (`docs/vehicles.md`):
+
+1. Stops: seconds in which neither the mean rate nor the mean force of a tenth of a second changes.
+   They give the gyro's bias, and in the filter a velocity of zero.
+2. The mounting, from the whole drive (`filtering.mounting`), and with it the constraint that a car
+   moves neither sideways nor up.
+3. Heights of a barometer and fixes of a receiver, as for a walk (`apps.sensors`). A car that moves
+   at its start has the speed of its first fixes.
+
+The field in a car is that of its steel and its currents, so a magnetometer is left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gnio_jax.apps import sensors
+from gnio_jax.config import TrainConfig
+from gnio_jax.data.gait import detect_gait
+from gnio_jax.data.geodesy import Place, east_north_up
+from gnio_jax.data.sensors import GNSS, MAGNETOMETER
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import (
+    PreparedRecording,
+    SequenceEstimate,
+    estimate,
+    no_displacements,
+    prepare,
+)
+from gnio_jax.filtering import Filter, find_mounting, make_filter
+from gnio_jax.filtering.mounting import Mounting
+from gnio_jax.filtering.nonholonomic import NonHolonomic, car_axes
+from gnio_jax.numerics import rotation_z, yaw
+from gnio_jax.reporting import Progress, silent
+from gnio_jax.types import GRAVITY, Readings, Sequence
+
+MEASURED = (
+    "on the two drives with a reference on which this was measured, from rest and without fixes, "
+    "the path errs by 4.7 and 3.7 % of the way (t_rel, onavdata)"
+)
+"""What is known about the error (`docs/vehicles.md`)."""
+DRIVEN = 4.0
+"""Mean speed between fixes, in the faster half of a recording without steps, from which it is a
+drive, m/s (ours)."""
+MEAN_SECONDS = 0.1
+"""Length of the means that show a stop, s."""
+STOP_BIAS, STOP_SPEED = 5e-4, 0.05
+"""Standard deviations of the gyro's bias after a stop, rad/s, which walks, and of the velocity at
+one, m/s (ours)."""
+FIRST_FIXES = 15.0
+"""Time of the first fixes to which the path is aligned, s: a car that moves needs no more."""
+ROAD_STD = 0.05
+"""Standard deviation of the tilt of a road, rad (ours)."""
+UNKNOWN_SPEED = 15.0
+"""Standard deviation of the first velocity of a car that moves, m/s (ours)."""
+FIRST_SECONDS = 5.0
+"""Time of the first fixes that give the speed, s."""
+SPEED_ERROR, LEAST_SPEED_STD = 0.3, 1.5
+"""Standard deviation of that speed, as a share of it, and the smallest one, m/s (ours)."""
+
+
+class Stops(NamedTuple):
+    """The seconds in which a car stands."""
+
+    still: Bool[np.ndarray, "k"]
+    """Which whole seconds of the recording."""
+    gyro_bias: Float[np.ndarray, "3"]
+    """Median of the gyro in them, rad/s; zero if there is none."""
+
+
+def is_drive(sequence: Sequence, readings: dict[str, Readings]) -> bool:
+    """Whether the fixes of a recording without steps show a drive."""
+    fixes = readings.get(GNSS)
+    rate = 1.0 / float(np.median(np.diff(sequence.time)))
+    if fixes is None or len(fixes.time) < 2:
+        return False
+    if detect_gait(sequence.gyro, sequence.accel, rate).has_steps:
+        return False
+    position = _on_map(fixes)
+    speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / np.diff(fixes.time)
+    return bool(np.mean(np.sort(speed)[len(speed) // 2 :]) > DRIVEN)
+
+
+def estimate_drive(
+    sequence: Sequence,
+    readings: dict[str, Readings],
+    config: TrainConfig,
+    progress: Progress = silent,
+) -> sensors.Fused:
+    """The estimate of a drive, as `track.estimate_recording` gives that of a walk.
+
+    Args:
+        sequence: The recording.
+        readings: The readings of its other sensors.
+        config: The rate and the filter, as configs/drive.yaml has them.
+        progress: A function that gets the finished share.
+
+    Raises:
+        InputError: The drive does not show the mounting, and there are no fixes; or the recording
+            is too short.
+    """
+    ekf = make_filter(config.data, config.filter)
+    rate = 1.0 / float(np.median(np.diff(sequence.time)))
+    stops = find_stops(sequence, rate, ekf)
+    notes = [f"car: it stands for {stops.still.sum()} s, which give the gyro's bias"]
+    if not stops.still.any():
+        notes = ["car: it never stands still, so the gyro's bias starts from zero"]
+    mounting = None
+    try:
+        gyro = sequence.gyro - stops.gyro_bias
+        mounting = find_mounting(gyro, sequence.accel, rate, sequence.name)
+    except InputError as error:
+        if GNSS not in readings:
+            raise
+        problem = str(error).removeprefix(f"{sequence.name}: ").partition(";")[0]
+        notes.append(f"car: no constraint, because the drive {problem}")
+    else:
+        angles = np.degrees([mounting.yaw, mounting.pitch, mounting.roll])
+        words = "mounting: yaw {:.0f}°, pitch {:.0f}°, roll {:.0f}°".format(*angles)
+        notes.append(f"{words} (±{np.degrees(mounting.std):.1f}°)")
+    ekf = dataclasses.replace(ekf, measurements=tuple(_mounted(ekf, mounting)))
+    prepared, left_out = prepare([sequence], config.data, ekf, init="static", from_first=True)
+    if not prepared:
+        raise InputError(sequence.name, left_out[sequence.name], "record for longer")
+    ready = _start(prepared[0], stops, mounting, readings.get(GNSS))
+    ready = ready._replace(notes=(*ready.notes, *notes))
+
+    def run(ready: PreparedRecording, ekf: Filter) -> SequenceEstimate:
+        return estimate([ready], [no_displacements(ready)], config.data, ekf, 1)[0]
+
+    progress(0.0)
+    others = {sensor: rows for sensor, rows in readings.items() if sensor != MAGNETOMETER}
+    fused = sensors.fuse(run(ready, ekf), ready, ekf, others, run, FIRST_FIXES)
+    if MAGNETOMETER in readings:
+        reason = "left out: the field in a car is that of its steel and its currents"
+        use = sensors.SensorUse(MAGNETOMETER, len(readings[MAGNETOMETER].time), None, reason)
+        fused = fused._replace(uses=(*fused.uses, use))
+    return fused
+
+
+def find_stops(sequence: Sequence, rate: float, ekf: Filter) -> Stops:
+    """The seconds in which the means of gyro and accelerometer over `MEAN_SECONDS` differ from the
+    second's mean by less than the filter's bounds of rest, and the mean rate from the median of
+    these seconds."""
+    config, size = ekf.config, max(round(MEAN_SECONDS * rate), 1)
+    parts = round(1.0 / MEAN_SECONDS)
+    seconds = len(sequence.time) // (size * parts)
+    rows = slice(0, seconds * size * parts)
+    means = (
+        signal[rows].reshape(seconds, parts, size, 3).mean(axis=2)
+        for signal in (sequence.gyro, sequence.accel)
+    )
+    gyro, accel = means
+    still = np.linalg.norm(gyro - gyro.mean(1, keepdims=True), axis=2).max(1) < config.rest_gyro
+    still &= np.linalg.norm(accel - accel.mean(1, keepdims=True), axis=2).max(1) < config.rest_accel
+    if not still.any():
+        return Stops(still, np.zeros(3))
+    bias = np.median(gyro[still].mean(1), axis=0)
+    still &= np.linalg.norm(gyro.mean(1) - bias, axis=1) < config.rest_gyro
+    return Stops(still, bias)
+
+
+def _mounted(ekf: Filter, mounting: Mounting | None) -> list:
+    """The measurements of the filter with this mounting; without one there is no constraint."""
+    measurements = []
+    for measurement in ekf.measurements:
+        if not isinstance(measurement, NonHolonomic):
+            measurements.append(measurement)
+        elif mounting is not None:
+            yaw, pitch, roll, _ = mounting
+            measurements.append(measurement._replace(yaw=yaw, pitch=pitch, roll=roll))
+    return measurements
+
+
+def _start(
+    ready: PreparedRecording,
+    stops: Stops,
+    mounting: Mounting | None,
+    fixes: Readings | None,
+) -> PreparedRecording:
+    """The start with the gyro's bias of the stops.
+
+    A car that does not stand has the tilt of its mounting on a level road, because the mean force
+    has the acceleration in it, and the speed of its first fixes, ahead. Without them the speed is
+    unknown.
+    """
+    start = ready.start
+    notes = [note for note in ready.notes if not note.startswith("start: ")]
+    rotation, velocity, std = start.rotation, start.velocity, start.std
+    if stops.still.any():
+        std = std._replace(gyro_bias=STOP_BIAS)
+    if stops.still[:1].any():
+        # The engine shakes the samples, of which the spread of a walker's start is made.
+        std = std._replace(velocity=STOP_SPEED, tilt=float(std.accel_bias) / GRAVITY)
+    else:
+        speed = None if fixes is None else first_speed(fixes, ready.time[0])
+        std, note = std._replace(velocity=UNKNOWN_SPEED), "nothing shows its speed"
+        if mounting is not None:
+            rotation = np.asarray(car_axes(mounting.yaw, mounting.pitch, mounting.roll))
+            rotation = rotation_z(-yaw(rotation)) @ rotation
+            std = std._replace(tilt=ROAD_STD)
+        if speed is not None and mounting is not None:
+            velocity = speed * (rotation @ car_axes(*mounting[:3])[0])
+            std = std._replace(velocity=max(SPEED_ERROR * speed, LEAST_SPEED_STD))
+            note = f"its first fixes show {speed:.0f} m/s"
+        notes.append(f"start: the car moves, and {note}")
+    start = start._replace(
+        rotation=rotation,
+        velocity=np.asarray(velocity),
+        gyro_bias=stops.gyro_bias,
+        std=std,
+        level_gyro_bias=std.gyro_bias,
+        raw_gyro=False,
+    )
+    return ready._replace(start=start, notes=tuple(notes))
+
+
+def first_speed(fixes: Readings, start: float) -> float | None:
+    """The speed at the start by the fixes of the first `FIRST_SECONDS`, m/s: that of a parabola,
+    because a car speeds up, or of a line through two or three. None with fewer than two, or less
+    than two seconds between them."""
+    rows = (fixes.time >= start - 1.0) & (fixes.time <= start + FIRST_SECONDS)
+    time = fixes.time[rows] - start
+    if len(time) < 2 or np.ptp(time) < 2.0:
+        return None
+    slope = np.polyfit(time, _on_map(fixes)[rows], 2 if len(time) > 3 else 1)[-2]
+    return float(np.linalg.norm(slope))
+
+
+def _on_map(fixes: Readings) -> Float[np.ndarray, "f 2"]:
+    """East and north of the first fix, m."""
+    places = np.column_stack([fixes.values[:, :2], np.zeros(len(fixes.time))])
+    return east_north_up(places, Place(*places[0].tolist()))[:, :2]

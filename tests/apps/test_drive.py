@@ -1,0 +1,174 @@
+"""`gnio track` of a car: what a drive shows of itself, the path without and with fixes, and what it
+says where it knows too little."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import config as configuration
+from gnio_jax.apps import drive
+from gnio_jax.apps.importing import Imported
+from gnio_jax.apps.track import track
+from gnio_jax.data.geodesy import Place, geodetic
+from gnio_jax.data.hdf5 import write_hdf5
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation.trajectory import read_tum
+from gnio_jax.filtering import make_filter
+from gnio_jax.types import Readings, Sequence
+from tests.support import cars
+
+CONFIG = configuration.load("drive")
+ORIGIN = Place(48.0, 9.0, 300.0)
+
+
+def recording(first=0.0, fixes=None, mounting=(0.5, 0.1, -0.2)):
+    """A drive without a reference. `fixes` says at which whole seconds there is one, with an error
+    of 2 m that changes in 20 s."""
+    time, gyro, accel, _, position = cars.city_drive(mounting, first)
+    readings = {}
+    if fixes is not None:
+        stamps = np.arange(1.0, time[-1])
+        stamps = stamps[[fixes(stamp) for stamp in stamps]]
+        random, error = np.random.default_rng(1), [np.zeros(2)]
+        for _ in stamps[1:]:
+            error.append(0.95 * error[-1] + 2.0 * np.sqrt(1 - 0.95**2) * random.normal(size=2))
+        true = np.stack([np.interp(stamps, time, axis) for axis in position.T], axis=1)
+        true[:, :2] += error
+        values = geodetic(true, ORIGIN)
+        readings["gnss"] = Readings(stamps, values, np.full_like(values, 3.0))
+    unknown = np.full((len(time), 3), np.nan)
+    return Sequence(
+        name="drive",
+        time=time,
+        gyro=gyro,
+        accel=accel,
+        orientation=np.full((len(time), 4), np.nan),
+        position=unknown,
+        velocity=unknown,
+        valid=np.zeros(len(time), dtype=bool),
+        attributes={},
+        readings=readings,
+    )
+
+
+@pytest.fixture(autouse=True)
+def _undrawn(undrawn):
+    """Without pictures."""
+
+
+def tracked(sequence, folder):
+    return track(Imported(sequence, (), ()), CONFIG, folder / "track")
+
+
+def truth(time, first=0.0):
+    stamps, *_, position = cars.city_drive(first=first)
+    return np.stack([np.interp(time, stamps, axis) for axis in position.T], axis=1)
+
+
+def test_stops_and_bias_are_seen_through_the_shaking_of_an_engine():
+    sequence = recording()
+    stops = drive.find_stops(sequence, cars.RATE, make_filter(CONFIG.data, CONFIG.filter))
+    standing = [second < 8 or 40 <= second < 46 for second in range(len(stops.still))]
+    assert np.array_equal(stops.still, standing)
+    np.testing.assert_allclose(stops.gyro_bias, cars.BIAS, atol=2e-3)
+    moving = recording(first=15.0)
+    moving = moving._replace(**{part: getattr(moving, part)[:2000] for part in ("time", "gyro")})
+    moving = moving._replace(accel=moving.accel[:2000])
+    stops = drive.find_stops(moving, cars.RATE, make_filter(CONFIG.data, CONFIG.filter))
+    assert not stops.still.any() and not stops.gyro_bias.any()
+
+
+def test_a_drive_from_rest_has_its_path_and_no_error_without_fixes(tmp_path):
+    result = tracked(recording(), tmp_path)
+    path, summary = result.estimate.trajectory, result.summary
+    true = truth(path.time)
+    way = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    # The world's yaw is that of the phone at the start, which is turned in the car.
+    turn = Rotation.from_euler("ZYX", [0.5, 0.1, -0.2]).inv().as_matrix()
+    yaw = np.arctan2(turn[1, 0], turn[0, 0])
+    aligned = Rotation.from_euler("z", yaw).apply(path.position)
+    error = np.linalg.norm((aligned - true)[:, :2], axis=1)
+    assert way > 350 and error[-1] < 0.03 * way
+    assert np.isnan(summary.expected_error) and summary.carrier == "car"
+    assert summary.warnings[0].startswith("car: there are no fixes, so no error can be stated")
+    assert summary.at_rest == pytest.approx(14 / 70, abs=0.04)
+    assert any(note.startswith("mounting: yaw 2") for note in summary.notes)
+    written = json.loads((result.folder / "summary.json").read_text(encoding="utf-8"))
+    assert written["carrier"] == "car" and "expected_error" not in written
+
+
+def test_fixes_lead_through_their_gap_and_give_the_start_of_a_moving_car(tmp_path):
+    """The second drive begins at 11 m/s."""
+    for first, gap in ((0.0, (22.0, 36.0)), (15.0, (15.0, 24.0))):
+        folder = tmp_path / f"{first:g}"
+        folder.mkdir()
+        fixes = lambda stamp, gap=gap: not gap[0] < stamp < gap[1]  # noqa: E731
+        result = tracked(recording(first, fixes), folder)
+        path, summary = result.estimate.trajectory, result.summary
+        true = truth(path.time, first)[:, :2]
+        east_north = path.position[:, :2] + true[0] - path.position[0, :2]
+        error = np.linalg.norm(east_north - true, axis=1)
+        hidden = (path.time > gap[0]) & (path.time < gap[1])
+        assert error.max() < 12.0 and error[hidden].max() < 12.0
+        assert 1.0 < summary.expected_error < 10.0 and summary.warnings == ()
+        (use,) = summary.sensors
+        assert use.sensor == "gnss" and use.accepted > 0.95
+        if first:
+            (note,) = (note for note in summary.notes if "its first fixes show" in note)
+            assert float(note.split()[-2]) == pytest.approx(11.0, abs=5.0)
+
+
+def test_a_moving_car_without_fixes_says_that_its_speed_is_unknown(tmp_path):
+    summary = tracked(recording(first=15.0), tmp_path).summary
+    assert any("nothing shows its speed, so the path is wrong" in text for text in summary.warnings)
+
+
+def test_a_drive_that_shows_no_mounting_needs_fixes(tmp_path):
+    """It goes straight on at one speed."""
+    time, still = np.arange(0.0, 60.0, 0.01), recording()
+    shape = (len(time), 3)
+    straight = still._replace(
+        time=time,
+        gyro=np.zeros(shape),
+        accel=np.tile([0.0, 0.0, 9.81], (len(time), 1)),
+        orientation=np.full((len(time), 4), np.nan),
+        position=np.full(shape, np.nan),
+        velocity=np.full(shape, np.nan),
+        valid=np.zeros(len(time), dtype=bool),
+    )
+    with pytest.raises(InputError, match="drive: "):
+        tracked(straight, tmp_path)
+    assert not (tmp_path / "track").exists()
+
+
+def test_a_drive_is_recognised_by_its_fixes_alone():
+    with_fixes = recording(fixes=lambda stamp: True)
+    assert drive.is_drive(with_fixes, with_fixes.readings)
+    assert not drive.is_drive(with_fixes, {})
+    slow = with_fixes.readings["gnss"]._replace(time=6 * with_fixes.readings["gnss"].time)
+    assert not drive.is_drive(with_fixes, {"gnss": slow})
+    steps = np.arange(0.0, 30.0, 0.01)
+    walk = with_fixes._replace(
+        time=steps,
+        gyro=np.sin(2 * np.pi * 0.9 * steps)[:, None] * [0.5, 1.0, 0.3],
+        accel=[0.0, 0.0, 9.81] + np.sin(2 * np.pi * 1.8 * steps)[:, None] * [0.5, 1.0, 3.0],
+    )
+    assert not drive.is_drive(walk, with_fixes.readings)
+
+
+def test_the_command_takes_a_car_or_recognises_it(tmp_path, gnio, mistake):
+    file, settings = tmp_path / "drive.hdf5", tmp_path / "van.yaml"
+    write_hdf5(file, recording(fixes=lambda stamp: True))
+    out = tmp_path / "out"
+    told = gnio("track", file, "--out", out, "--format", "geojson")
+    assert "tracked as a car" in told and "by no network" in told
+    assert "expected error at the end" in told and "start: " not in told and "warning" not in told
+    assert (out / "trajectory.geojson").exists() and len(read_tum(out / "trajectory.txt").time)
+    settings.write_text("data: {rate: 100.0, window_seconds: 0.2}\nfilter: {rest_gyro: -1}\n")
+    assert "rest_gyro" in mistake("track", file, "--carrier", settings, "--out", tmp_path / "b")
+    assert "no" in mistake("track", file, "--carrier", "boat", "--out", tmp_path / "b")
+    told = mistake("track", file, "--carrier", "car", "--network", "pedestrian")
+    assert "leave it out with --carrier car" in told
+    assert not (tmp_path / "b").exists()
