@@ -123,7 +123,7 @@ def estimate_drive(
         angles = np.degrees([mounting.yaw, mounting.pitch, mounting.roll])
         words = "mounting: yaw {:.0f}°, pitch {:.0f}°, roll {:.0f}°".format(*angles)
         notes.append(f"{words} (±{np.degrees(mounting.std):.1f}°)")
-    ekf = dataclasses.replace(ekf, measurements=tuple(_mounted(ekf, mounting)))
+    ekf = dataclasses.replace(ekf, measurements=tuple(_measurements(ekf, mounting)))
     prepared, left_out = prepare([sequence], config.data, ekf, init="static", from_first=True)
     if not prepared:
         raise InputError(sequence.name, left_out[sequence.name], "record for longer")
@@ -165,7 +165,7 @@ def find_stops(sequence: Sequence, rate: float, ekf: Filter) -> Stops:
     return Stops(still, bias)
 
 
-def _mounted(ekf: Filter, mounting: Mounting | None) -> list:
+def _measurements(ekf: Filter, mounting: Mounting | None) -> list:
     """The measurements of the filter with this mounting; without one there is no constraint."""
     measurements = []
     for measurement in ekf.measurements:

@@ -121,11 +121,11 @@ def summarise(
     used = filtered.accepted[:rows]
     used = used[np.isfinite(used)]
     error = float(np.sqrt(np.trace(filtered.covariance[rows - 1, :2, :2])))
-    about = describe_source(source)
+    described = describe_source(source)
     gait = detect_gait(ready.gyro, ready.accel, 1.0 / ekf.config.dt, ready.imu_valid)
     summary = Summary(
         recording=sequence.name,
-        **about,
+        **described,
         start_time=float(sequence.attributes.get("start_time", 0.0)),
         seconds=float(time[-1] - time[0]),
         path_length=0.0

@@ -75,6 +75,8 @@ For numbers that the recordings determine it has almost no effect; other numbers
 start."""
 DIGITS = 4
 """Number of digits that are written to the settings."""
+LARGEST_SENSITIVITY = 1e6
+"""Largest derivative of a position by an error that is not estimated, m for one unit of it."""
 CHECKPOINT_EVERY = 50
 """Clone intervals between the states that the backward pass keeps."""
 LEAST_GAIN = 1e-4
@@ -430,11 +432,14 @@ def compare_positions(
 ) -> PositionErrors:
     """Compare the positions of a filter over the walks with the true ones, where it is healthy.
 
-    `truth` has the true positions after each stride, m; NaN where there is none.
+    `truth` has the true positions after each stride, m; NaN where there is none. Positions on
+    which an error that is not estimated acts more than `LARGEST_SENSITIVITY` are left out: there
+    the filter amplifies it from update to update, and no covariance is that large.
     """
     healthy, position, *parts = jax.device_get(_run_walks(walks, settings, windows=windows))
     error = truth - position
     compared = np.isfinite(error).all(axis=2) & (healthy > 0)
+    compared &= np.abs(parts[1]).max(axis=(2, 3)) < LARGEST_SENSITIVITY
     recording = np.broadcast_to(np.arange(len(error))[:, None], compared.shape)
     return PositionErrors(*(part[compared] for part in (error, *parts, recording)))
 

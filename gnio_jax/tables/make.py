@@ -78,7 +78,10 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
             loop.refuse_untrainable(row.config)
     if options.table == "comparison":
         announce(experiment.rows, Path(options.out), options.seeds, reporter)
-    results = [run_row(row, options, reporter, workers) for row in experiment.rows]
+    results = []
+    for row in experiment.rows:
+        results.append(run_row(row, options, reporter, workers))
+        jax.clear_caches()  # the programs of all networks need more memory maps than Linux allows
     path = Path(options.out) / file_name(options)
     remarks = notes(base, options, experiment)
     if options.table == "trajectories":

@@ -127,13 +127,19 @@ def finished_epochs(workdir: Path) -> int:
 
 def calibrate_run(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
     """The run's best weights with the filter fitted to its validation split: the existing
-    calibrated run if it has these weights, else a new one."""
+    calibrated run if it has these weights, else a new one. If the filter cannot be fitted, a
+    warning says so, and the run stays as it is: the other rows go on."""
     folder = workdir.with_name(f"{workdir.name}_calibrated")
     if folder.exists() and read_settings(folder).digest == read_settings(workdir).digest:
         return folder
     reporter.line(f"calibrating {workdir.name}")
     shutil.rmtree(folder, ignore_errors=True)
-    result = calibration.calibrate(CalibrateConfig(str(workdir), out=str(folder)), workers=workers)
+    request = CalibrateConfig(str(workdir), out=str(folder))
+    try:
+        result = calibration.calibrate(request, workers=workers)
+    except InputError as error:
+        reporter.line(f"warning: {workdir.name} is measured without calibration: {error}")
+        return workdir
     for warning in result.warnings:
         reporter.line(f"warning: {folder.name}: {warning}")
     return folder

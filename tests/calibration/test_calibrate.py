@@ -564,6 +564,19 @@ def test_the_sensitivity_of_positions_does_not_depend_on_which_axis_of_the_phone
     np.testing.assert_allclose(actual[..., 3:], expected[..., 3:], atol=1e-4 * scale)
 
 
+def test_positions_of_a_filter_that_amplifies_an_error_are_left_out(monkeypatch):
+    """A covariance of 1e40 m² has no likelihood beside one of a metre."""
+    covariance = np.tile(np.eye(3), (2, 4, 1, 1))
+    sensitivity = np.ones((2, 4, 3, 6))
+    sensitivity[1, 2, 0, 3], sensitivity[1, 3, 2, 1] = 1e20, np.nan
+    rows, of_yaw = np.zeros((2, 4, 3)), np.zeros((2, 4, 6))
+    parts = np.ones((2, 4)), rows, covariance, sensitivity, rows, of_yaw, rows
+    monkeypatch.setattr(fitting, "_run_walks", lambda *_, **__: parts)
+    positions = fitting.compare_positions(None, rows + 0.5, None, None)
+    assert positions.recording.tolist() == [0, 0, 0, 0, 1, 1]
+    assert fitting.fit_considered(positions, FilterSettings()).after < 1
+
+
 def test_a_recording_counts_once_beside_the_prior():
     """An error without effect on the positions keeps the start of the search. If few recordings
     show the error, the result lies between the start and their value, by Bayes' rule."""

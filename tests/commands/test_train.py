@@ -76,9 +76,13 @@ def test_every_config_of_the_repository_is_valid_and_names_its_command():
     files = {file.stem: file for file in (ROOT / "configs").glob("*.yaml")}
     assert {"quickstart", "gnio_tlio", "gnio_oxiod", "gnio_oxiod_small"} <= files.keys()
     budgets = {file.stem: file for file in (ROOT / "configs" / "tables").glob("*.yaml")}
-    assert budgets.keys() == {"oxiod_lists", "oxiod_sessions", "synthetic", "tlio_layout"}
+    networks = {"networks_oxiod", "networks_synthetic", "networks_walks"}
+    assert budgets.keys() == networks | {
+        *("oxiod_lists", "oxiod_sessions", "synthetic", "tlio_layout"),
+    }
     commands = {name: f"gnio train --config {name} " for name in files}
     commands |= {name: f"gnio tables comparison --base tables/{name}" for name in budgets}
+    commands["drive"] = "gnio track drive.zip --carrier car"
     for name, file in (files | budgets).items():
         config = configuration.validate(configuration.load(file), str(file))
         assert configuration.parse(configuration.to_yaml(config), "its own text") == config

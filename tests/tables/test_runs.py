@@ -35,6 +35,20 @@ def test_a_calibration_is_of_the_best_weights_and_warns(tmp_path, monkeypatch, c
     assert len(made) == 2 and digest(tmp_path / "gnio_s0_calibrated") == digest(run)
 
 
+def test_a_run_that_cannot_be_calibrated_is_measured_as_it_is(tmp_path, monkeypatch, capsys):
+    """And the other rows of the table go on."""
+
+    def calibrate(config, workers):
+        raise InputError("the filter", "is not healthy")
+
+    monkeypatch.setattr(runs.calibration, "calibrate", calibrate)
+    run = tmp_path / "gnio_s0"
+    write_run(run)
+    assert runs.calibrate_run(run, Lines()) == run
+    line = "warning: gnio_s0 is measured without calibration: the filter: is not healthy"
+    assert line in capsys.readouterr().err.splitlines()
+
+
 @pytest.mark.parametrize("rows, state", [(0, "begun"), (39, "begun"), (40, "finished")])
 def test_a_run_is_finished_with_its_last_epoch(tmp_path, rows, state):
     config = dataclasses.replace(BASE, dataset="synthetic", workdir=str(tmp_path / "gnio_s0"))
