@@ -572,7 +572,8 @@ def test_positions_of_a_filter_that_amplifies_an_error_are_left_out(monkeypatch)
     rows, of_yaw = np.zeros((2, 4, 3)), np.zeros((2, 4, 6))
     parts = np.ones((2, 4)), rows, covariance, sensitivity, rows, of_yaw, rows
     monkeypatch.setattr(fitting, "_run_walks", lambda *_, **__: parts)
-    positions = fitting.compare_positions(None, rows + 0.5, None, None)
+    walks = BatchInputs._make([None] * len(BatchInputs._fields))
+    positions = fitting.compare_positions(walks, rows + 0.5, DataConfig(), FilterSettings())
     assert positions.recording.tolist() == [0, 0, 0, 0, 1, 1]
     assert fitting.fit_considered(positions, FilterSettings()).after < 1
 
