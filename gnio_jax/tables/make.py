@@ -235,12 +235,12 @@ def scale_gradients(run: Path) -> list[float]:
 def _entropies(result: RowResult) -> Float[np.ndarray, "seeds 2"]:
     """Entropies of the attention of each run; none for a network without a bank."""
     runs = result.runs if result.row.config.model.bank_size != 0 else []
-    predictions = [activities.predict_split(run, _measured(result)) for run in runs]
+    predictions = [activities.predict_split(run, _recordings(result)) for run in runs]
     entropies = [activities.entropy(windows.diagnostics["attention"]) for windows in predictions]
     return np.array(entropies).reshape(-1, 2)
 
 
-def _measured(result: RowResult) -> activities.Recordings:
+def _recordings(result: RowResult) -> activities.Recordings:
     settings = result.reports[0].settings
     return activities.Recordings(*(settings[name] for name in activities.Recordings._fields))
 
@@ -354,7 +354,7 @@ def make_standing(
 
     lines, by_method = [], {}
     for result in results:
-        seeds = [activities.predict_split(run, _measured(result)) for run in result.runs]
+        seeds = [activities.predict_split(run, _recordings(result)) for run in result.runs]
         by_method[result.row.name] = activities.mean_over_seeds(seeds)
         stem = f"{path.name}_{result.row.name}"
         if "gate" in seeds[0].diagnostics:
