@@ -19,10 +19,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gnio_jax import config as configuration
 from gnio_jax.apps import sensors
 from gnio_jax.config import TrainConfig
 from gnio_jax.data.gait import detect_gait
 from gnio_jax.data.geodesy import Place, east_north_up
+from gnio_jax.data.resampling import resample
 from gnio_jax.data.sensors import GNSS, MAGNETOMETER
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import (
@@ -44,9 +46,10 @@ MEASURED = (
     "the path errs by 4.7 and 3.7 % of the way (t_rel, onavdata)"
 )
 """What is known about the error (`docs/vehicles.md`)."""
-DRIVEN = 4.0
-"""Mean speed between fixes, in the faster half of a recording without steps, from which it is a
-drive, m/s (ours)."""
+DRIVEN, APART = 4.0, 5.0
+"""Upper quartile of the speeds between fixes that are at least this time, s, apart, from which a
+recording without steps is a drive, m/s (ours). It is a quartile because a fix may be kilometres
+off, and fixes that follow each other closely show their errors."""
 MEAN_SECONDS = 0.1
 """Length of the means that show a stop, s."""
 STOP_BIAS, STOP_SPEED = 5e-4, 0.05
@@ -60,6 +63,8 @@ UNKNOWN_SPEED = 15.0
 """Standard deviation of the first velocity of a car that moves, m/s (ours)."""
 FIRST_SECONDS = 5.0
 """Time of the first fixes that give the speed, s."""
+FASTEST = 70.0
+"""Speed that no car reaches, m/s: a fix that needs it is off (ours)."""
 SPEED_ERROR, LEAST_SPEED_STD = 0.3, 1.5
 """Standard deviation of that speed, as a share of it, and the smallest one, m/s (ours)."""
 
@@ -68,7 +73,7 @@ class Stops(NamedTuple):
     """The seconds in which a car stands."""
 
     still: Bool[np.ndarray, "k"]
-    """Which whole seconds of the recording."""
+    """Which whole seconds of the recording; none of which a sample is missing."""
     gyro_bias: Float[np.ndarray, "3"]
     """Median of the gyro in them, rad/s; zero if there is none."""
 
@@ -81,9 +86,24 @@ def is_drive(sequence: Sequence, readings: dict[str, Readings]) -> bool:
         return False
     if detect_gait(sequence.gyro, sequence.accel, rate).has_steps:
         return False
-    position = _on_map(fixes)
-    speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / np.diff(fixes.time)
-    return bool(np.mean(np.sort(speed)[len(speed) // 2 :]) > DRIVEN)
+    later = np.searchsorted(fixes.time, fixes.time + APART)
+    earlier = np.flatnonzero(later < len(fixes.time))
+    if not len(earlier):
+        return False
+    time, position = fixes.time, _on_map(fixes)
+    distance = np.linalg.norm(position[later[earlier]] - position[earlier], axis=1)
+    return bool(np.quantile(distance / (time[later[earlier]] - time[earlier]), 0.75) > DRIVEN)
+
+
+def load_filter(carrier: str) -> TrainConfig:
+    """The configuration of a car's filter: "car" is configs/drive.yaml, others are files or names
+    of experiments. Raises `InputError` if it cannot be read, or is none of a car."""
+    config = configuration.load("drive" if carrier == "car" else carrier)
+    config = configuration.validate(config, carrier)
+    if NonHolonomic.name not in config.filter.measurements:
+        problem = "has no filter.measurements.nonholonomic, so it is no filter of a car"
+        raise InputError(carrier, problem, "write it as configs/drive.yaml, or give --carrier car")
+    return config
 
 
 def estimate_drive(
@@ -101,28 +121,33 @@ def estimate_drive(
         progress: A function that gets the finished share.
 
     Raises:
-        InputError: The drive does not show the mounting, and there are no fixes; or the recording
-            is too short.
+        InputError: The drive does not show the mounting, the settings do not state it, and there
+            are no fixes; or the recording is too short.
     """
-    ekf = make_filter(config.data, config.filter)
-    rate = 1.0 / float(np.median(np.diff(sequence.time)))
+    ekf, rate = make_filter(config.data, config.filter), config.data.rate
+    sequence = resample(sequence, rate)  # a tenth of a second is a whole number of samples
     stops = find_stops(sequence, rate, ekf)
     notes = [f"car: it stands for {stops.still.sum()} s, which give the gyro's bias"]
     if not stops.still.any():
         notes = ["car: it never stands still, so the gyro's bias starts from zero"]
-    mounting = None
-    try:
-        gyro = sequence.gyro - stops.gyro_bias
-        mounting = find_mounting(gyro, sequence.accel, rate, sequence.name)
-    except InputError as error:
-        if GNSS not in readings:
-            raise
-        problem = str(error).removeprefix(f"{sequence.name}: ").partition(";")[0]
-        notes.append(f"car: no constraint, because the drive {problem}")
-    else:
+    mounting = _stated_mounting(config)
+    source = "of the settings"
+    if mounting is None:
+        try:
+            gyro = sequence.gyro - stops.gyro_bias
+            mounting = find_mounting(gyro, sequence.accel, rate, sequence.name)
+            source = f"±{np.degrees(mounting.std):.1f}°"
+        except InputError as error:
+            problem = str(error).removeprefix(f"{sequence.name}: ").partition(";")[0]
+            if GNSS not in readings:
+                remedy = "drive on, through bends; or give --carrier FILE, as configs/drive.yaml, "
+                remedy += "with yaw, pitch and roll (rad) of nonholonomic"
+                raise InputError(sequence.name, problem, remedy) from error
+            notes.append(f"car: no constraint, because the mounting is unknown: {problem}")
+    if mounting is not None:
         angles = np.degrees([mounting.yaw, mounting.pitch, mounting.roll])
         words = "mounting: yaw {:.0f}°, pitch {:.0f}°, roll {:.0f}°".format(*angles)
-        notes.append(f"{words} (±{np.degrees(mounting.std):.1f}°)")
+        notes.append(f"{words} ({source})")
     ekf = dataclasses.replace(ekf, measurements=tuple(_measurements(ekf, mounting)))
     prepared, left_out = prepare([sequence], config.data, ekf, init="static", from_first=True)
     if not prepared:
@@ -158,11 +183,22 @@ def find_stops(sequence: Sequence, rate: float, ekf: Filter) -> Stops:
     gyro, accel = means
     still = np.linalg.norm(gyro - gyro.mean(1, keepdims=True), axis=2).max(1) < config.rest_gyro
     still &= np.linalg.norm(accel - accel.mean(1, keepdims=True), axis=2).max(1) < config.rest_accel
+    if sequence.imu_valid is not None:  # samples on a line across a hole look like rest
+        still &= sequence.imu_valid[rows].reshape(seconds, -1).all(axis=1)
     if not still.any():
         return Stops(still, np.zeros(3))
     bias = np.median(gyro[still].mean(1), axis=0)
     still &= np.linalg.norm(gyro.mean(1) - bias, axis=1) < config.rest_gyro
     return Stops(still, bias)
+
+
+def _stated_mounting(config: TrainConfig) -> Mounting | None:
+    """The mounting of the settings; None if they have none of its angles."""
+    numbers = config.filter.measurements.get(NonHolonomic.name) or {}
+    angles = {name: float(numbers[name]) for name in ("yaw", "pitch", "roll") if name in numbers}
+    if not angles:
+        return None
+    return Mounting(**{"yaw": 0.0, "pitch": 0.0, "roll": 0.0, **angles}, std=0.0)
 
 
 def _measurements(ekf: Filter, mounting: Mounting | None) -> list:
@@ -194,6 +230,8 @@ def _start(
     rotation, velocity, std = start.rotation, start.velocity, start.std
     if stops.still.any():
         std = std._replace(gyro_bias=STOP_BIAS)
+    elif start.raw_gyro:
+        std = std._replace(gyro_bias=sensors.RAW_BIAS)
     if stops.still[:1].any():
         # The engine shakes the samples, of which the spread of a walker's start is made.
         std = std._replace(velocity=STOP_SPEED, tilt=float(std.accel_bias) / GRAVITY)
@@ -215,21 +253,26 @@ def _start(
         gyro_bias=stops.gyro_bias,
         std=std,
         level_gyro_bias=std.gyro_bias,
-        raw_gyro=False,
+        raw_gyro=start.raw_gyro and not stops.still.any(),
     )
     return ready._replace(start=start, notes=tuple(notes))
 
 
 def first_speed(fixes: Readings, start: float) -> float | None:
     """The speed at the start by the fixes of the first `FIRST_SECONDS`, m/s: that of a parabola,
-    because a car speeds up, or of a line through two or three. None with fewer than two, or less
-    than two seconds between them."""
+    because a car speeds up, or of a line through two or three. Fixes that no car reaches from the
+    others are left out. None with fewer than two, less than two seconds between them, or a speed
+    of no car."""
     rows = (fixes.time >= start - 1.0) & (fixes.time <= start + FIRST_SECONDS)
-    time = fixes.time[rows] - start
+    time, position = fixes.time[rows] - start, _on_map(fixes)[rows]
+    if len(time) > 2:
+        distance = np.linalg.norm(position - np.median(position, axis=0), axis=1)
+        reached = distance < FASTEST * np.ptp(time)
+        time, position = time[reached], position[reached]
     if len(time) < 2 or np.ptp(time) < 2.0:
         return None
-    slope = np.polyfit(time, _on_map(fixes)[rows], 2 if len(time) > 3 else 1)[-2]
-    return float(np.linalg.norm(slope))
+    speed = float(np.linalg.norm(np.polyfit(time, position, 2 if len(time) > 3 else 1)[-2]))
+    return speed if speed < FASTEST else None
 
 
 def _on_map(fixes: Readings) -> Float[np.ndarray, "f 2"]:

@@ -335,7 +335,7 @@ def place_on_map(readings: Readings, path: SequenceEstimate, longest: float) -> 
     time, values = readings.time[inside], readings.values[inside]
     if len(time) < FEWEST_FIXES:
         problem = f"{len(time)} fixes are within the recording, and {FEWEST_FIXES} are needed"
-        raise InputError("gnss", problem, "wait for the first fix, and walk for a minute")
+        raise InputError("gnss", problem, "wait for the first fix, and record for a minute")
     std = readings.std[inside, :2].max(axis=1)
     std = np.maximum(np.where(np.isfinite(std), std, ACCURACY), LEAST_ACCURACY)
     altitude = values[:, 2][np.isfinite(values[:, 2])]
@@ -359,7 +359,7 @@ def place_on_map(readings: Readings, path: SequenceEstimate, longest: float) -> 
         spread = float(np.linalg.norm(np.ptp(walked, axis=0)))
         problem = f"the fixes show the heading to {np.degrees(min(yaw_std, 3.0)):.0f}° only: the"
         problem += f" path spans {spread:.0f} m, and the fixes are good to {np.median(std):.0f} m"
-        raise InputError("gnss", problem, "walk farther, under the open sky")
+        raise InputError("gnss", problem, "go farther, under the open sky")
     origin = Place(*geodetic(np.array([[*shift, 0.0]]), reference)[0].tolist())
     position = east_north_up(places, origin)[:, :2]
     yaw, first_std = float(np.arctan2(turn[1, 0], turn[0, 0])), float(np.median(std))

@@ -160,7 +160,7 @@ def summarise(
         *(f"{use.sensor}: {use.text}" for use in sensors if use.accepted is None),
         *of_walk,
         *_warnings_of_errors(summary),
-        *_warnings_of_start(ready, recording, ekf, summary.carrier),
+        *_warnings_of_start(ready, recording, ekf, summary.carrier, shown),
     )
     expected_error = error if shown and not has_diverged else np.nan
     return summary._replace(expected_error=expected_error, warnings=warnings)
@@ -186,7 +186,7 @@ def _warnings_of_drive(summary: Summary, has_fixes: bool) -> list[str]:
     """The warning about a drive without fixes, whose error grows with the way."""
     if has_fixes:
         return []
-    return [f"car: there are no fixes, so no error can be stated: {summary.measured}"]
+    return [f"car: no fixes are used, so no error can be stated: {summary.measured}"]
 
 
 def _warnings_of_gait(gait: Gait, steps: float | None) -> list[str]:
@@ -210,9 +210,14 @@ def _warnings_of_gait(gait: Gait, steps: float | None) -> list[str]:
 
 
 def _warnings_of_start(
-    ready: PreparedRecording, recording: Imported, ekf: Filter, carrier: str = "person"
+    ready: PreparedRecording,
+    recording: Imported,
+    ekf: Filter,
+    carrier: str = "person",
+    has_fixes: bool = False,
 ) -> list[str]:
-    """Warnings about missing samples and the start, and about a filter that was not calibrated."""
+    """Warnings about missing samples and the start, and about a filter that was not calibrated.
+    `has_fixes` says whether the fixes of a receiver were used, which show a car's speed."""
     has_holes = ready.imu_valid is not None
     where = "" if has_holes else " (see above)"
     hidden = ekf.config.gap_gyro_std > 0 and ekf.config.gap_accel_std > 0
@@ -223,12 +228,18 @@ def _warnings_of_start(
         f"the place after it are uncertain{counted}": has_holes
         or any(GAPS in note for note in recording.notes),
         "gyro: raw, and without a rest that shows its bias: the heading may be lost within a "
-        "minute; hold the phone still for some seconds first": ready.start.raw_gyro,
+        "minute; hold the phone still for some seconds first": (
+            ready.start.raw_gyro and carrier == "person"
+        ),
         "start: it moves in its first second, so velocity and tilt are inaccurate": (
             ready.start.std.velocity > ROUGH_START and carrier == "person"
         ),
         "start: the car moves, and nothing shows its speed, so the path is wrong; begin at rest": (
-            ready.start.std.velocity >= drive.UNKNOWN_SPEED
+            ready.start.std.velocity >= drive.UNKNOWN_SPEED and not has_fixes
+        ),
+        "gyro: no stop of the car shows its bias, so mounting and path may be farther off than the "
+        "filter says; stand still for two seconds": (
+            carrier == "car" and float(ready.start.std.gyro_bias) > drive.STOP_BIAS
         ),
         "calibration: the filter's covariances were not calibrated (gnio calibrate), so the real "
         "error is probably larger than the expected one": (

@@ -40,7 +40,7 @@ class TrackOptions:
     carrier: str | None = None
     """What carries the IMU: person, car, or a file with the filter of a car (as configs/drive.yaml,
     that of car). By default person, and car if a recording without steps has the fixes of a
-    drive."""
+    drive and no --network is named."""
     rerun: Path | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     recording: Annotated[ImportOptions, UNNAMED] = ImportOptions()  # noqa: RUF009 - it is frozen
@@ -72,19 +72,18 @@ def track(request: TrackOptions, call: options.Call) -> None:
     console.compile_quickly()
     import jax  # late, so that mistakes do not wait for it
 
-    from gnio_jax import config as configuration
     from gnio_jax import networks
+    from gnio_jax.apps import drive
     from gnio_jax.apps import track as tracking
     from gnio_jax.apps.importing import read_imported
 
+    carrier = "person" if request.network else request.carrier
+    source: Any = None if carrier in (None, "person") else drive.load_filter(carrier)
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     recording = read_imported(request.file, request.recording)
-    carrier = request.carrier or recognise_carrier(recording.sequence, request.without)
-    if carrier == "person":
-        source: Any = networks.load(request.network)
-    else:
-        source = configuration.load("drive" if carrier == "car" else carrier)
-        source = configuration.validate(source, carrier)
+    if carrier is None and recognise_carrier(recording.sequence, request.without) == "car":
+        source = drive.load_filter("car")
+    source = source or networks.load(request.network)
     out = request.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)

@@ -73,7 +73,7 @@ def find_mounting(
     Raises:
         InputError: The IMU hardly moves, or it does not turn and brake enough.
     """
-    remedy = "give yaw, pitch and roll of filter.measurements.nonholonomic"
+    remedy = "state yaw, pitch and roll in filter.measurements.nonholonomic of the settings"
     length = round(PIECE_SECONDS * rate)
     count = len(gyro) // length
     if not count:

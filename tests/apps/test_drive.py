@@ -13,6 +13,7 @@ from gnio_jax.apps.importing import Imported
 from gnio_jax.apps.track import track
 from gnio_jax.data.geodesy import Place, geodetic
 from gnio_jax.data.hdf5 import write_hdf5
+from gnio_jax.data.resampling import resample
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import read_tum
 from gnio_jax.filtering import make_filter
@@ -80,6 +81,33 @@ def test_stops_and_bias_are_seen_through_the_shaking_of_an_engine():
     assert not stops.still.any() and not stops.gyro_bias.any()
 
 
+def test_a_hole_of_the_imu_is_no_stop():
+    """The samples on a line across it look like rest."""
+    sequence = recording()
+    measured = np.ones(len(sequence.time), dtype=bool)
+    measured[150:270] = False
+    ekf = make_filter(CONFIG.data, CONFIG.filter)
+    stops = drive.find_stops(sequence._replace(imu_valid=measured), cars.RATE, ekf)
+    assert np.array_equal(np.flatnonzero(stops.still[:8]), [0, 3, 4, 5, 6, 7])
+
+
+def test_stops_are_seen_at_rates_that_are_no_multiple_of_ten(tmp_path):
+    sequence = recording(fixes=lambda stamp: True)
+    unshaken = dict(zip(("gyro", "accel"), averaged(sequence), strict=True))
+    result = tracked(resample(sequence._replace(**unshaken), 52.0), tmp_path)
+    assert any(note.startswith("car: it stands for 14 s") for note in result.summary.notes)
+    assert result.summary.warnings == ()
+
+
+def averaged(sequence):
+    """Gyro and accelerometer without the shaking of the engine, whose period is four samples."""
+    mean = np.full(4, 0.25)
+    return (
+        np.apply_along_axis(np.convolve, 0, np.pad(signal, ((2, 1), (0, 0)), "edge"), mean, "valid")
+        for signal in (sequence.gyro, sequence.accel)
+    )
+
+
 def test_a_drive_from_rest_has_its_path_and_no_error_without_fixes(tmp_path):
     result = tracked(recording(), tmp_path)
     path, summary = result.estimate.trajectory, result.summary
@@ -92,7 +120,7 @@ def test_a_drive_from_rest_has_its_path_and_no_error_without_fixes(tmp_path):
     error = np.linalg.norm((aligned - true)[:, :2], axis=1)
     assert way > 350 and error[-1] < 0.03 * way
     assert np.isnan(summary.expected_error) and summary.carrier == "car"
-    assert summary.warnings[0].startswith("car: there are no fixes, so no error can be stated")
+    assert summary.warnings[0].startswith("car: no fixes are used, so no error can be stated")
     assert summary.at_rest == pytest.approx(14 / 70, abs=0.04)
     assert any(note.startswith("mounting: yaw 2") for note in summary.notes)
     written = json.loads((result.folder / "summary.json").read_text(encoding="utf-8"))
@@ -141,6 +169,56 @@ def test_a_drive_that_shows_no_mounting_needs_fixes(tmp_path):
     with pytest.raises(InputError, match="drive: "):
         tracked(straight, tmp_path)
     assert not (tmp_path / "track").exists()
+    with pytest.raises(InputError, match="give --carrier FILE"):
+        tracked(first_seconds(still, 12.0), tmp_path)
+
+
+def first_seconds(sequence, seconds):
+    rows = sequence.time < seconds
+    parts = {k: v[rows] for k, v in sequence._asdict().items() if isinstance(v, np.ndarray)}
+    return sequence._replace(**parts)
+
+
+def test_a_mounting_of_the_settings_is_taken(tmp_path):
+    """12 s are too short to find it. Roll is not stated, so it is zero."""
+    angles = "filter.measurements.nonholonomic={lateral_std: 1.0, yaw: 0.5, pitch: 0.1}"
+    config = configuration.assign(CONFIG, [angles])
+    short = first_seconds(recording(mounting=(0.5, 0.1, 0.0)), 12.0)
+    result = track(Imported(short, (), ()), config, tmp_path / "track")
+    assert "mounting: yaw 29°, pitch 6°, roll 0° (of the settings)" in result.summary.notes
+    path = result.estimate.trajectory
+    way = np.linalg.norm(truth(path.time)[-1])
+    assert np.linalg.norm(path.position[-1]) == pytest.approx(way, rel=0.1)
+
+
+def test_a_fix_kilometres_off_does_not_give_the_speed_of_the_start(tmp_path):
+    sequence = recording(first=15.0, fixes=lambda stamp: True)
+    fixes = sequence.readings["gnss"]
+    right = drive.first_speed(fixes, 0.0)
+    assert right == pytest.approx(11.0, abs=5.0)
+    for row in range(5):
+        values = fixes.values.copy()
+        values[row, 0] += 0.05
+        speed = drive.first_speed(fixes._replace(values=values), 0.0)
+        assert speed == pytest.approx(right, abs=7.0)
+    two = Readings(fixes.time[:3:2], values[3:5], fixes.std[:2])
+    assert drive.first_speed(two, 0.0) is None
+
+
+def test_only_a_path_without_fixes_is_wrong_for_its_unknown_speed(tmp_path):
+    summary = tracked(recording(15.0, lambda stamp: stamp > 8), tmp_path).summary
+    assert any("nothing shows its speed" in note for note in summary.notes)
+    assert np.isfinite(summary.expected_error) and summary.warnings == ()
+
+
+def test_a_car_that_never_stands_says_that_nothing_shows_the_bias(tmp_path):
+    """Its gyro is raw, so the bias may be large."""
+    moving = first_seconds(recording(15.0, lambda stamp: stamp < 24), 24.0)
+    moving = moving._replace(attributes={"imu_compensated": "no"})
+    moving = moving._replace(gyro=moving.gyro - cars.BIAS)
+    result = tracked(moving, tmp_path)
+    assert any(text.startswith("gyro: no stop") for text in result.summary.warnings)
+    assert result.summary.expected_error > 5.0
 
 
 def test_a_drive_is_recognised_by_its_fixes_alone():
@@ -149,6 +227,13 @@ def test_a_drive_is_recognised_by_its_fixes_alone():
     assert not drive.is_drive(with_fixes, {})
     slow = with_fixes.readings["gnss"]._replace(time=6 * with_fixes.readings["gnss"].time)
     assert not drive.is_drive(with_fixes, {"gnss": slow})
+    fixes = with_fixes.readings["gnss"]
+    still = np.tile(fixes.values[0], (len(fixes.time), 1))
+    still[20, 0] += 0.05
+    assert not drive.is_drive(with_fixes, {"gnss": fixes._replace(values=still)})
+    noise = np.random.default_rng(2).normal(size=(600, 3)) * 3.0
+    often = Readings(np.arange(1.0, 61.0, 0.1), geodetic(noise, ORIGIN), np.full((600, 3), 3.0))
+    assert not drive.is_drive(with_fixes, {"gnss": often})
     steps = np.arange(0.0, 30.0, 0.01)
     walk = with_fixes._replace(
         time=steps,
@@ -169,6 +254,8 @@ def test_the_command_takes_a_car_or_recognises_it(tmp_path, gnio, mistake):
     settings.write_text("data: {rate: 100.0, window_seconds: 0.2}\nfilter: {rest_gyro: -1}\n")
     assert "rest_gyro" in mistake("track", file, "--carrier", settings, "--out", tmp_path / "b")
     assert "no" in mistake("track", file, "--carrier", "boat", "--out", tmp_path / "b")
+    told = mistake("track", file, "--carrier", "pedestrian", "--out", tmp_path / "b")
+    assert "no filter of a car; write it as configs/drive.yaml" in told
     told = mistake("track", file, "--carrier", "car", "--network", "pedestrian")
     assert "leave it out with --carrier car" in told
     assert not (tmp_path / "b").exists()

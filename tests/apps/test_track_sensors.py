@@ -343,7 +343,7 @@ def test_fixes_of_a_phone_that_stands_show_no_heading():
     level = np.tile([1.0, 0, 0, 0], (len(time), 1))
     path = Trajectory(time, np.zeros((len(time), 3)), level)
     still = SequenceEstimate("still", path, path)
-    with pytest.raises(InputError, match=r"the fixes show the heading to .* only.*walk farther"):
+    with pytest.raises(InputError, match=r"the fixes show the heading to .* only.*go farther"):
         sensors.place_on_map(gnss, still, 60.0)
     with pytest.raises(InputError, match="2 fixes are within the recording, and 4 are needed"):
         few = gnss._replace(time=gnss.time[:2], values=gnss.values[:2], std=gnss.std[:2])

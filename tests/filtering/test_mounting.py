@@ -73,5 +73,5 @@ def test_a_drive_that_slides_more_is_less_certain():
 )
 def test_a_drive_that_does_not_show_the_mounting_is_refused(change, problem):
     signals = change(*recording(1, (0.0, 0.0, 0.0), 60))
-    with pytest.raises(InputError, match=rf"^drive: .*({problem}).*; give yaw, pitch and roll"):
+    with pytest.raises(InputError, match=rf"^drive: .*({problem}).*; state yaw, pitch and roll"):
         find_mounting(*signals, RATE, "drive")
