@@ -124,10 +124,11 @@ def base_config(options: TablesConfig) -> TrainConfig:
 def measured_dataset(options: TablesConfig, base: TrainConfig) -> str:
     """The dataset that is measured. Raises `InputError` if it is unknown, or if none is named and
     there are several to learn from."""
-    if options.dataset is None and len(base.datasets) > 1:
-        remedy = f"name the one to measure, e.g. --dataset {base.datasets[0]}"
+    first, *others = base.datasets
+    if options.dataset is None and others:
+        remedy = f"name the one to measure, e.g. --dataset {first}"
         raise InputError(options.base, f"has several datasets: {', '.join(base.datasets)}", remedy)
-    dataset = options.dataset or base.datasets[0]
+    dataset = options.dataset or first
     data.get(dataset)
     return dataset
 
