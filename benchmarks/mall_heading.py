@@ -61,6 +61,9 @@ def field_legs(split: str, root: str | None, name: str) -> list[tuple[np.ndarray
     rows, kept = [], []
     for recording, path in zip(ready, paths, strict=True):
         walk = walks[recording.name]
+        if "magnetometer" not in walk.readings:
+            print(f"left out: {walk.name} has no magnetometer")
+            continue
         field = walk.readings["magnetometer"]
         rotation = matrix_from_quaternion(path.trajectory.orientation[1:])
         stamps = field.time, field.values, rotation, ekf.config, walk.time[0]
