@@ -26,6 +26,7 @@ from gnio_jax.data.gait import detect_gait
 from gnio_jax.data.geodesy import Place, east_north_up
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.sensors import GNSS, MAGNETOMETER
+from gnio_jax.data.validation import check_bridged
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import (
     PreparedRecording,
@@ -81,9 +82,9 @@ class Stops(NamedTuple):
 def is_drive(sequence: Sequence, readings: dict[str, Readings]) -> bool:
     """Whether the fixes of a recording without steps show a drive."""
     fixes = readings.get(GNSS)
-    rate = 1.0 / float(np.median(np.diff(sequence.time)))
-    if fixes is None or len(fixes.time) < 2:
+    if fixes is None:
         return False
+    rate = 1.0 / float(np.median(np.diff(sequence.time)))
     if detect_gait(sequence.gyro, sequence.accel, rate).has_steps:
         return False
     later = np.searchsorted(fixes.time, fixes.time + APART)
@@ -122,8 +123,9 @@ def estimate_drive(
 
     Raises:
         InputError: The drive does not show the mounting, the settings do not state it, and there
-            are no fixes; or the recording is too short.
+            are no fixes; or the recording is too short or has a hole that is too long.
     """
+    check_bridged(sequence)
     ekf, rate = make_filter(config.data, config.filter), config.data.rate
     sequence = resample(sequence, rate)  # a tenth of a second is a whole number of samples
     stops = find_stops(sequence, rate, ekf)
@@ -138,7 +140,7 @@ def estimate_drive(
             mounting = find_mounting(gyro, sequence.accel, rate, sequence.name)
             source = f"±{np.degrees(mounting.std):.1f}°"
         except InputError as error:
-            problem = str(error).removeprefix(f"{sequence.name}: ").partition(";")[0]
+            problem = error.parts[1]
             if GNSS not in readings:
                 remedy = "drive on, through bends; or give --carrier FILE, as configs/drive.yaml, "
                 remedy += "with yaw, pitch and roll (rad) of nonholonomic"
@@ -155,12 +157,14 @@ def estimate_drive(
     ready = _start(prepared[0], stops, mounting, readings.get(GNSS))
     ready = ready._replace(notes=(*ready.notes, *notes))
 
-    def run(ready: PreparedRecording, ekf: Filter) -> SequenceEstimate:
-        return estimate([ready], [no_displacements(ready)], config.data, ekf, 1)[0]
+    none = [no_displacements(ready)]
+    (first,) = estimate([ready], none, config.data, ekf, 1, progress)
 
-    progress(0.0)
+    def run(ready: PreparedRecording, ekf: Filter) -> SequenceEstimate:
+        return estimate([ready], none, config.data, ekf, 1)[0]
+
     others = {sensor: rows for sensor, rows in readings.items() if sensor != MAGNETOMETER}
-    fused = sensors.fuse(run(ready, ekf), ready, ekf, others, run, FIRST_FIXES)
+    fused = sensors.fuse(first, ready, ekf, others, run, FIRST_FIXES)
     if MAGNETOMETER in readings:
         reason = "left out: the field in a car is that of its steel and its currents"
         use = sensors.SensorUse(MAGNETOMETER, len(readings[MAGNETOMETER].time), None, reason)

@@ -121,11 +121,10 @@ def summarise(
     used = filtered.accepted[:rows]
     used = used[np.isfinite(used)]
     error = float(np.sqrt(np.trace(filtered.covariance[rows - 1, :2, :2])))
-    described = describe_source(source)
     gait = detect_gait(ready.gyro, ready.accel, 1.0 / ekf.config.dt, ready.imu_valid)
     summary = Summary(
         recording=sequence.name,
-        **described,
+        **describe_source(source),
         start_time=float(sequence.attributes.get("start_time", 0.0)),
         seconds=float(time[-1] - time[0]),
         path_length=0.0
@@ -149,10 +148,12 @@ def summarise(
     if summary.carrier == "car":
         shown = any(use.sensor == GNSS and use.accepted is not None for use in sensors)
         first, of_walk = _warnings_of_drive(summary, shown), []
+        of_start = _warnings_of_car_start(ready, shown)
     else:
         shown = gait.has_steps
         first = _warnings_of_gait(gait, summary.steps)
         of_walk = _warnings_of_walk(summary, recorded_rate, ekf)
+        of_start = _warnings_of_start(ready, ekf)
     warnings = (
         *(note for note in estimate.notes if note not in ready.notes),  # of a divergence
         *first,
@@ -160,7 +161,8 @@ def summarise(
         *(f"{use.sensor}: {use.text}" for use in sensors if use.accepted is None),
         *of_walk,
         *_warnings_of_errors(summary),
-        *_warnings_of_start(ready, recording, ekf, summary.carrier, shown),
+        *_warnings_of_gaps(ready, recording, ekf),
+        *of_start,
     )
     expected_error = error if shown and not has_diverged else np.nan
     return summary._replace(expected_error=expected_error, warnings=warnings)
@@ -209,41 +211,44 @@ def _warnings_of_gait(gait: Gait, steps: float | None) -> list[str]:
     ]
 
 
-def _warnings_of_start(
-    ready: PreparedRecording,
-    recording: Imported,
-    ekf: Filter,
-    carrier: str = "person",
-    has_fixes: bool = False,
-) -> list[str]:
-    """Warnings about missing samples and the start, and about a filter that was not calibrated.
-    `has_fixes` says whether the fixes of a receiver were used, which show a car's speed."""
+def _warnings_of_gaps(ready: PreparedRecording, recording: Imported, ekf: Filter) -> list[str]:
+    """A warning about missing samples."""
     has_holes = ready.imu_valid is not None
+    if not has_holes and not any(GAPS in note for note in recording.notes):
+        return []
     where = "" if has_holes else " (see above)"
     hidden = ekf.config.gap_gyro_std > 0 and ekf.config.gap_accel_std > 0
     counted = "" if hidden else ", and more so than the filter says, which counts no motion in it"
-    conditions = {
+    return [
         f"gaps: samples are missing{where}, and nothing shows the turn in a gap: trust the shape "
         "of the path before and after it, but not the angle between both parts. The heading and "
-        f"the place after it are uncertain{counted}": has_holes
-        or any(GAPS in note for note in recording.notes),
+        f"the place after it are uncertain{counted}"
+    ]
+
+
+def _warnings_of_start(ready: PreparedRecording, ekf: Filter) -> list[str]:
+    """Warnings about the start of a walk, and about a filter that was not calibrated."""
+    conditions = {
         "gyro: raw, and without a rest that shows its bias: the heading may be lost within a "
-        "minute; hold the phone still for some seconds first": (
-            ready.start.raw_gyro and carrier == "person"
-        ),
+        "minute; hold the phone still for some seconds first": ready.start.raw_gyro,
         "start: it moves in its first second, so velocity and tilt are inaccurate": (
-            ready.start.std.velocity > ROUGH_START and carrier == "person"
+            ready.start.std.velocity > ROUGH_START
         ),
+        "calibration: the filter's covariances were not calibrated (gnio calibrate), so the real "
+        "error is probably larger than the expected one": ekf.considered is None,
+    }
+    return [text for text, applies in conditions.items() if applies]
+
+
+def _warnings_of_car_start(ready: PreparedRecording, has_fixes: bool) -> list[str]:
+    """Warnings about the start of a drive. The fixes of a receiver show the speed."""
+    conditions = {
         "start: the car moves, and nothing shows its speed, so the path is wrong; begin at rest": (
             ready.start.std.velocity >= drive.UNKNOWN_SPEED and not has_fixes
         ),
         "gyro: no stop of the car shows its bias, so mounting and path may be farther off than the "
         "filter says; stand still for two seconds": (
-            carrier == "car" and float(ready.start.std.gyro_bias) > drive.STOP_BIAS
-        ),
-        "calibration: the filter's covariances were not calibrated (gnio calibrate), so the real "
-        "error is probably larger than the expected one": (
-            ekf.considered is None and carrier == "person"
+            float(ready.start.std.gyro_bias) > drive.STOP_BIAS
         ),
     }
     return [text for text, applies in conditions.items() if applies]

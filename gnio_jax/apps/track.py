@@ -18,8 +18,7 @@ from gnio_jax.apps import drive, export, rerun, sensors
 from gnio_jax.apps.importing import Imported
 from gnio_jax.apps.summary import Summary, summarise
 from gnio_jax.config import TrainConfig
-from gnio_jax.data.resampling import longest_bridge
-from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
+from gnio_jax.data.validation import check_bridged
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import (
     PreparedRecording,
@@ -85,7 +84,6 @@ def track(
     if sensors.GNSS not in readings:
         export.check_map(formats)
     if isinstance(source, TrainConfig):
-        _check_bridged(sequence)
         config, fused = source, drive.estimate_drive(sequence, readings, source, progress)
     else:
         config = source.config
@@ -131,7 +129,7 @@ def estimate_recording(
     rest at the start gives the gyro's bias. A reference is not used. Raises `InputError` for a
     recording that is too short or has a hole that is too long.
     """
-    _check_bridged(sequence)
+    check_bridged(sequence)
     config = trained.config
     ekf = make_filter(config.data, config.filter)
     ready, left_out = prepare(
@@ -155,17 +153,6 @@ def estimate_recording(
         return estimate([ready], network, config.data, ekf, 1)[0]
 
     return sensors.fuse(first, ready[0], ekf, readings, run)
-
-
-def _check_bridged(sequence: Sequence) -> None:
-    """Raise `InputError` for a hole that is too long to be bridged, because no sample shows the
-    motion in it."""
-    # An earlier resampling interpolated the holes, and each clock has widened a hole by up to a
-    # sample at each end.
-    measured = np.union1d(sequence.time[sequence.measured_rows], sequence.time[[0, -1]])
-    bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
-    check_gaps(sequence.time, sequence.name)
-    check_gaps(measured, sequence.name, WINDOW_SECONDS + bridged)
 
 
 def _write_figures(

@@ -73,7 +73,7 @@ def track(request: TrackOptions, call: options.Call) -> None:
     import jax  # late, so that mistakes do not wait for it
 
     from gnio_jax import networks
-    from gnio_jax.apps import drive
+    from gnio_jax.apps import drive, sensors
     from gnio_jax.apps import track as tracking
     from gnio_jax.apps.importing import read_imported
 
@@ -81,7 +81,9 @@ def track(request: TrackOptions, call: options.Call) -> None:
     source: Any = None if carrier in (None, "person") else drive.load_filter(carrier)
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     recording = read_imported(request.file, request.recording)
-    if carrier is None and recognise_carrier(recording.sequence, request.without) == "car":
+    readings = sensors.usable_readings(recording.sequence, request.without)
+    if carrier is None and drive.is_drive(recording.sequence, readings):
+        console.say("no steps, and fixes as fast as a car: tracked as a car (--carrier)")
         source = drive.load_filter("car")
     source = source or networks.load(request.network)
     out = request.out or Path("tracks") / _folder_name(recording.sequence.name)
@@ -102,24 +104,11 @@ def track(request: TrackOptions, call: options.Call) -> None:
             console.say(f"{use.sensor}: {use.text}")
     for warning in summary.warnings[len(first) :]:
         console.say(f"warning: {warning}")
-    if summary.carrier == "car":
-        if not first:
-            console.say(f"{summary.measured}; with fixes, by what the filter expects")
-    elif not first:  # what was measured are whole walks
+    if not first and summary.carrier == "person":  # what was measured are whole walks
         on_others = f" on recordings with a reference: {summary.measured}"
         measured = on_others if summary.measured else ": its error was not measured (gnio evaluate)"
         console.say(f"network {summary.network}{measured}")
     console.say(f"results: {result.folder} (open report.html, or look at track.png)")
-
-
-def recognise_carrier(sequence: Any, without: tuple[str, ...]) -> str:
-    """car if the recording is a drive by its fixes, else person."""
-    from gnio_jax.apps import drive, sensors
-
-    is_drive = drive.is_drive(sequence, sensors.usable_readings(sequence, without))
-    if is_drive:
-        console.say("no steps, and fixes as fast as a car: tracked as a car (--carrier)")
-    return "car" if is_drive else "person"
 
 
 def _folder_name(name: str) -> str:

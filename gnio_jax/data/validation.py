@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.sensors import check_readings
 from gnio_jax.errors import InputError
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
@@ -226,3 +227,14 @@ def check_gaps(
         row = int(np.argmax(gaps))
         problem = f"field 'time' has a gap of {gaps[row]:.3f} s after row {row + 1}"
         raise InputError(source, f"{problem}, longer than {longest:g} s", "cut the recording there")
+
+
+def check_bridged(sequence: Sequence) -> None:
+    """Raise `InputError` for a hole that is too long to be bridged, because no sample shows the
+    motion in it."""
+    # An earlier resampling interpolated the holes, and each clock has widened a hole by up to a
+    # sample at each end.
+    measured = np.union1d(sequence.time[sequence.measured_rows], sequence.time[[0, -1]])
+    bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
+    check_gaps(sequence.time, sequence.name)
+    check_gaps(measured, sequence.name, WINDOW_SECONDS + bridged)

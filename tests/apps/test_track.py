@@ -17,7 +17,7 @@ from gnio_jax.apps.summary import (
     Summary,
     _warnings_of_errors,
     _warnings_of_gait,
-    _warnings_of_start,
+    _warnings_of_gaps,
     _warnings_of_walk,
     summarise,
 )
@@ -332,7 +332,7 @@ def test_a_gap_that_the_filter_does_not_count_is_told(runs, std, counted):
     config = dataclasses.replace(network.config, filter=settings)
     walk = without_poses("walk", time)
     _, ready, ekf, *_ = estimate_recording(walk, {}, network._replace(config=config))
-    warnings = _warnings_of_start(ready, Imported(without_poses("walk", time), (), ()), ekf)
+    warnings = _warnings_of_gaps(ready, Imported(without_poses("walk", time), (), ()), ekf)
     (gaps,) = [warning for warning in warnings if warning.startswith("gaps: ")]
     assert ("more so than the filter says" in gaps) == counted
 
