@@ -436,12 +436,14 @@ def compare_positions(
     which an error that is not estimated acts more than `LARGEST_SENSITIVITY` are left out: there
     the filter amplifies it from update to update, and no covariance is that large.
     """
-    healthy, position, *parts = jax.device_get(_run_walks(walks, settings, windows=windows))
+    results = jax.device_get(_run_walks(walks, settings, windows=windows))
+    healthy, position, covariance, sensitivity, *parts = results
     error = truth - position
     compared = np.isfinite(error).all(axis=2) & (healthy > 0)
-    compared &= np.abs(parts[1]).max(axis=(2, 3)) < LARGEST_SENSITIVITY
+    compared &= np.abs(sensitivity).max(axis=(2, 3)) < LARGEST_SENSITIVITY
     recording = np.broadcast_to(np.arange(len(error))[:, None], compared.shape)
-    return PositionErrors(*(part[compared] for part in (error, *parts, recording)))
+    rows = error, covariance, sensitivity, *parts, recording
+    return PositionErrors(*(part[compared] for part in rows))
 
 
 @functools.partial(jax.jit, static_argnames="windows")

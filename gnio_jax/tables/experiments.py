@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -109,14 +108,15 @@ def method(network: str, base: TrainConfig) -> TrainConfig:
 
 def scaled_width(network: str, base: TrainConfig) -> int | None:
     """The width of a network at the share of its published width that `base` has of GNIO's, or the
-    next one that the network can have. None, the published one, for networks without a width, and
-    for those with memory, which are small."""
+    next one that the network can have; if there is none near it, the network says why. None, the
+    published one, for networks without a width, and for those with memory, which are small."""
     default = models.create(network)
     small = isinstance(default, NetworkWithMemory) or not hasattr(default, "width")
     if small or base.model.width is None:
         return None
     width = max(round(base.model.width / GNIO.width * default.width), 1)
-    return next(filter(partial(accepts_width, network), itertools.count(width)))
+    wider = range(width, width + default.width)
+    return next(filter(partial(accepts_width, network), wider), width)
 
 
 def accepts_width(network: str, width: int) -> bool:

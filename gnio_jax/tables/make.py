@@ -84,6 +84,11 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
         jax.clear_caches()  # the programs of all networks need more memory maps than Linux allows
     path = Path(options.out) / file_name(options)
     remarks = notes(base, options, experiment)
+    failed = [name for result in results for name in result.uncalibrated]
+    if options.calibrate and failed:
+        remarks += (
+            f"\n\nNot calibrated, because the filter could not be fitted: {', '.join(failed)}."
+        )
     if options.table == "trajectories":
         return make_trajectories(path, options, results)
     if options.table == "standing":

@@ -23,7 +23,7 @@ MEANINGS: dict[Definition, str] = {
     "of_length": "RMSE of the distance in % of the path",
     "aligned": "after a fit of the whole path",
     "window_frames": "sum of windows in their own frames",
-    "unknown": "not defined",
+    "unknown": "not known",
 }
 """What is called ATE."""
 
@@ -52,8 +52,8 @@ ERRORS = (
     PublishedError("TLIO", "IONext, random split", 0.86, "of_length", 2, "arXiv 2507.17089"),
     PublishedError("TLIO", "TLIO, in GNIO's paper", 2.40, "unknown", 3, "GNIO"),
     PublishedError("TLIO", "GNIO", 1.66, "unknown", 3, "GNIO"),
-    PublishedError("RoNIN unseen", "RIO's RoNIN", 5.57, "coordinate", 2, "CVPR 2022"),
-    PublishedError("RoNIN unseen", "RIO, joint", 5.02, "coordinate", 2, "CVPR 2022"),
+    PublishedError("RoNIN unseen", "RIO's RoNIN", 5.57, "unknown", 2, "CVPR 2022"),
+    PublishedError("RoNIN unseen", "RIO, joint", 5.02, "unknown", 2, "CVPR 2022"),
     PublishedError("RoNIN unseen", "EqNIO, O(2) around RoNIN", 4.42, "coordinate", 2, "ICLR 2025"),
     PublishedError("RoNIN unseen", "MambaIO", 4.48, "coordinate", 2, "arXiv 2511.15645"),
     PublishedError(
@@ -70,8 +70,8 @@ ERRORS = (
     PublishedError("OxIOD", "EqNIO, O(2) around RoNIN", 1.28, "coordinate", 2, "ICLR 2025"),
     PublishedError("OxIOD", "MambaIO", 1.568, "coordinate", 2, "arXiv 2511.15645"),
     PublishedError("OxIOD", "IONext, random split", 0.49, "of_length", 2, "arXiv 2507.17089"),
-    PublishedError("OxIOD seen", "IONet, in RoNIN's paper", 1.79, "coordinate", 2, "RoNIN"),
-    PublishedError("OxIOD unseen", "IONet, in RoNIN's paper", 2.63, "coordinate", 2, "RoNIN"),
+    PublishedError("OxIOD seen", "IONet, in RoNIN's paper", 1.79, "unknown", 2, "RoNIN"),
+    PublishedError("OxIOD unseen", "IONet, in RoNIN's paper", 2.63, "unknown", 2, "RoNIN"),
     PublishedError("IDOL", "TartanIMU", 4.32, "distance", 3, "CVPR 2025"),
     PublishedError("IDOL", "TLIO, in TartanIMU's paper", 6.96, "distance", 3, "CVPR 2025"),
     PublishedError("Blackbird seen", "AirIO and filter", 0.403, "distance", 3, "arXiv 2501.15659"),

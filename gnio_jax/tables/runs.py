@@ -23,6 +23,9 @@ from gnio_jax.tables.cost import RunCost, load_or_measure
 from gnio_jax.tables.experiments import TableRow
 from gnio_jax.training import loop, run_folder
 
+CALIBRATED = "_calibrated"
+"""Ending of the folder of a calibrated run."""
+
 
 class Interrupted(Exception):
     """A signal, whose number is the argument, asked a training run to stop; it is saved, and the
@@ -39,6 +42,11 @@ class RowResult(NamedTuple):
     folders: list[Path]
     """Reports of their evaluations."""
     cost: RunCost
+
+    @property
+    def uncalibrated(self) -> list[str]:
+        """Names of the runs whose filter is not calibrated."""
+        return [run.name for run in self.runs if not run.name.endswith(CALIBRATED)]
 
     @property
     def seeds(self) -> list[Scores]:
@@ -129,7 +137,7 @@ def calibrate_run(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
     """The run's best weights with the filter fitted to its validation split: the existing
     calibrated run if it has these weights, else a new one. If the filter cannot be fitted, a
     warning says so, and the run stays as it is: the other rows go on."""
-    folder = workdir.with_name(f"{workdir.name}_calibrated")
+    folder = workdir.with_name(f"{workdir.name}{CALIBRATED}")
     if folder.exists() and read_settings(folder).digest == read_settings(workdir).digest:
         return folder
     reporter.line(f"calibrating {workdir.name}")

@@ -7,6 +7,7 @@ import pytest
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import LossConfig, SegmentTraining, TablesConfig
+from gnio_jax.errors import InputError
 from gnio_jax.tables import experiments, make
 from tests.support.reports import BASE
 
@@ -75,6 +76,14 @@ def test_networks_on_windows_have_one_share_of_their_published_widths(width, wid
     assert tuple(experiments.method(name, base).model.width for name in networks) == widths
     for name in ("gru", "state_space", "ronin_lstm", "ronin_tcn", "imot"):
         assert experiments.method(name, base).model.width is None
+
+
+def test_the_search_for_a_width_ends_where_a_network_accepts_none(monkeypatch):
+    """The error of the network names what is wrong."""
+    monkeypatch.setattr(experiments, "accepts_width", lambda network, width: False)
+    assert experiments.scaled_width("ctin", BASE) == 6
+    with pytest.raises(InputError, match="width must be even"):
+        experiments.method("ctin", BASE)
 
 
 def test_only_networks_with_memory_learn_on_segments_with_as_many_seconds_in_a_batch():

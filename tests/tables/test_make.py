@@ -125,6 +125,28 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
     assert abs(np.log(run.filter.noise.std_factor)).max() > 0.01
 
 
+def test_rows_free_their_programs_and_the_note_names_what_is_not_calibrated(tmp_path, monkeypatch):
+    """Linux has no memory maps for the programs of ten networks."""
+    steps, shown = [], []
+
+    def run_row(row, options, *_):
+        steps.append(row.name)
+        failed = row.name == "tlio"
+        runs = [tmp_path / f"{row.name}_s0{'' if failed else '_calibrated'}"]
+        return make.RowResult(row, [], runs, [], None)
+
+    monkeypatch.setattr(make, "run_row", run_row)
+    monkeypatch.setattr(make, "announce", lambda *_: None)
+    monkeypatch.setattr(make, "make_table", lambda *parts: shown.append(parts[-1]) or "")
+    monkeypatch.setattr(make.jax, "clear_caches", lambda: steps.append("free"))
+    options = TablesConfig("comparison", seeds=1, methods="gnio,tlio", out=tmp_path, calibrate=True)
+    make.make(options)
+    assert steps == ["gnio", "free", "tlio", "free"]
+    assert shown[0].endswith("Not calibrated, because the filter could not be fitted: tlio_s0.")
+    make.make(dataclasses.replace(options, calibrate=False))
+    assert "Not calibrated" not in shown[1]
+
+
 def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys):
     root, arguments = made
     monkeypatch.setattr(loop, "train_all", lambda *_, **__: [loop.TrainingResult(root, None, 15)])

@@ -39,7 +39,7 @@ def test_the_table_has_every_figure_with_its_meaning(tmp_path, capsys):
     assert len(rows) == len(errors) + 1 and "Published errors" in capsys.readouterr().out
     cells = {row[1]: row[2:5] for row in rows if row[0] == "| RoNIN unseen"}
     assert cells["EqNIO, O(2) around RoNIN"] == ["4.42 m", "RMSE of a coordinate, 2-D", "6.25"]
-    assert cells["gnio"] == ["5.02 m", "not defined", "–"]
+    assert cells["gnio"] == ["5.02 m", "not known", "–"]
     keys = [(error.dataset, error.system) for error in errors]
     assert len(set(keys)) == len(keys)
 
