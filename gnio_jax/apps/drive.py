@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -38,6 +39,7 @@ from gnio_jax.evaluation import (
 from gnio_jax.filtering import Filter, find_mounting, make_filter
 from gnio_jax.filtering.mounting import Mounting
 from gnio_jax.filtering.nonholonomic import NonHolonomic, car_axes
+from gnio_jax.geometry import level
 from gnio_jax.numerics import rotation_z, yaw
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.types import GRAVITY, Readings, Sequence
@@ -225,9 +227,9 @@ def _start(
 ) -> PreparedRecording:
     """The start with the gyro's bias of the stops.
 
-    A car that does not stand has the tilt of its mounting on a level road, because the mean force
-    has the acceleration in it, and the speed of its first fixes, ahead. Without them the speed is
-    unknown.
+    A car that stands has the tilt that the mean force of its first second shows. One that does not
+    has the tilt of its mounting on a level road, because the mean force has the acceleration in it,
+    and the speed of its first fixes, ahead. Without them the speed is unknown.
     """
     start = ready.start
     notes = [note for note in ready.notes if not note.startswith("start: ")]
@@ -237,7 +239,9 @@ def _start(
     elif start.raw_gyro:
         std = std._replace(gyro_bias=sensors.RAW_BIAS)
     if stops.still[:1].any():
-        # The engine shakes the samples, of which the spread of a walker's start is made.
+        # An engine shakes the samples, so a walker's start would turn them by a gyro with its bias.
+        second = round(len(ready.accel) / (ready.time[-1] - ready.time[0]))
+        rotation = np.asarray(level(jnp.asarray(ready.accel[:second].mean(axis=0))))
         std = std._replace(velocity=STOP_SPEED, tilt=float(std.accel_bias) / GRAVITY)
     else:
         speed = None if fixes is None else first_speed(fixes, ready.time[0])

@@ -260,3 +260,60 @@ def test_the_command_takes_a_car_or_recognises_it(tmp_path, gnio, mistake):
     told = mistake("track", file, "--carrier", "car", "--network", "pedestrian")
     assert "leave it out with --carrier car" in told
     assert not (tmp_path / "b").exists()
+
+
+def angle_between(a, b):
+    return np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
+
+
+def test_the_start_of_a_standing_car_is_that_of_its_stop():
+    start = drive.estimate_drive(recording(), {}, CONFIG).ready.start
+    assert start.std.velocity == drive.STOP_SPEED and start.std.gyro_bias == drive.STOP_BIAS
+    assert start.std.tilt == pytest.approx(CONFIG.filter.start.accel_bias / 9.80665, rel=0.01)
+    np.testing.assert_allclose(start.gyro_bias, cars.BIAS, atol=2e-3)
+    up = Rotation.from_quat(cars.city_drive()[3][0], scalar_first=True).as_matrix()[2]
+    assert angle_between(start.rotation[2], up) < 0.5 and not start.velocity.any()
+
+
+@pytest.mark.parametrize("raw, std", [("no", 0.1), ("yes", CONFIG.filter.start.gyro_bias)])
+def test_the_start_of_a_moving_car_is_level_by_its_mounting(raw, std, monkeypatch):
+    """In a bend, where the mean force leans; the yaw of the world is that of the phone, and the
+    velocity is ahead."""
+    moving = first_seconds(recording(15.0, lambda stamp: stamp < 24), 24.0)
+    readings = {"gnss": moving.readings["gnss"]}
+    moving = moving._replace(attributes={"imu_compensated": raw}, gyro=moving.gyro - cars.BIAS)
+    starts = []
+
+    def fuse(first, ready, *others):
+        starts.append((ready, others))
+        raise InterruptedError
+
+    monkeypatch.setattr(drive.sensors, "fuse", fuse)
+    with pytest.raises(InterruptedError):
+        drive.estimate_drive(moving, readings, CONFIG)
+    ((ready, (*_, first_fixes)),) = starts
+    start = ready.start
+    assert first_fixes == drive.FIRST_FIXES
+    assert start.std.gyro_bias == std and start.std.tilt == drive.ROAD_STD
+    body = Rotation.from_quat(cars.city_drive(first=15.0)[3][0], scalar_first=True).as_matrix()
+    assert angle_between(start.rotation[2], body[2]) < 2 * np.degrees(drive.ROAD_STD)
+    assert abs(np.arctan2(start.rotation[1, 0], start.rotation[0, 0])) < 1e-6
+    car = body @ Rotation.from_euler("ZYX", (0.5, 0.1, -0.2)).as_matrix()
+    assert angle_between(start.rotation.T @ start.velocity, body.T @ car[:, 0]) < 3.0
+
+
+def test_a_hole_that_is_too_long_is_refused_before_anything_is_written(tmp_path):
+    whole = recording()
+    measured = np.ones(len(whole.time), dtype=bool)
+    measured[2000:2500] = False
+    with pytest.raises(InputError, match="gap of 5"):
+        tracked(whole._replace(imu_valid=measured), tmp_path)
+    assert not (tmp_path / "track").exists()
+
+
+def test_a_magnetometer_in_a_car_is_left_out_once():
+    whole = recording()
+    time = whole.time[::10]
+    field = Readings(time, np.tile([20.0, 0, -40], (len(time), 1)), np.full((len(time), 3), np.nan))
+    (use,) = drive.estimate_drive(whole, {"magnetometer": field}, CONFIG).uses
+    assert use.accepted is None and "its steel" in use.text
