@@ -282,6 +282,8 @@ class ModelConfig:
     """Channels of the first encoder group; the others follow (gnio, tlio, ronin_resnet, deepils:
     64). Features of a sample (ctin, state_space: 96), of the first convolution (gru: 64), of the
     first block (ronin_tcn: 16), or units of a layer (ronin_lstm: 100)."""
+    particles: Count | None = None
+    """Velocities that attend to the window (imot, imot_text: 128)."""
     bank_size: NonNegativeCount | None = None
     """Prototypes in the Motion Bank; 0 leaves the bank out (gnio: 64, networks with memory: 0)."""
     bank_std: Positive | None = None

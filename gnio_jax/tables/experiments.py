@@ -83,8 +83,8 @@ def method(network: str, base: TrainConfig) -> TrainConfig:
     learns on the segments of `base`, if there are any, in batches with as many seconds of walks.
     Losses differ, so every row's checkpoint is the one with the smallest squared error on the
     validation split."""
-    width = scaled_width(network, base)
-    model = ModelConfig(name=network, width=width, equivariance=base.model.equivariance)
+    equivariance = base.model.equivariance
+    model = ModelConfig(name=network, equivariance=equivariance, **scaled_size(network, base))
     regularisation = REGULARISATION.get(network, {})
     optim = dataclasses.replace(base.optim, best_by="squared_error", **regularisation)
     config = dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)
@@ -106,23 +106,26 @@ def method(network: str, base: TrainConfig) -> TrainConfig:
     return config
 
 
-def scaled_width(network: str, base: TrainConfig) -> int | None:
-    """The width of a network at the share of its published width that `base` has of GNIO's, or the
-    next one that the network can have; if there is none near it, the network says why. None, the
-    published one, for networks without a width, and for those with memory, which are small."""
-    default = models.create(network)
-    small = isinstance(default, NetworkWithMemory) or not hasattr(default, "width")
-    if small or base.model.width is None:
-        return None
-    width = max(round(base.model.width / GNIO.width * default.width), 1)
-    wider = range(width, width + default.width)
-    return next(filter(partial(accepts_width, network), wider), width)
+def scaled_size(network: str, base: TrainConfig) -> dict[str, int]:
+    """The option that makes a network wider or narrower, at the share of its published value that
+    `base` has of GNIO's width, or the next value that the network can have; if there is none near
+    it, the network says why. It is the width, and for iMoT, whose features are the samples of a
+    window, the number of particles. Empty, for the published size, for networks without such an
+    option, and for those with memory, which are small."""
+    published = models.create(network)
+    option = next((name for name in ("width", "particles") if hasattr(published, name)), None)
+    if isinstance(published, NetworkWithMemory) or option is None or base.model.width is None:
+        return {}
+    full = getattr(published, option)
+    size = max(round(base.model.width / GNIO.width * full), 1)
+    larger = range(size, size + full)
+    return {option: next(filter(partial(accepts, network, option), larger), size)}
 
 
-def accepts_width(network: str, width: int) -> bool:
-    """Whether a network can have this width: that of CTIN is a multiple of its heads."""
+def accepts(network: str, option: str, value: int) -> bool:
+    """Whether a network can have this option: the width of CTIN is a multiple of its heads."""
     try:
-        models.create(network, width=width)
+        models.create(network, **{option: value})
     except InputError:
         return False
     return True

@@ -29,6 +29,11 @@ from gnio_jax.types import Sequence
 
 GRID = {"C": [1.0, 10.0], "epsilon": [0.001, 0.01]}
 """Values among which three folds choose, for each machine; ε is in m."""
+MOST_WINDOWS = 5000
+"""Windows from which a machine learns (ours). The time of a fit grows with their square: 5,000
+windows of 50 samples take a minute for each axis, and all windows of a large data set take days."""
+CHUNK = 1024
+"""Windows whose kernels are in memory at once."""
 CLASS_C = 10.0
 """C of the machine that tells the placements apart."""
 
@@ -81,9 +86,9 @@ def require_library() -> None:
 
 def fit(data: LabelledWindows, held_out: LabelledWindows, config: TrainConfig) -> TrainedNetwork:
     """The network of these windows: a machine for each placement and axis, chosen by three folds,
-    and one that tells the placements apart. The constant uncertainty is that of the windows that
-    are held out. Raises `InputError` without scikit-learn, or for a placement with fewer than 9
-    windows."""
+    and one that tells the placements apart. Each learns from at most `MOST_WINDOWS` windows, drawn
+    by the seed. The constant uncertainty is that of the windows that are held out. Raises
+    `InputError` without scikit-learn, or for a placement with fewer than 9 windows."""
     require_library()
     from sklearn.model_selection import GridSearchCV  # pyright: ignore[reportMissingImports]
     from sklearn.svm import SVC, SVR  # pyright: ignore[reportMissingImports]
@@ -91,11 +96,12 @@ def fit(data: LabelledWindows, held_out: LabelledWindows, config: TrainConfig) -
     x = np.asarray(jax.jit(features)(jnp.asarray(data.windows, jnp.float32)), float)
     gamma, names = 1 / x.shape[1], sorted(set(data.placement))
     labels = np.array([names.index(name) for name in data.placement])
-    machines = []
-    for number, name in enumerate(names):
-        rows = labels == number
-        if rows.sum() < 9:
-            problem = f"placement '{name}' has {rows.sum()} windows, 9 are needed"
+    rows_of_names = [np.flatnonzero(labels == number) for number in range(len(names))]
+    generator, machines = np.random.default_rng(config.seed), []
+    for name, rows in zip(names, rows_of_names, strict=True):
+        rows = draw_rows(generator, rows, MOST_WINDOWS)
+        if len(rows) < 9:
+            problem = f"placement '{name}' has {len(rows)} windows, 9 are needed"
             raise InputError("the training split", problem, "leave its recordings out")
         for axis in (0, 1):
             search = GridSearchCV(SVR(kernel="rbf", gamma=gamma), GRID, cv=3)
@@ -110,7 +116,9 @@ def fit(data: LabelledWindows, held_out: LabelledWindows, config: TrainConfig) -
     params: dict[str, Any] = {"support": support, "weight": weight, "offset": offset}
     options = {"placements": len(names), "supports": most}
     if len(names) > 1:
-        classes = SVC(C=CLASS_C, kernel="rbf", gamma=gamma).fit(x, labels)
+        share = MOST_WINDOWS // len(names)  # a rare placement keeps its windows
+        rows = np.sort(np.concatenate([draw_rows(generator, r, share) for r in rows_of_names]))
+        classes = SVC(C=CLASS_C, kernel="rbf", gamma=gamma).fit(x[rows], labels[rows])
         params["class_support"] = classes.support_vectors_
         params["class_weight"], params["class_offset"] = pair_weights(classes, len(names))
         options["class_supports"] = len(classes.support_vectors_)
@@ -120,13 +128,21 @@ def fit(data: LabelledWindows, held_out: LabelledWindows, config: TrainConfig) -
     variables = {"params": params, "batch_stats": zeros}
     variables = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), variables)
     windows = jnp.asarray(held_out.windows, jnp.float32)
-    predicted: Any = jax.jit(network.apply)(variables, windows)
-    error = held_out.displacement - np.asarray(predicted.displacement)[:, :2]
+    predict = jax.jit(lambda rows: network.apply(variables, rows).displacement)  # pyright: ignore[reportAttributeAccessIssue]
+    chunks = [predict(windows[k : k + CHUNK]) for k in range(0, len(windows), CHUNK)]
+    error = held_out.displacement - np.concatenate(chunks)[:, :2]
     mse = [*np.mean(error**2, axis=0), 1.0]
     log_std = jnp.asarray(0.5 * np.log(np.maximum(mse, 1e-8)), jnp.float32)
     variables = {**variables, "batch_stats": {"uncertainty": {"log_std": log_std}}}
     config = dataclasses.replace(config, model=model)
     return TrainedNetwork(config, network, variables, epoch=0, step=0)
+
+
+def draw_rows(generator: np.random.Generator, rows: np.ndarray, most: int) -> np.ndarray:
+    """These rows, or `most` of them, in their order."""
+    if len(rows) <= most:
+        return rows
+    return np.sort(generator.choice(rows, most, replace=False))
 
 
 def pair_weights(machine: Any, count: int) -> tuple[np.ndarray, np.ndarray]:

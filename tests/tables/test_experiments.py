@@ -69,19 +69,22 @@ def test_losses_and_regularisation_are_those_of_the_published_recipes(network):
     "width, widths", [(16, (16, 24, 24, 8)), (4, (4, 8, 6, 2)), (None, (None, None, None, None))]
 )
 def test_networks_on_windows_have_one_share_of_their_published_widths(width, widths):
-    """Those with memory are small as published, and iMoT has no width. CTIN's is a multiple of its
-    8 heads."""
+    """Those with memory are small as published. CTIN's width is a multiple of its 8 heads, and
+    iMoT, whose features are the samples of a window, has the share of the 128 particles."""
     base = dataclasses.replace(BASE, model=dataclasses.replace(BASE.model, width=width))
     networks = ("tlio", "ctin", "ionet", "experts")
     assert tuple(experiments.method(name, base).model.width for name in networks) == widths
-    for name in ("gru", "state_space", "ronin_lstm", "ronin_tcn", "imot"):
+    for name in ("gru", "state_space", "ronin_lstm", "ronin_tcn", "imot", "ridi"):
         assert experiments.method(name, base).model.width is None
+    for name in ("imot", "imot_text"):
+        particles = None if width is None else 2 * width
+        assert experiments.method(name, base).model.particles == particles
 
 
 def test_the_search_for_a_width_ends_where_a_network_accepts_none(monkeypatch):
     """The error of the network names what is wrong."""
-    monkeypatch.setattr(experiments, "accepts_width", lambda network, width: False)
-    assert experiments.scaled_width("ctin", BASE) == 6
+    monkeypatch.setattr(experiments, "accepts", lambda network, option, value: False)
+    assert experiments.scaled_size("ctin", BASE) == {"width": 6}
     with pytest.raises(InputError, match="width must be even"):
         experiments.method("ctin", BASE)
 

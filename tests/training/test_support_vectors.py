@@ -68,6 +68,29 @@ def test_predictions_are_those_of_scikit_learn(count):
     assert rms.max() < 0.3 * held_out.displacement.std()  # it has learnt
 
 
+def test_a_machine_learns_from_a_share_of_many_windows_drawn_by_the_seed(monkeypatch):
+    """A rare placement keeps all of its windows among those that tell the placements apart."""
+    pytest.importorskip("sklearn.svm")
+    monkeypatch.setattr(support_vectors, "MOST_WINDOWS", 60)
+    monkeypatch.setattr(support_vectors, "CHUNK", 7)
+    data, mixed = windows_of(300, ("hand", "leg")), windows_of(60)
+    bags = np.flatnonzero(np.array(mixed.placement) == "bag")[:12]
+    rare = LabelledWindows(mixed.windows[bags], mixed.displacement[bags], ["bag"] * len(bags))
+    data = LabelledWindows(
+        np.concatenate([data.windows, rare.windows]),
+        np.concatenate([data.displacement, rare.displacement]),
+        data.placement + rare.placement,
+    )
+    configs = [dataclasses.replace(CONFIG, seed=seed) for seed in (0, 0, 1)]
+    first, again, other = (support_vectors.fit(data, rare, config) for config in configs)
+    assert first.model.supports <= 60 and first.model.class_supports <= 60
+    weights = [np.asarray(n.variables["params"]["weight"]) for n in (first, again, other)]
+    np.testing.assert_array_equal(weights[0], weights[1])
+    assert weights[0].shape != weights[2].shape or np.any(weights[0] != weights[2])
+    found = first.model.apply(first.variables, jnp.asarray(rare.windows))
+    assert np.argmax(found.diagnostics["placement"], axis=1).tolist() == [0] * len(bags)
+
+
 def score(machine, x, y):
     """Mean R² of three folds in their order, by which a regressor is chosen."""
     scores = []
