@@ -34,9 +34,11 @@ class ZeroVelocity(NamedTuple):
         interval shows. In all other cases the filter's velocity may be wrong, and rest can correct
         it: after the start, after a series of rejections, and where there are no displacements.
         Without displacements no gate would open again, and a rest that was refused once would
-        always be refused. The gate's memory depends on the displacements alone, because a false
-        rest must neither open nor close their gate. `mahalanobis_fail_scale` and `gate_softness`
-        are not for rest.
+        always be refused. So there the test is made only in the first `rest_test_seconds` of a
+        rest (ours), against the moments in which a smooth road is quiet.
+
+        The gate's memory depends on the displacements alone, because a false rest must neither open
+        nor close their gate. `mahalanobis_fail_scale` and `gate_softness` are not for rest.
         """
         config = step.config
         state, quiet = detect_rest(state, step.imu, config)
@@ -48,6 +50,9 @@ class ZeroVelocity(NamedTuple):
         linear = linearise(state, residual, self.std**2 * eye, **jacobian)
         active, _ = gate_activity(state.gate, config, state.step * config.samples_per_clone)
         tested = active & step.before["displacement"].tested
+        if config.rest_test_seconds > 0:
+            until = config.rest_seconds + config.rest_test_seconds
+            tested = tested | (state.imu.quiet < intervals_of(until, config))
         return measure(state, linear, step, jnp.where(tested, config.gate_threshold, jnp.inf))
 
 
@@ -63,8 +68,13 @@ def detect_rest(
     if imu.gap is not None:
         quiet = quiet & jnp.all(imu.gap.gyro_variance == 0)
     count = jnp.where(quiet, state.imu.quiet + 1, 0).astype(state.imu.quiet.dtype)
-    enough = int(np.ceil(config.rest_seconds / config.clone_seconds - 1e-6))
-    return state._replace(imu=state.imu._replace(quiet=count)), count >= max(enough, 1)
+    enough = intervals_of(config.rest_seconds, config)
+    return state._replace(imu=state.imu._replace(quiet=count)), count >= enough
+
+
+def intervals_of(seconds: float, config: FilterConfig) -> int:
+    """The smallest number of clone intervals, at least one, that last for a time."""
+    return max(int(np.ceil(seconds / config.clone_seconds - 1e-6)), 1)
 
 
 def unbiased_output(

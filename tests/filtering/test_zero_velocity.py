@@ -109,6 +109,30 @@ def resting(now, converged=True, last_success=100, pause_end=0, tried=True, spee
     return state, new, found
 
 
+@pytest.mark.parametrize(
+    "test_seconds, refused", [(0.0, 0), (0.05, 1), (0.1, 1), (0.3, 3), (0.35, 4)]
+)
+def test_a_young_rest_at_a_speed_that_the_filter_knows_is_refused(test_seconds, refused):
+    """Intervals of 0.1 s, rest from the third quiet one on, at 11 m/s and without displacements: a
+    smooth road. As slow as the filter's uncertainty, every rest is taken."""
+    config = dataclasses.replace(CONFIG, rest_test_seconds=test_seconds)
+    no, nothing = jnp.bool_(False), jnp.zeros(())
+    absent = filtering.Outcome(no, no, jnp.zeros(3), nothing, nothing, nothing, no)
+    step = filtering.Step(STILL, 0, 1, config, filtering.NoiseModel(), {"displacement": absent})
+    ekf = filtering.Filter(config, start=filtering.InitialStd(velocity=0.1))
+    update = jax.jit(lambda state: ZeroVelocity(0.05).update(state, step)[:2])
+    for speed, count in ((11.0, refused), (0.1, 0)):
+        state = filtering.initial_state(ekf, np.eye(3), np.array([speed, 0, 0]), np.zeros(3))
+        accepted, present = [], []
+        for _ in range(8):
+            state, outcome = update(state)
+            accepted.append(bool(outcome.accepted))
+            present.append(bool(outcome.present))
+        assert present == [False] * 2 + [True] * 6
+        assert accepted == [False] * (2 + count) + [True] * (6 - count)
+        np.testing.assert_allclose(state.velocity, 0, atol=0.2 * speed)
+
+
 EDGE = np.sqrt(CONFIG.gate_threshold * (0.1**2 + 0.05**2))
 """Speed at which the χ² test is just passed, m/s."""
 
