@@ -129,7 +129,7 @@ def estimate_drive(
     """
     check_bridged(sequence)
     ekf, rate = make_filter(config.data, config.filter), config.data.rate
-    sequence = resample(sequence, rate)  # a tenth of a second is a whole number of samples
+    sequence = resample(sequence, rate)
     stops = find_stops(sequence, rate, ekf)
     notes = [f"car: it stands for {stops.still.sum()} s, which give the gyro's bias"]
     if not stops.still.any():
@@ -178,19 +178,22 @@ def find_stops(sequence: Sequence, rate: float, ekf: Filter) -> Stops:
     """The seconds in which the means of gyro and accelerometer over `MEAN_SECONDS` differ from the
     second's mean by less than the filter's bounds of rest, and the mean rate from the median of
     these seconds."""
-    config, size = ekf.config, max(round(MEAN_SECONDS * rate), 1)
-    parts = round(1.0 / MEAN_SECONDS)
-    seconds = len(sequence.time) // (size * parts)
-    rows = slice(0, seconds * size * parts)
-    means = (
-        signal[rows].reshape(seconds, parts, size, 3).mean(axis=2)
+    config, parts = ekf.config, round(1.0 / min(max(MEAN_SECONDS, 1.0 / rate), 1.0))
+    seconds = int(len(sequence.time) / rate + 1e-6)
+    edges = np.round(np.arange(seconds * parts + 1) * rate / parts).astype(int)
+    if seconds == 0:
+        return Stops(np.zeros(0, dtype=bool), np.zeros(3))
+    gyro, accel = (
+        (np.add.reduceat(signal[: edges[-1]], edges[:-1]) / np.diff(edges)[:, None]).reshape(
+            seconds, parts, 3
+        )
         for signal in (sequence.gyro, sequence.accel)
     )
-    gyro, accel = means
     still = np.linalg.norm(gyro - gyro.mean(1, keepdims=True), axis=2).max(1) < config.rest_gyro
     still &= np.linalg.norm(accel - accel.mean(1, keepdims=True), axis=2).max(1) < config.rest_accel
     if sequence.imu_valid is not None:  # samples on a line across a hole look like rest
-        still &= sequence.imu_valid[rows].reshape(seconds, -1).all(axis=1)
+        measured = sequence.imu_valid[: edges[-1]]
+        still &= np.logical_and.reduceat(measured, edges[:-1:parts])
     if not still.any():
         return Stops(still, np.zeros(3))
     bias = np.median(gyro[still].mean(1), axis=0)

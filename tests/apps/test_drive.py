@@ -100,6 +100,26 @@ def test_stops_are_seen_at_rates_that_are_no_multiple_of_ten(tmp_path):
     assert result.summary.warnings == ()
 
 
+@pytest.mark.parametrize("rate", [52.0, 33.3, 8.0])
+def test_seconds_of_stops_are_those_of_the_clock_at_any_rate(rate):
+    """Also where a tenth of a second is no whole number of samples, or less than one."""
+    sequence = recording()
+    unshaken = dict(zip(("gyro", "accel"), averaged(sequence), strict=True))
+    ekf = make_filter(CONFIG.data, CONFIG.filter)
+    slow = resample(sequence._replace(**unshaken), rate)
+    stops = drive.find_stops(slow, rate, ekf)
+    assert len(stops.still) == int(len(slow.time) / rate)
+    standing = np.flatnonzero(stops.still)
+    inside = {*range(1, 7), *range(41, 45)}
+    assert inside <= set(standing) <= inside | {0, 7, 40, 45}
+    np.testing.assert_allclose(stops.gyro_bias, cars.BIAS, atol=2e-3)
+    measured = np.arange(len(slow.time)) != round(3.5 * rate)
+    without = drive.find_stops(slow._replace(imu_valid=measured), rate, ekf)
+    assert set(standing) - set(np.flatnonzero(without.still)) == {3}
+    short = slow._replace(**{part: getattr(slow, part)[:5] for part in ("time", "gyro", "accel")})
+    assert not drive.find_stops(short, rate, ekf).still.any()
+
+
 def averaged(sequence):
     """Gyro and accelerometer without the shaking of the engine, whose period is four samples."""
     mean = np.full(4, 0.25)
