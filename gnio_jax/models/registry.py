@@ -166,6 +166,11 @@ def trained_by(model: nn.Module) -> str:
     return getattr(innermost(model), "trained_by", "gradient")
 
 
+def fitted_options(model: nn.Module) -> tuple[str, ...]:
+    """The options that a network's training sets, by its attribute `fitted_options`."""
+    return getattr(innermost(model), "fitted_options", ())
+
+
 def create(name: str, **values: Any) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a
     `Prediction`.

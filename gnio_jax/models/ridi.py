@@ -37,6 +37,7 @@ class RIDI(nn.Module):
     class_supports: Count = 1
     output_dim = 2
     trained_by = "support_vectors"
+    fitted_options = ("placements", "supports", "class_supports")
 
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 6"], train: bool = False) -> Prediction:

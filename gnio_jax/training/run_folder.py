@@ -20,7 +20,7 @@ from tensorboardX.proto import event_pb2
 from tensorboardX.summary import scalar
 
 from gnio_jax import config as configuration
-from gnio_jax import parallel
+from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
@@ -60,8 +60,10 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
         raise InputError(workdir, problem, "start it without --resume")
     configs = map(configuration.without_paths, (config, configuration.load(file)))
     ours, theirs = map(configuration.flatten, configs)
+    network = models.from_config(config.model)
+    fitted = {f"model.options.{option}" for option in models.fitted_options(network)}
     for name in ours | theirs:
-        if ours.get(name) != theirs.get(name):
+        if ours.get(name) != theirs.get(name) and not (name in fitted and ours.get(name) is None):
             problem = f"'{name}' was {theirs.get(name)} and is now {ours.get(name)}"
             raise InputError(file, problem, "resume with the same settings")
     return workdir
