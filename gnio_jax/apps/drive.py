@@ -178,7 +178,8 @@ def find_stops(sequence: Sequence, rate: float, ekf: Filter) -> Stops:
     """The seconds in which the means of gyro and accelerometer over `MEAN_SECONDS` differ from the
     second's mean by less than the filter's bounds of rest, and the mean rate from the median of
     these seconds."""
-    config, parts = ekf.config, round(1.0 / min(max(MEAN_SECONDS, 1.0 / rate), 1.0))
+    config = ekf.config
+    parts = max(int(min(1.0 / MEAN_SECONDS, rate) + 1e-6), 1)  # each has at least one sample
     seconds = int(len(sequence.time) / rate + 1e-6)
     edges = np.round(np.arange(seconds * parts + 1) * rate / parts).astype(int)
     if seconds == 0:

@@ -526,9 +526,9 @@ class FilterOptions:
     rest_seconds: NonNegative = 0.5
     """How long the IMU must be quiet before it counts as at rest, s."""
     rest_test_seconds: NonNegative = 0.0
-    """For this long, s, a rest must pass the χ² test with `gate_threshold` also without a
-    displacement: a car on a smooth road is quiet for moments. A longer rest is taken in any case,
-    because the filter's velocity may be wrong."""
+    """For this long after `rest_seconds`, s, a rest without a displacement must pass the χ² test
+    with `gate_threshold`: a car on a smooth road is quiet for moments. A longer rest is taken in
+    any case, because the filter's velocity may be wrong. 0: there is no such test."""
     bridge_seconds: NonNegative = 0.1
     """For this long, s, the last IMU sample stands in for missing ones; then the filter coasts with
     constant attitude and velocity, and windows are no measurements."""

@@ -34,8 +34,9 @@ class ZeroVelocity(NamedTuple):
         interval shows. In all other cases the filter's velocity may be wrong, and rest can correct
         it: after the start, after a series of rejections, and where there are no displacements.
         Without displacements no gate would open again, and a rest that was refused once would
-        always be refused. So there the test is made only in the first `rest_test_seconds` of a
-        rest (ours), against the moments in which a smooth road is quiet.
+        always be refused. So there the test is made only in the first `rest_test_seconds` after a
+        rest counts (ours), against the moments in which a smooth road is quiet. A true stop that is
+        shorter than this corrects no velocity of which the filter is wrongly sure.
 
         The gate's memory depends on the displacements alone, because a false rest must neither open
         nor close their gate. `mahalanobis_fail_scale` and `gate_softness` are not for rest.
@@ -49,10 +50,12 @@ class ZeroVelocity(NamedTuple):
         jacobian = {"velocity": to_body, "rotation": to_body @ geometry.hat(state.velocity)}
         linear = linearise(state, residual, self.std**2 * eye, **jacobian)
         active, _ = gate_activity(state.gate, config, state.step * config.samples_per_clone)
-        tested = active & step.before["displacement"].tested
+        displacement = step.before["displacement"]
+        tested = active & displacement.tested
         if config.rest_test_seconds > 0:
-            until = config.rest_seconds + config.rest_test_seconds
-            tested = tested | (state.imu.quiet < intervals_of(until, config))
+            times = config.rest_seconds, config.rest_test_seconds
+            young = state.imu.quiet < sum(intervals_of(seconds, config) for seconds in times)
+            tested = tested | (young & ~displacement.present)
         return measure(state, linear, step, jnp.where(tested, config.gate_threshold, jnp.inf))
 
 

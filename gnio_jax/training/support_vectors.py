@@ -128,8 +128,9 @@ def fit(data: LabelledWindows, held_out: LabelledWindows, config: TrainConfig) -
     variables = {"params": params, "batch_stats": zeros}
     variables = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), variables)
     windows = jnp.asarray(held_out.windows, jnp.float32)
-    predict = jax.jit(lambda rows: network.apply(variables, rows).displacement)  # pyright: ignore[reportAttributeAccessIssue]
-    chunks = [predict(windows[k : k + CHUNK]) for k in range(0, len(windows), CHUNK)]
+    predict: Any = jax.jit(network.apply)
+    parts = [windows[k : k + CHUNK] for k in range(0, len(windows), CHUNK)]
+    chunks = [predict(variables, part).displacement for part in parts]
     error = held_out.displacement - np.concatenate(chunks)[:, :2]
     mse = [*np.mean(error**2, axis=0), 1.0]
     log_std = jnp.asarray(0.5 * np.log(np.maximum(mse, 1e-8)), jnp.float32)

@@ -100,7 +100,7 @@ def test_stops_are_seen_at_rates_that_are_no_multiple_of_ten(tmp_path):
     assert result.summary.warnings == ()
 
 
-@pytest.mark.parametrize("rate", [52.0, 33.3, 8.0])
+@pytest.mark.parametrize("rate", [52.0, 33.3, 9.5, 8.0])
 def test_seconds_of_stops_are_those_of_the_clock_at_any_rate(rate):
     """Also where a tenth of a second is no whole number of samples, or less than one."""
     sequence = recording()

@@ -110,26 +110,36 @@ def resting(now, converged=True, last_success=100, pause_end=0, tried=True, spee
 
 
 @pytest.mark.parametrize(
-    "test_seconds, refused", [(0.0, 0), (0.05, 1), (0.1, 1), (0.3, 3), (0.35, 4)]
+    "seconds, test_seconds, refused",
+    [
+        *((0.3, 0.0, 0), (0.3, 0.05, 1), (0.3, 0.1, 1), (0.3, 0.3, 3), (0.3, 0.35, 4)),
+        *((0.0, 0.1, 1), (0.0, 0.3, 3), (0.05, 0.05, 1), (0.25, 0.05, 1)),
+    ],
 )
-def test_a_young_rest_at_a_speed_that_the_filter_knows_is_refused(test_seconds, refused):
-    """Intervals of 0.1 s, rest from the third quiet one on, at 11 m/s and without displacements: a
-    smooth road. As slow as the filter's uncertainty, every rest is taken."""
-    config = dataclasses.replace(CONFIG, rest_test_seconds=test_seconds)
+def test_a_young_rest_at_a_speed_that_the_filter_knows_is_refused(seconds, test_seconds, refused):
+    """Intervals of 0.1 s, at 11 m/s and without displacements: a smooth road. A rest that counts
+    within an interval is tested as long as one that counts later. As slow as the filter's
+    uncertainty, every rest is taken, and so is one beside a displacement while the gate is open."""
+    config = dataclasses.replace(CONFIG, rest_seconds=seconds, rest_test_seconds=test_seconds)
+    waiting = {0.0: 0, 0.05: 0, 0.25: 2, 0.3: 2}[seconds]
     no, nothing = jnp.bool_(False), jnp.zeros(())
-    absent = filtering.Outcome(no, no, jnp.zeros(3), nothing, nothing, nothing, no)
-    step = filtering.Step(STILL, 0, 1, config, filtering.NoiseModel(), {"displacement": absent})
     ekf = filtering.Filter(config, start=filtering.InitialStd(velocity=0.1))
-    update = jax.jit(lambda state: ZeroVelocity(0.05).update(state, step)[:2])
-    for speed, count in ((11.0, refused), (0.1, 0)):
+
+    @jax.jit
+    def update(state, there):
+        found = filtering.Outcome(there, there, jnp.zeros(3), nothing, nothing, nothing, no)
+        step = filtering.Step(STILL, 0, 1, config, filtering.NoiseModel(), {"displacement": found})
+        return ZeroVelocity(0.05).update(state, step)[:2]
+
+    for speed, there, count in ((11.0, False, refused), (0.1, False, 0), (11.0, True, 0)):
         state = filtering.initial_state(ekf, np.eye(3), np.array([speed, 0, 0]), np.zeros(3))
         accepted, present = [], []
         for _ in range(8):
-            state, outcome = update(state)
+            state, outcome = update(state, np.bool_(there))
             accepted.append(bool(outcome.accepted))
             present.append(bool(outcome.present))
-        assert present == [False] * 2 + [True] * 6
-        assert accepted == [False] * (2 + count) + [True] * (6 - count)
+        assert present == [False] * waiting + [True] * (8 - waiting)
+        assert accepted == [False] * (waiting + count) + [True] * (8 - waiting - count)
         np.testing.assert_allclose(state.velocity, 0, atol=0.2 * speed)
 
 
