@@ -1,6 +1,7 @@
 """The velocity at rest as a measurement."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +21,11 @@ NOISE = filtering.NoiseModel(measurement_scale=2.0)
 STILL = Imu(jnp.zeros((N, 3)), jnp.tile(jnp.array([[0.0, 0.0, 9.81]]), (N, 1)), None)
 
 
-@jax.jit
-def at_rest(state, tried):
+@functools.partial(jax.jit, static_argnums=2)
+def at_rest(state, tried, test_seconds):
     """The state after an interval at rest, and what became of that measurement."""
-    config = dataclasses.replace(CONFIG, rest_seconds=0.0, convergence_seconds=10.0)
+    settings = dict(rest_seconds=0.0, rest_test_seconds=test_seconds, convergence_seconds=10.0)
+    config = dataclasses.replace(CONFIG, **settings)
     scalar, no = jnp.zeros(()), jnp.bool_(False)
     displacement = filtering.Outcome(tried, tried, jnp.zeros(3), scalar, scalar, scalar, no)
     step = filtering.Step(
@@ -96,7 +98,9 @@ def test_rest_is_seen_without_the_biases():
         assert bool(detect_rest(state, imu, config)[1]) == quiet
 
 
-def resting(now, converged=True, last_success=100, pause_end=0, tried=True, speed=1.0):
+def resting(
+    now, converged=True, last_success=100, pause_end=0, tried=True, speed=1.0, test_seconds=0.0
+):
     """The state before and after the IMU is quiet at sample `now`, with a velocity of `speed` known
     to 0.1 m/s per axis, and what the filter made of it. `tried`: there was a displacement, too."""
     std, velocity = filtering.InitialStd(velocity=0.1), speed * np.array([0.6, 0.0, -0.8])
@@ -105,7 +109,7 @@ def resting(now, converged=True, last_success=100, pause_end=0, tried=True, spee
     )
     gate = filtering.GateState(jnp.bool_(converged), jnp.int32(last_success), jnp.int32(pause_end))
     state = state._replace(gate=gate, step=jnp.int32(now // N))
-    new, found = at_rest(state, np.bool_(tried))
+    new, found = at_rest(state, np.bool_(tried), test_seconds)
     return state, new, found
 
 
@@ -160,6 +164,9 @@ EDGE = np.sqrt(CONFIG.gate_threshold * (0.1**2 + 0.05**2))
         (dict(now=115, pause_end=115), 3.0, False),
         (dict(now=110, tried=False), 3.0, True),
         (dict(now=110, tried=False), 0.999 * EDGE, True),
+        (dict(now=110, tried=False, test_seconds=1.0), 1.001 * EDGE, False),
+        (dict(now=110, converged=False, test_seconds=1.0), 3.0, True),
+        (dict(now=110, test_seconds=1.0), 1.001 * EDGE, False),
     ],
 )
 def test_rest_passes_a_chi_square_test_where_the_gate_is_active(gate, speed, accepted):

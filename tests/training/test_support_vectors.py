@@ -70,10 +70,17 @@ def test_predictions_are_those_of_scikit_learn(count):
 
 def test_a_machine_learns_from_a_share_of_many_windows_drawn_by_the_seed(monkeypatch):
     """A rare placement keeps all of its windows among those that tell the placements apart."""
-    pytest.importorskip("sklearn.svm")
+    svm, counts = pytest.importorskip("sklearn.svm"), []
+    fit_classes = svm.SVC.fit
+
+    def counted(machine, x, labels):
+        counts.append(np.bincount(labels).tolist())
+        return fit_classes(machine, x, labels)
+
+    monkeypatch.setattr(svm.SVC, "fit", counted)
     monkeypatch.setattr(support_vectors, "MOST_WINDOWS", 60)
     monkeypatch.setattr(support_vectors, "CHUNK", 7)
-    data, mixed = windows_of(300, ("hand", "leg")), windows_of(60)
+    data, mixed = windows_of(300, ("hand", "leg")), windows_of(120)
     bags = np.flatnonzero(np.array(mixed.placement) == "bag")[:12]
     rare = LabelledWindows(mixed.windows[bags], mixed.displacement[bags], ["bag"] * len(bags))
     data = LabelledWindows(
@@ -83,12 +90,21 @@ def test_a_machine_learns_from_a_share_of_many_windows_drawn_by_the_seed(monkeyp
     )
     configs = [dataclasses.replace(CONFIG, seed=seed) for seed in (0, 0, 1)]
     first, again, other = (support_vectors.fit(data, rare, config) for config in configs)
-    assert first.model.supports <= 60 and first.model.class_supports <= 60
+    assert first.model.supports <= 60 and counts == 3 * [[12, 20, 20]]  # bag, hand, leg
     weights = [np.asarray(n.variables["params"]["weight"]) for n in (first, again, other)]
     np.testing.assert_array_equal(weights[0], weights[1])
     assert weights[0].shape != weights[2].shape or np.any(weights[0] != weights[2])
     found = first.model.apply(first.variables, jnp.asarray(rare.windows))
     assert np.argmax(found.diagnostics["placement"], axis=1).tolist() == [0] * len(bags)
+
+
+def test_rows_are_drawn_once_each_and_keep_their_order():
+    rows = np.arange(5, 105)
+    drawn = support_vectors.draw_rows(np.random.default_rng(0), rows, 60)
+    assert len(drawn) == 60 and (np.diff(drawn) > 0).all() and set(drawn) <= set(rows)
+    for most in (100, 101):
+        whole = support_vectors.draw_rows(np.random.default_rng(0), rows, most)
+        np.testing.assert_array_equal(whole, rows)
 
 
 def score(machine, x, y):
