@@ -182,14 +182,11 @@ def find_stops(sequence: Sequence, rate: float, ekf: Filter) -> Stops:
     parts = max(int(min(1.0 / MEAN_SECONDS, rate) + 1e-6), 1)  # each has at least one sample
     seconds = int(len(sequence.time) / rate + 1e-6)
     edges = np.round(np.arange(seconds * parts + 1) * rate / parts).astype(int)
-    if seconds == 0:
-        return Stops(np.zeros(0, dtype=bool), np.zeros(3))
-    gyro, accel = (
-        (np.add.reduceat(signal[: edges[-1]], edges[:-1]) / np.diff(edges)[:, None]).reshape(
-            seconds, parts, 3
-        )
+    sums = (
+        np.add.reduceat(signal[: edges[-1]], edges[:-1])
         for signal in (sequence.gyro, sequence.accel)
     )
+    gyro, accel = ((part / np.diff(edges)[:, None]).reshape(seconds, parts, 3) for part in sums)
     still = np.linalg.norm(gyro - gyro.mean(1, keepdims=True), axis=2).max(1) < config.rest_gyro
     still &= np.linalg.norm(accel - accel.mean(1, keepdims=True), axis=2).max(1) < config.rest_accel
     if sequence.imu_valid is not None:  # samples on a line across a hole look like rest

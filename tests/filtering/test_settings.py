@@ -100,7 +100,7 @@ def test_every_setting_of_the_filter_is_reachable_from_a_file_or_fixed_by_name()
     fields = {field.name for field in dataclasses.fields(filtering.FilterConfig)}
     assert fields == (options & fields) | FIXED.keys() and not options & FIXED.keys()
     others = {
-        **{name: 0.5 for name in ("success_seconds", "pause_seconds", "rest_seconds")},
+        **{name: 0.4 for name in ("success_seconds", "pause_seconds", "rest_seconds")},
         **{"rest_test_seconds": 2.0},
         **{name: 0.25 for name in ("rest_gyro", "rest_accel", "bridge_seconds")},
         **{name: 0.75 for name in ("gap_gyro_std", "gap_accel_std", "low_pass_seconds")},

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
+from gnio_jax import config as configuration
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import ridi
-from gnio_jax.training import support_vectors
+from gnio_jax.training import run_folder, support_vectors
 from gnio_jax.training.support_vectors import LabelledWindows
 
 RNG = np.random.default_rng(10)
@@ -105,6 +106,28 @@ def test_rows_are_drawn_once_each_and_keep_their_order():
     for most in (100, 101):
         whole = support_vectors.draw_rows(np.random.default_rng(0), rows, most)
         np.testing.assert_array_equal(whole, rows)
+
+
+@pytest.mark.parametrize(
+    "wanted, fitted, refused",
+    [
+        ({}, {"placements": 9, "supports": 40}, False),
+        ({"placements": 2}, {"placements": 9}, True),
+        ({}, {"output_dim": 9}, True),
+    ],
+)
+def test_options_that_the_training_sets_are_no_other_settings(wanted, fitted, refused, tmp_path):
+    """Unless the configuration gives them another value."""
+    run = dataclasses.replace(CONFIG, model=ModelConfig("ridi", options=fitted))
+    configuration.save(tmp_path / "config.yaml", run)
+    config = dataclasses.replace(
+        CONFIG, model=ModelConfig("ridi", options=wanted), workdir=str(tmp_path)
+    )
+    if not refused:
+        assert run_folder.refuse_other_run(config, resume=True) == tmp_path
+        return
+    with pytest.raises(InputError, match="resume with the same settings"):
+        run_folder.refuse_other_run(config, resume=True)
 
 
 def score(machine, x, y):
