@@ -1,32 +1,28 @@
 """The error of a vehicle's filter on KITTI's held-out drives, with constants chosen without them.
 
-    python -m benchmarks.vehicle_constants --data-root DIR [--seeds 0 1 2] [--folds 3]
-        [--only 0 1 2] [--trials 156] [--low-pass 0 0.03 0.06 0.09]
+    python -m benchmarks.vehicle_constants --data-root DIR [--folds 3] [--only 0 1 2]
+        [--low-pass 0.03 0.06 0.09]
 
-The drives of a fold are held out whole. Everything is chosen within the other drives (nested
-cross-validation), and the held-out drives are measured once:
+The drives of a fold are held out whole; without `--folds` each drive is a fold of its own. All is
+chosen by the other drives, and the held-out drives are measured once:
 
-- The time constant of the IMU's low-pass (`filter.low_pass_seconds`) is the one of `--low-pass`
-  with which the package's default constants have the smallest objective.
-- The penalty on the distance from the defaults is one of three. The training drives are divided
-  into two halves. Each half is searched, and the other one is measured.
-- A search has 14 constants (`UNITS`) and starts at the defaults. It is an evolution strategy of
-  `--trials` trials. Its objective is the mean of two errors, `t_rel` of all pieces and its mean
-  over drives, plus the penalty times the squared distance in `UNITS`.
+- The filter has 14 constants (`UNITS`). The fit starts at the package's defaults and is damped
+  Gauss-Newton steps (SciPy) with the derivatives through the whole filter (JAX). What it minimises
+  is the mean of two errors, `t_rel` of all pieces and its mean over drives, plus a penalty times
+  the squared distance from the defaults in `UNITS`.
+- The penalty and the time constant of the IMU's low-pass (`filter.low_pass_seconds`) are those with
+  the smallest error of approximate leave-one-out: the constants without one training drive are one
+  Gauss-Newton step from the fit, and this drive is measured with them.
 
-The filter starts at the reference's pose and velocity, and gets no displacement and no rest. Only
-the seed of the search differs between the seeds, so the low-pass is chosen once for each fold.
-`--low-pass 0` is the same protocol with the low-pass left in. `--only` runs some folds. The
-brackets are 95 % intervals of a bootstrap over drives (10,000 draws).
-
-SciPy has no CMA-ES. Its methods without derivatives are for few constants or for many more trials,
-so the strategy is written out below and needs no other package.
+Nothing is drawn, so there are no seeds. The filter starts at the reference's pose and velocity, and
+gets no displacement and no rest. `--low-pass 0` is the same protocol with the low-pass left in.
+`--only` runs some folds. The brackets are 95 % intervals of a bootstrap over drives (10,000 draws).
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -36,17 +32,17 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from scipy.optimize import least_squares  # noqa: E402
 
 from gnio_jax import data  # noqa: E402
 from gnio_jax.config import DataConfig, FilterSettings  # noqa: E402
-from gnio_jax.evaluation.metrics import piece_errors, pieces  # noqa: E402
+from gnio_jax.evaluation.metrics import pieces  # noqa: E402
 from gnio_jax.evaluation.prepare import PreparedRecording, prepare  # noqa: E402
-from gnio_jax.evaluation.trajectory import Trajectory  # noqa: E402
 from gnio_jax.filtering import initial_state, make_filter, run_filter  # noqa: E402
 from gnio_jax.filtering.batch import padded_signals  # noqa: E402
 from gnio_jax.filtering.nonholonomic import NonHolonomic  # noqa: E402
 from gnio_jax.filtering.settings import free_parameters, with_free_parameters  # noqa: E402
-from gnio_jax.numerics import filled_up, quaternion_from_matrix  # noqa: E402
+from gnio_jax.numerics import matrix_from_quaternion  # noqa: E402
 
 WINDOWS = DataConfig(rate=100.0, window_seconds=0.1, stride_seconds=0.1)
 UNITS = {
@@ -65,19 +61,21 @@ UNITS = {
     "measurements.nonholonomic.lever_x": 0.3,
     "measurements.nonholonomic.lever_z": 0.3,
 }
-"""The constants of the search, and how much of each free parameter is one unit of the search: a
-factor e or 2, 0.005 rad, 0.3 m (`settings.free_parameters`; ours)."""
-PENALTIES = (0.003, 0.03, 0.3)
-"""%, per squared unit of the search."""
-POPULATION = 12
-"""Trials of one generation, which are filtered side by side. 4 + ⌊3 ln 14⌋ would be 11."""
+"""The constants of the fit, and how much of each free parameter is one unit of it: a factor e or 2,
+0.005 rad, 0.3 m (`settings.free_parameters`; ours)."""
+PENALTIES = (0.3, 0.03, 0.003)
+"""%, per squared unit. The fit with one of them starts at that with the one before."""
+ROUNDING = 0.3
+"""%. An error ε counts as √(ε² + ROUNDING²) in the fit, so that its derivative exists at zero."""
+STEPS = 12
+"""Of a fit at most. It ends earlier where a step changes the objective by less than a
+thousandth."""
 PADDING = 200
-"""Drives are padded to a multiple of this number of strides: few lengths, few compilations."""
-FAILED = 99.0
-"""The objective of a trial whose path is not finite, %."""
+"""Drives are padded to a multiple of this number of strides, and pieces to one of this number: few
+shapes, few compilations."""
 
-Points = np.ndarray
-"""(m, 14) places of the search, in units of the search; zeros are the defaults."""
+Point = np.ndarray
+"""(14,) a place of the fit, in units; zeros are the defaults."""
 
 
 class Choice(NamedTuple):
@@ -85,8 +83,7 @@ class Choice(NamedTuple):
 
     low_pass_seconds: float
     penalty: float
-    point: Points
-    """(14,)."""
+    point: Point
 
 
 class FoldResult(NamedTuple):
@@ -105,8 +102,8 @@ def default_settings(low_pass_seconds: float) -> FilterSettings:
     return FilterSettings(low_pass_seconds=low_pass_seconds, measurements={"nonholonomic": numbers})
 
 
-def settings_at(low_pass_seconds: float, point: Points) -> FilterSettings:
-    """The settings at a place (14,) of the search, which may be traced."""
+def settings_at(low_pass_seconds: float, point: Point) -> FilterSettings:
+    """The settings at a place (14,) of the fit, which may be traced."""
     defaults = default_settings(low_pass_seconds)
     free = free_parameters(defaults, UNITS)
     steps = zip(UNITS.items(), point, strict=True)
@@ -115,36 +112,75 @@ def settings_at(low_pass_seconds: float, point: Points) -> FilterSettings:
     )
 
 
+def motion_of_pieces(low_pass_seconds, point, start, gyro, accel, rows):
+    """R_iᵀ (p_j − p_i) (m, 3) of the rows (2, m) i, j of a drive, with the filter at a point."""
+    ekf = make_filter(WINDOWS, settings_at(low_pass_seconds, point))
+    strides = len(gyro) // WINDOWS.stride
+    absent = jnp.full((strides, 3), jnp.nan), jnp.zeros((strides, 3, 3))
+    _, history = run_filter(ekf, initial_state(ekf, *start), gyro, accel, *absent)
+    rotation = jnp.concatenate([start[0][None], history.rotation])
+    position = jnp.concatenate([start[2][None], history.position])
+    first, last = rows
+    return jnp.einsum("mji,mj->mi", rotation[first], position[last] - position[first])
+
+
 @partial(jax.jit, static_argnums=0)
-def run_points(low_pass_seconds, points, pose, gyro, accel):
-    """Rotations (m, K, 3, 3) and positions (m, K, 3) of a drive, with the filter at each point."""
-
-    def run(point):
-        ekf = make_filter(WINDOWS, settings_at(low_pass_seconds, point))
-        strides = len(gyro) // WINDOWS.stride
-        absent = jnp.full((strides, 3), jnp.nan), jnp.zeros((strides, 3, 3))
-        _, history = run_filter(ekf, initial_state(ekf, *pose), gyro, accel, *absent)
-        return history.rotation, history.position
-
-    return jax.vmap(run)(points)
+def run_drive(low_pass_seconds, point, *drive):
+    """`motion_of_pieces`."""
+    return motion_of_pieces(low_pass_seconds, point, *drive)
 
 
-def measure_drive(
-    drive: PreparedRecording, low_pass_seconds: float, points: Points
-) -> list[np.ndarray]:
-    """KITTI's relative errors of translation of all pieces of a drive, %, for each point."""
-    samples = -(-drive.strides // PADDING) * PADDING * WINDOWS.stride
-    (gyro,), (accel,) = padded_signals([(drive.gyro, drive.accel)], samples)
-    pose = drive.start.rotation, drive.start.velocity, drive.start.position
-    padded = filled_up(points, max(len(points), POPULATION))
-    rotation, position = map(np.asarray, run_points(low_pass_seconds, padded, pose, gyro, accel))
-    errors = []
-    for i in range(len(points)):
-        matrices = np.concatenate([pose[0][None], rotation[i, : drive.strides]])
-        path = np.concatenate([pose[2][None], position[i, : drive.strides]])
-        estimate = Trajectory(drive.time, path, quaternion_from_matrix(matrices))
-        errors.append(100 * piece_errors(estimate, drive.reference, WINDOWS.stride_seconds)[:, 0])
-    return errors
+@partial(jax.jit, static_argnums=0)
+def differentiate_drive(low_pass_seconds, point, *drive):
+    """The derivatives (m, 3, 14) of `motion_of_pieces` by the point."""
+    return jax.jacfwd(partial(motion_of_pieces, low_pass_seconds))(point, *drive)
+
+
+class Drive(NamedTuple):
+    """A drive and its pieces, as arrays of few shapes."""
+
+    name: str
+    group: str
+    signals: tuple
+    """Pose and velocity at the start, gyro and accel (n, 3), rows (2, m)."""
+    motion: np.ndarray
+    """(m, 3) motion of the reference in each piece, in the body at its beginning, m."""
+    length: np.ndarray
+    """(m,) nominal lengths, m."""
+
+
+def make_drive(recording: PreparedRecording) -> Drive:
+    """Pad a recording. The rows behind the pieces are zeros."""
+    reference = recording.reference
+    first, last, length = pieces(reference, WINDOWS.stride_seconds)
+    back = np.swapaxes(matrix_from_quaternion(reference.orientation[first]), 1, 2)
+    move = reference.position[last] - reference.position[first]
+    samples = -(-recording.strides // PADDING) * PADDING * WINDOWS.stride
+    (gyro,), (accel,) = padded_signals([(recording.gyro, recording.accel)], samples)
+    start = recording.start.rotation, recording.start.velocity, recording.start.position
+    rows = np.zeros((2, -(-len(first) // PADDING) * PADDING), int)
+    rows[:, : len(first)] = first, last
+    signals = start, gyro, accel, rows
+    motion = np.einsum("nij,nj->ni", back, move)
+    return Drive(recording.name, recording.group, signals, motion, length)
+
+
+def relative_errors(drive: Drive, low_pass_seconds: float, point: Point) -> np.ndarray:
+    """The error of motion (m, 3) in each piece, % of its length. Its norm is KITTI's relative error
+    of translation (`metrics.piece_errors`)."""
+    motion = np.asarray(run_drive(low_pass_seconds, point, *drive.signals))
+    return 100 * (motion[: len(drive.length)] - drive.motion) / drive.length[:, None]
+
+
+def differentiate(drive: Drive, low_pass_seconds: float, point: Point) -> np.ndarray:
+    """The derivatives (m, 3, 14) of `relative_errors`."""
+    derivatives = np.asarray(differentiate_drive(low_pass_seconds, point, *drive.signals))
+    return 100 * derivatives[: len(drive.length)] / drive.length[:, None, None]
+
+
+def measure_drive(drive: Drive, low_pass_seconds: float, point: Point) -> np.ndarray:
+    """KITTI's relative errors of translation of all pieces of a drive, %."""
+    return np.linalg.norm(relative_errors(drive, low_pass_seconds, point), axis=1)
 
 
 def mean_errors(errors: Iterable[np.ndarray]) -> np.ndarray:
@@ -154,134 +190,100 @@ def mean_errors(errors: Iterable[np.ndarray]) -> np.ndarray:
     return np.array([np.concatenate(errors).mean(), np.mean(of_drives), np.median(of_drives)])
 
 
-def objective(
-    drives: Sequence[PreparedRecording], low_pass_seconds: float, points: Points
-) -> np.ndarray:
-    """Mean of the error of all pieces and of its mean over drives, %, for each point."""
-    by_drive = [measure_drive(drive, low_pass_seconds, points) for drive in drives]
-    values = [mean_errors(errors)[:2].mean() for errors in zip(*by_drive, strict=True)]
-    return np.where(np.isfinite(values), values, FAILED)
+def weights_of_pieces(drives: Sequence[Drive]) -> list[float]:
+    """Weight of a piece of each drive in the mean of the first two `mean_errors`."""
+    counts = [len(drive.length) for drive in drives]
+    return [0.5 / sum(counts) + 0.5 / (len(drives) * count) for count in counts]
 
 
-def minimise(
-    function: Callable[[Points], np.ndarray],
-    dimensions: int,
-    trials: int,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """The mean of the last generation of an evolution strategy that starts at zero with a standard
-    deviation of 0.5.
+def fit(drives: Sequence[Drive], low_pass_seconds: float, penalty: float, start: Point) -> Point:
+    """Minimise Σ w √(ε² + ROUNDING²) + penalty |x|² over the pieces of these drives.
 
-    CMA-ES with rank-one and rank-µ updates and cumulative step lengths, positive weights only
-    (Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, with its default
-    parameters; c_c is 4 / (n + 4), without its terms in µ_eff / n, and the damping is 1 + c_σ, as
-    it is for many dimensions). `function` gives the values of the points (POPULATION, dimensions)
-    of a generation; `trials` // POPULATION generations are tried.
+    Each piece has three residuals, w times its error. SciPy's loss function sees their squares, so
+    it can count the three together; without its second derivative a step is one of iteratively
+    reweighted least squares.
     """
-    d, parents = dimensions, POPULATION // 2
-    weights = np.log(parents + 0.5) - np.log(np.arange(1, parents + 1))
-    weights /= weights.sum()
-    mass = 1 / np.sum(weights**2)  # µ_eff
-    path_rate, step_rate = 4 / (d + 4), (mass + 2) / (d + mass + 5)  # c_c, c_σ
-    rank_one = 2 / ((d + 1.3) ** 2 + mass)
-    rank_mu = min(1 - rank_one, 2 * (mass - 2 + 1 / mass) / ((d + 2) ** 2 + mass))
-    normal_length = np.sqrt(d) * (1 - 1 / (4 * d) + 1 / (21 * d**2))  # E |N(0, I)|
-    mean, std, shape = np.zeros(d), 0.5, np.eye(d)
-    path, step_path = np.zeros(d), np.zeros(d)
-    for generation in range(1, trials // POPULATION + 1):
-        variances, axes = np.linalg.eigh(shape)
-        lengths = np.sqrt(np.maximum(variances, 1e-12))
-        steps = (rng.standard_normal((POPULATION, d)) * lengths) @ axes.T
-        parent_steps = steps[np.argsort(function(mean + std * steps))[:parents]]
-        step = weights @ parent_steps
-        mean = mean + std * step
-        whitened = axes @ ((axes.T @ step) / lengths)
-        step_path = (1 - step_rate) * step_path + np.sqrt(
-            step_rate * (2 - step_rate) * mass
-        ) * whitened
-        length = np.linalg.norm(step_path)
-        expected_length = np.sqrt(1 - (1 - step_rate) ** (2 * generation)) * normal_length
-        short = length < (1.4 + 2 / (d + 1)) * expected_length
-        path = (1 - path_rate) * path + short * np.sqrt(path_rate * (2 - path_rate) * mass) * step
-        shape = (1 - rank_one - rank_mu) * shape + rank_one * np.outer(path, path)
-        shape += rank_mu * (parent_steps.T * weights) @ parent_steps
-        std *= np.exp(step_rate / (1 + step_rate) * (length / normal_length - 1))
-    return mean
+    weights = weights_of_pieces(drives)
+    of_pieces = np.repeat(weights, [len(drive.length) for drive in drives])
+    ridge = np.sqrt(2 * penalty)
+
+    def residuals(point):
+        parts = [
+            weight * relative_errors(drive, low_pass_seconds, point).ravel()
+            for weight, drive in zip(weights, drives, strict=True)
+        ]
+        return np.concatenate([*parts, ridge * point])
+
+    def derivatives(point):
+        parts = [
+            weight * differentiate(drive, low_pass_seconds, point).reshape(-1, len(UNITS))
+            for weight, drive in zip(weights, drives, strict=True)
+        ]
+        return np.concatenate([*parts, ridge * np.eye(len(UNITS))])
+
+    def count_norms(squares):
+        """ρ, ρ' and ρ'' of each residual, where ½ Σ ρ is the objective."""
+        rho = np.stack([squares, np.ones(len(squares)), np.zeros(len(squares))])
+        triples = squares[: -len(UNITS)].reshape(-1, 3).sum(1)
+        norm = np.repeat(np.sqrt(triples + (ROUNDING * of_pieces) ** 2), 3)
+        rho[:2, : -len(UNITS)] = 2 * norm / 3, 1 / norm
+        return rho
+
+    limits = {"ftol": 1e-3, "xtol": 1e-3, "gtol": None, "max_nfev": STEPS}
+    return least_squares(residuals, start, derivatives, loss=count_norms, **limits).x
 
 
-def search(
-    drives: Sequence[PreparedRecording],
-    low_pass_seconds: float,
-    penalty: float,
-    trials: int,
-    rng: np.random.Generator,
-) -> Points:
-    """The point (14,) that a search with these drives ends at."""
+def leave_one_out(
+    drives: Sequence[Drive], low_pass_seconds: float, penalty: float, point: Point
+) -> float:
+    """The objective of each drive with the constants that a fit without it would have, %.
 
-    def penalised(points):
-        distance = np.sum(points**2, axis=1)
-        return objective(drives, low_pass_seconds, points) + penalty * distance
-
-    return minimise(penalised, len(UNITS), trials, rng)
-
-
-def choose_low_pass(drives: Sequence[PreparedRecording], seconds: Sequence[float]) -> float:
-    """The time constant with which the defaults have the smallest objective on these drives. One
-    constant alone is no choice and costs no run."""
-    if len(seconds) == 1:
-        return seconds[0]
-    defaults = np.zeros((1, len(UNITS)))
-    return min(seconds, key=lambda tau: objective(drives, tau, defaults)[0])
-
-
-def choose(
-    drives: Sequence[PreparedRecording], low_pass_seconds: float, trials: int, seed: Sequence[int]
-) -> Choice:
-    """The penalty by two halves of the drives, and then the constants by all of them."""
-    halves, inner_errors = (drives[0::2], drives[1::2]), []
-    for penalty in PENALTIES:
-        errors = []
-        for i, half in enumerate(halves):
-            rng = np.random.default_rng([*seed, i])
-            point = search(half, low_pass_seconds, penalty, trials, rng)
-            errors += [
-                measure_drive(drive, low_pass_seconds, point[None])[0] for drive in halves[1 - i]
-            ]
-        inner_errors.append(mean_errors(errors)[:2].mean())
-    penalty = PENALTIES[int(np.argmin(inner_errors))]
-    rng = np.random.default_rng([*seed, 2])
-    return Choice(low_pass_seconds, penalty, search(drives, low_pass_seconds, penalty, trials, rng))
+    These are one Gauss-Newton step from `point`, the fit with all of them. A step that is longer
+    than 1.5 units in a constant is shortened.
+    """
+    curvatures, slopes = [], []
+    for weight, drive in zip(weights_of_pieces(drives), drives, strict=True):
+        error = relative_errors(drive, low_pass_seconds, point)
+        derivative = differentiate(drive, low_pass_seconds, point)
+        scale = weight / np.sqrt((error**2).sum(1) + ROUNDING**2)
+        curvatures.append(np.einsum("n,ncj,nck->jk", scale, derivative, derivative))
+        slopes.append(np.einsum("n,ncj,nc->j", scale, derivative, error))
+    ridge = 2 * penalty * np.eye(len(UNITS))
+    errors = []
+    for drive, curvature, slope in zip(drives, curvatures, slopes, strict=True):
+        remaining = sum(slopes) - slope + 2 * penalty * point
+        step = -np.linalg.solve(sum(curvatures) - curvature + ridge, remaining)
+        step *= min(1.0, 1.5 / np.abs(step).max())
+        errors.append(measure_drive(drive, low_pass_seconds, point + step))
+    value = mean_errors(errors)[:2].mean()
+    return value if np.isfinite(value) else np.inf
 
 
-class Fold(NamedTuple):
-    """The drives of a fold, and the constant of the low-pass that the others choose for it. No seed
-    changes them."""
-
-    training: list[PreparedRecording]
-    held_out: list[PreparedRecording]
-    low_pass_seconds: float
-
-
-def make_fold(
-    drives: Sequence[PreparedRecording],
-    fold_of: Mapping[str, int],
-    number: int,
-    low_pass: Sequence[float],
-) -> Fold:
-    """Divide the drives, and choose the low-pass by those that are not held out."""
-    training = [drive for drive in drives if fold_of[drive.group] != number]
-    held_out = [drive for drive in drives if fold_of[drive.group] == number]
-    return Fold(training, held_out, choose_low_pass(training, low_pass))
+def choose(drives: Sequence[Drive], low_pass: Sequence[float]) -> Choice:
+    """The constants, the penalty and the low-pass by these drives."""
+    choices = {}
+    for seconds in low_pass:
+        point = np.zeros(len(UNITS))
+        for penalty in PENALTIES:
+            point = fit(drives, seconds, penalty, point)
+            choice = Choice(seconds, penalty, point)
+            choices[leave_one_out(drives, *choice)] = choice
+    return choices[min(choices)]
 
 
-def evaluate_fold(fold: Fold, trials: int, seed: Sequence[int]) -> FoldResult:
+def evaluate_fold(
+    training: Sequence[Drive], held_out: Sequence[Drive], low_pass: Sequence[float]
+) -> FoldResult:
     """Choose by the training drives of a fold, and then measure the drives that are held out."""
-    choice = choose(fold.training, fold.low_pass_seconds, trials, seed)
-    points = np.stack([np.zeros(len(UNITS)), choice.point])
-    errors = {
-        drive.name: measure_drive(drive, fold.low_pass_seconds, points) for drive in fold.held_out
-    }
-    return FoldResult(choice, *({name: pair[i] for name, pair in errors.items()} for i in (0, 1)))
+    choice = choose(training, low_pass)
+    points = np.zeros(len(UNITS)), choice.point
+    return FoldResult(
+        choice,
+        *(
+            {drive.name: measure_drive(drive, choice.low_pass_seconds, p) for drive in held_out}
+            for p in points
+        ),
+    )
 
 
 def describe_errors(errors: Mapping[str, np.ndarray]) -> str:
@@ -299,17 +301,20 @@ def describe_errors(errors: Mapping[str, np.ndarray]) -> str:
     )
 
 
-def load_drives(root: str | None, folds: int) -> tuple[list[PreparedRecording], dict[str, int]]:
-    """The drives that have a piece, by name, and the fold of each group, which depends on the names
-    and lengths of all drives."""
+def load_drives(root: str | None, folds: int | None) -> tuple[list[Drive], dict[str, int]]:
+    """The drives that have a piece, by name, and the fold of each group: `folds` ones, which depend
+    on the names and lengths of all drives, or one for each group."""
     sequences = sorted(data.load("kitti", root, "all"), key=lambda sequence: sequence.name)
     recordings, _ = prepare(sequences, WINDOWS)
     drives = [
-        recording
+        make_drive(recording)
         for recording in recordings
         if pieces(recording.reference, WINDOWS.stride_seconds).shape[1]
     ]
-    return drives, data.folds(sequences, folds)
+    if folds is not None:
+        return drives, data.folds(sequences, folds)
+    groups = sorted({drive.group for drive in drives})
+    return drives, {group: number for number, group in enumerate(groups)}
 
 
 def main() -> None:
@@ -317,41 +322,35 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data-root", help="KITTI's folder, as for gnio evaluate")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--folds", type=int, default=3)
+    parser.add_argument("--folds", type=int, help="default: each drive is a fold of its own")
     parser.add_argument("--only", type=int, nargs="+", help="folds to run; default: all")
-    parser.add_argument("--trials", type=int, default=156, help="of one search")
-    parser.add_argument("--low-pass", type=float, nargs="+", default=[0.0, 0.03, 0.06, 0.09])
+    parser.add_argument("--low-pass", type=float, nargs="+", default=[0.03, 0.06, 0.09])
     arguments = parser.parse_args()
-    numbers = range(arguments.folds) if arguments.only is None else arguments.only
-    if not set(numbers) <= set(range(arguments.folds)):
-        parser.error(f"--only: there are the folds 0 to {arguments.folds - 1}")
     drives, fold_of = load_drives(arguments.data_root, arguments.folds)
-    total = sum(pieces(drive.reference, WINDOWS.stride_seconds).shape[1] for drive in drives)
+    every = sorted({fold_of[drive.group] for drive in drives})
+    numbers = every if arguments.only is None else arguments.only
+    if not set(numbers) <= set(every):
+        parser.error(f"--only: there are the folds 0 to {every[-1]}")
+    total = sum(len(drive.length) for drive in drives)
     print(f"{len(drives)} drives, {total} pieces", flush=True)
-    defaults = np.zeros((1, len(UNITS)))
-    unchanged = {drive.name: measure_drive(drive, 0.0, defaults)[0] for drive in drives}
+    defaults = np.zeros(len(UNITS))
+    unchanged = {drive.name: measure_drive(drive, 0.0, defaults) for drive in drives}
     print(f"defaults, low-pass left in: {describe_errors(unchanged)}", flush=True)
-    folds = {n: make_fold(drives, fold_of, n, arguments.low_pass) for n in numbers}
-    by_seed = []
-    for seed in arguments.seeds:
-        default_errors, errors = {}, {}
-        for number, fold in folds.items():
-            result = evaluate_fold(fold, arguments.trials, (seed, number))
-            default_errors |= result.default_errors
-            errors |= result.errors
-            tau, penalty, point = result.choice
-            free = free_parameters(settings_at(tau, point), UNITS)
-            print(f"seed {seed}, fold {number}: {describe_errors(result.errors)}", flush=True)
-            print(f"  low-pass {tau:g} s, penalty {penalty:g}, free parameters {free}", flush=True)
-        if not by_seed:
-            differences = {name: error - unchanged[name] for name, error in default_errors.items()}
-            print(f"defaults, low-pass chosen: {describe_errors(default_errors)}", flush=True)
-            print(f"  minus low-pass left in: {describe_errors(differences)}", flush=True)
-        by_seed.append(errors)
-        print(f"seed {seed}: {describe_errors(errors)}", flush=True)
-    mean = {name: np.mean([errors[name] for errors in by_seed], axis=0) for name in by_seed[0]}
-    print(f"mean of {len(by_seed)} seed(s), piece by piece: {describe_errors(mean)}", flush=True)
+    default_errors, errors = {}, {}
+    for number in numbers:
+        training = [drive for drive in drives if fold_of[drive.group] != number]
+        held_out = [drive for drive in drives if fold_of[drive.group] == number]
+        result = evaluate_fold(training, held_out, arguments.low_pass)
+        default_errors |= result.default_errors
+        errors |= result.errors
+        tau, penalty, point = result.choice
+        free = free_parameters(settings_at(tau, point), UNITS)
+        print(f"fold {number}, {', '.join(result.errors)}: {describe_errors(result.errors)}")
+        print(f"  low-pass {tau:g} s, penalty {penalty:g}, free parameters {free}", flush=True)
+    differences = {name: error - unchanged[name] for name, error in default_errors.items()}
+    print(f"defaults, low-pass chosen: {describe_errors(default_errors)}")
+    print(f"  minus low-pass left in: {describe_errors(differences)}")
+    print(f"constants chosen: {describe_errors(errors)}", flush=True)
 
 
 if __name__ == "__main__":
