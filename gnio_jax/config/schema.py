@@ -234,8 +234,8 @@ class AugmentConfig:
     rest_share: Annotated[Probability, FILE_ONLY] = 0.0
     """Share of the windows that are replaced by windows of a phone at rest (ours)."""
     mirror_share: Annotated[Share, FILE_ONLY] = 0.0
-    """Share of the windows or segments that are mirrored, so that the left hand carries what the
-    right one carried (ours)."""
+    """Share of the windows or segments that are mirrored from left to right, so that the left hand
+    carries what the right one carried (ours). What is ahead of the phone remains ahead."""
     rocking_share: Annotated[Share, FILE_ONLY] = 0.0
     """Share of the windows or segments in which the phone rocks otherwise in the hand: its rate of
     turn about horizontal axes is turned about the vertical by any angle and scaled by a factor from

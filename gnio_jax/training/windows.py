@@ -217,21 +217,25 @@ def random_low_pass(
 
 
 def random_mirror(key: PRNGKeyArray, count: int, share: float) -> Float[jax.Array, "b 3"]:
-    """Factors of the three components of a vector in a frame with gravity on z: −1 for y in a
-    random share of the signals, otherwise 1."""
+    """Factors of the three components of a vector in a frame with gravity on z: −1 for x in a
+    random share of the signals, otherwise 1.
+
+    The x axis of a window is that of the phone, from its left to its right. So a phone that looks
+    ahead does so in the mirrored walk, too, where it is in the other hand.
+    """
     mirrored = _uniform(key, (count,), 0.0, 1.0) < share
     ones = jnp.ones(count, jnp.float32)
-    return jnp.stack([ones, jnp.where(mirrored, -1.0, ones), ones], axis=1)
+    return jnp.stack([jnp.where(mirrored, -1.0, ones), ones, ones], axis=1)
 
 
 def mirror_channels(
     mirror: Float[jax.Array, "b 3"], imu: Float[jax.Array, "b n c"]
 ) -> Float[jax.Array, "b n c"]:
     """Signals of a mirrored walk (ours). A specific force changes its sign across the mirror, an
-    angular rate along it, because a rate is an axial vector. The mirrored body has its y axis on
+    angular rate along it, because a rate is an axial vector. The mirrored body has its x axis on
     the other side, so that its axes are right-handed again."""
-    axial = mirror * mirror[:, 1:2]
-    factors = jnp.concatenate([mirror, axial, mirror, axial], axis=1)  # axial: the y axis, too
+    axial = mirror * mirror[:, :1]
+    factors = jnp.concatenate([mirror, axial, axial, mirror], axis=1)  # axial: the x axis, too
     return imu * factors[:, None, : imu.shape[-1]]
 
 

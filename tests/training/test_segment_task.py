@@ -136,14 +136,14 @@ def test_a_frame_drifts_as_its_gyro_says():
 
 
 def test_a_mirrored_segment_is_that_of_a_mirrored_walk():
-    """The walk behind the mirror y → −y, cut as any other."""
+    """The walk behind the mirror x → −x, cut as any other."""
     sequence, config = walk(), dataclasses.replace(OFF, mirror_share=1.0)
     w, x, y, z = sequence.orientation.T
     behind = sequence._replace(
-        accel=sequence.accel * [1, -1, 1],
-        gyro=sequence.gyro * [-1, 1, -1],
-        orientation=np.stack([w, -x, y, -z], axis=1),
-        position=sequence.position * [1, -1, 1],
+        accel=sequence.accel * [-1, 1, 1],
+        gyro=sequence.gyro * [1, -1, -1],
+        orientation=np.stack([w, x, -y, -z], axis=1),
+        position=sequence.position * [-1, 1, 1],
     )
     grid = SegmentGrid(N, 20, W, RATE)
     source, expected = (
@@ -169,7 +169,7 @@ def test_a_bias_is_constant_in_the_body_behind_the_mirror():
         )
     )
     w, x, y, z = sequence.orientation[int(row[0]) : int(row[0]) + 20 * N].T
-    behind = Rotation.from_quat(np.stack([-x, y, -z, w], axis=1))
+    behind = Rotation.from_quat(np.stack([x, -y, -z, w], axis=1))
     bias = behind.inv().apply((biased - plain)[0, :, :3])
     np.testing.assert_allclose(bias, np.tile(bias[:1], (20 * N, 1)), atol=1e-5)
     assert np.abs(bias[0]).min() > 0.01

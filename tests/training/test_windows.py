@@ -197,7 +197,7 @@ def test_a_window_at_rest_has_gravity_alone_and_no_displacement():
 
 def simulated_phone(mirrored):
     """Samples in the world, and positions, of a phone that moves and turns along smooth curves,
-    from finite differences; behind the mirror y → −y if `mirrored`."""
+    from finite differences; behind the mirror x → −x if `mirrored`."""
     dt, time = 1e-4, 1e-4 * np.arange(4000)[:, None]
     rng = np.random.default_rng(3)
     size, rate, phase = rng.uniform(0.5, 3, (3, 3, 6))
@@ -205,7 +205,7 @@ def simulated_phone(mirrored):
     position, turns = waves, 0.2 * np.roll(waves, 1, axis=1)
     attitude = Rotation.from_rotvec(turns).as_matrix()
     if mirrored:
-        mirror = np.diag([1.0, -1.0, 1.0])
+        mirror = np.diag([-1.0, 1.0, 1.0])
         position, attitude = position @ mirror, mirror @ attitude @ mirror
     accel = np.diff(position, 2, axis=0) / dt**2 + [0, 0, 9.81]
     steps = attitude[1:] @ attitude[:-1].transpose(0, 2, 1)
@@ -240,6 +240,16 @@ def test_a_mirrored_window_is_that_of_a_phone_behind_the_mirror():
         np.testing.assert_allclose(after.imu[which], target, atol=2e-4)
         target = np.broadcast_to(way, after.displacement[which].shape)
         np.testing.assert_allclose(after.displacement[which], target, atol=1e-5)
+
+
+def test_a_phone_that_looks_ahead_does_so_behind_the_mirror():
+    """In a window's frame the x axis of the phone looks along x, and y is ahead of a phone that is
+    held flat in front of its walker."""
+    drift = np.tile(np.float32([0.3, 1.2, 0.0]), (400, 1))  # ahead, and a little to the right
+    before = batch(400)._replace(displacement=drift)
+    after = augmented(before, mirror_share=0.5).displacement
+    np.testing.assert_array_equal(after[:, 1], drift[:, 1])
+    assert set(np.sign(after[:, 0])) == {-1.0, 1.0}
 
 
 def test_a_phone_that_rocks_otherwise_measures_the_same_forces():
