@@ -11,8 +11,8 @@ chosen by the other drives, and the held-out drives are measured once:
   is the mean of two errors, `t_rel` of all pieces and its mean over drives, plus a penalty times
   the squared distance from the defaults in `UNITS`.
 - The penalty and the time constant of the IMU's low-pass (`filter.low_pass_seconds`) are those with
-  the smallest error of approximate leave-one-out: the constants without one training drive are one
-  Gauss-Newton step from the fit, and this drive is measured with them.
+  the smallest error of approximate leave-one-out: for each training drive one Gauss-Newton step
+  from the fit goes towards the constants without it, and this drive is measured with them.
 
 Nothing is drawn, so there are no seeds. The filter starts at the reference's pose and velocity, and
 gets no displacement and no rest. `--low-pass 0` is the same protocol with the low-pass left in.
@@ -68,8 +68,8 @@ PENALTIES = (0.3, 0.03, 0.003)
 ROUNDING = 0.3
 """%. An error ε counts as √(ε² + ROUNDING²) in the fit, so that its derivative exists at zero."""
 STEPS = 12
-"""Of a fit at most. It ends earlier where a step changes the objective by less than a
-thousandth."""
+"""Evaluations of a fit at most, its start included. It ends earlier where a step changes the
+objective or the place by less than a thousandth."""
 PADDING = 200
 """Drives are padded to a multiple of this number of strides, and pieces to one of this number: few
 shapes, few compilations."""
@@ -236,10 +236,11 @@ def fit(drives: Sequence[Drive], low_pass_seconds: float, penalty: float, start:
 def leave_one_out(
     drives: Sequence[Drive], low_pass_seconds: float, penalty: float, point: Point
 ) -> float:
-    """The objective of each drive with the constants that a fit without it would have, %.
+    """The objective of each drive with about the constants that a fit without it would have, %.
 
     These are one Gauss-Newton step from `point`, the fit with all of them. A step that is longer
-    than 1.5 units in a constant is shortened.
+    than 1.5 units in a constant is shortened. The weights of the remaining drives are not raised.
+    One step is too short, so the value is too small, and more so for a small penalty.
     """
     curvatures, slopes = [], []
     for weight, drive in zip(weights_of_pieces(drives), drives, strict=True):
@@ -261,14 +262,17 @@ def leave_one_out(
 
 def choose(drives: Sequence[Drive], low_pass: Sequence[float]) -> Choice:
     """The constants, the penalty and the low-pass by these drives."""
-    choices = {}
+    choices = []
     for seconds in low_pass:
         point = np.zeros(len(UNITS))
         for penalty in PENALTIES:
             point = fit(drives, seconds, penalty, point)
             choice = Choice(seconds, penalty, point)
-            choices[leave_one_out(drives, *choice)] = choice
-    return choices[min(choices)]
+            choices.append((leave_one_out(drives, *choice), choice))
+    error, choice = min(choices, key=lambda pair: pair[0])
+    if not np.isfinite(error):
+        raise ValueError("no fit has finite errors on its drives")
+    return choice
 
 
 def evaluate_fold(

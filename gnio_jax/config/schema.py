@@ -217,8 +217,8 @@ class AugmentConfig:
     """Largest tilt of gravity about a random horizontal axis, degrees."""
     yaw: bool = True
     """Turn window and target by a random yaw; through the filter, segment and reference. Without it
-    the frame of a window has the heading of the phone, from which a network then learns that the
-    phone is held ahead (docs/results/networks.md)."""
+    the frame of a window has the heading of the phone, from which a network then learns how phones
+    are held (docs/results/networks.md), and a segment keeps the axes of its recording's world."""
     noise: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """Standard deviations of white noise of gyro (rad/s) and accelerometer (m/s²)."""
     shift_samples: NonNegativeCount = 0

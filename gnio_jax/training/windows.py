@@ -220,8 +220,8 @@ def random_mirror(key: PRNGKeyArray, count: int, share: float) -> Float[jax.Arra
     """Factors of the three components of a vector in a frame with gravity on z: −1 for x in a
     random share of the signals, otherwise 1.
 
-    The x axis of a window is that of the phone, from its left to its right. So a phone that looks
-    ahead does so in the mirrored walk, too, where it is in the other hand.
+    The x axis of a window is that of the phone, from its left to its right in portrait. So a phone
+    that looks ahead does so in the mirrored walk, too, where it is in the other hand.
     """
     mirrored = _uniform(key, (count,), 0.0, 1.0) < share
     ones = jnp.ones(count, jnp.float32)
