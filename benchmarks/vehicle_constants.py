@@ -124,10 +124,7 @@ def motion_of_pieces(low_pass_seconds, point, start, gyro, accel, rows):
     return jnp.einsum("mji,mj->mi", rotation[first], position[last] - position[first])
 
 
-@partial(jax.jit, static_argnums=0)
-def run_drive(low_pass_seconds, point, *drive):
-    """`motion_of_pieces`."""
-    return motion_of_pieces(low_pass_seconds, point, *drive)
+run_drive = jax.jit(motion_of_pieces, static_argnums=0)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -194,6 +194,13 @@ def test_the_low_pass_and_the_penalty_are_those_of_the_smallest_error_of_leave_o
     assert starts == pytest.approx([0, 0.33, 0.06, 0, 0.36, 0.09, 0, 0.39, 0.12])
 
 
+def test_a_choice_among_fits_without_finite_errors_is_refused(monkeypatch):
+    monkeypatch.setattr(vehicle_constants, "fit", lambda *_: DEFAULTS)
+    monkeypatch.setattr(vehicle_constants, "leave_one_out", lambda *_: np.inf)
+    with pytest.raises(ValueError, match="no fit has finite errors"):
+        choose([], (0.06,))
+
+
 def test_the_program_prints_the_errors_of_all_drives_and_runs_a_part_of_the_folds(
     sequences, monkeypatch, capsys
 ):
