@@ -50,17 +50,22 @@ demo: $(VENV)/.package
 	$(BIN)/gnio evaluate --network $(DEMO)
 
 # A network of a quarter of the width learns from poses between the waypoints, and makes truer ones
-# for the network of half the width.
+# for the network of half the width. This learns the direction of a walk from the gait alone, and
+# then with the heading of the device.
 pedestrian: $(VENV)/.package
-	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_calibrated
+	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_calibrated $(RUNS)/pedestrian_gait
 	rm -rf $(RUNS)/pedestrian_first $(RUNS)/pedestrian_first_calibrated
 	$(BIN)/gnio train --config pedestrian --model.width 16 --workdir $(RUNS)/pedestrian_first \
 		--optim.epochs 4 --set augment.mirror_share=0 --set augment.rocking_share=0 \
-		--set "augment.vertical_gain=[1,1]"
+		--set "augment.vertical_gain=[1,1]" --set augment.hidden_axes_share=0
 	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian_first
+	$(BIN)/gnio train --config pedestrian --workdir $(RUNS)/pedestrian_gait \
+		--set data.poses_by=$(RUNS)/pedestrian_first_calibrated \
+		--set augment.hidden_axes_share=1 --optim.epochs 6
 	$(BIN)/gnio train --config pedestrian --workdir $(RUNS)/pedestrian \
-		--set data.poses_by=$(RUNS)/pedestrian_first_calibrated
-	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian --average-headings
+		--set data.poses_by=$(RUNS)/pedestrian_first_calibrated \
+		--init-from $(RUNS)/pedestrian_gait
+	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian
 
 test: $(VENV)/.with-$(EXTRAS)
 	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) $(SHARED_OUT) -m 'not slow' $(PYTEST_ARGS)

@@ -141,7 +141,8 @@ class DataConfig:
     window_rotation: Literal["per_sample", "single", "body_axes"] = "per_sample"
     """Rotate each sample with its own attitude, or the whole window with the attitude at its start
     (eq. 1 read literally). body_axes is per_sample with the x and y axes of the body as six more
-    channels, for networks that see the body (ai_imu, airio, and a corrector)."""
+    channels, for networks that see the body (ai_imu, airio, device_heading, and a
+    corrector)."""
     train_split: str = "train"
     """Split of the dataset for training. train-0of4 leaves out the first of four folds of it, in
     which people and sessions are whole: with a network for each fold, gnio calibrate has walks that
@@ -235,6 +236,9 @@ class AugmentConfig:
     """Half-widths of a window's uniform scale errors of gyro and accelerometer (ours)."""
     rest_share: Annotated[Probability, FILE_ONLY] = 0.0
     """Share of the windows that are replaced by windows of a phone at rest (ours)."""
+    hidden_axes_share: Annotated[Share, FILE_ONLY] = 0.0
+    """Share of the windows whose heading model.equivariance: device_heading does not know, so that
+    the network learns the direction from the gait, too (ours)."""
     mirror_share: Annotated[Share, FILE_ONLY] = 0.0
     """Share of the windows or segments that are mirrored from left to right, so that the left hand
     carries what the right one carried (ours). What is ahead of the phone remains ahead."""
@@ -315,12 +319,19 @@ class ModelConfig:
     """Normalisation of the convolutions (ronin_resnet: batch). group is that of RIO: over the
     samples of one window and 32 groups of channels, alike in training and inference."""
     equivariance: Literal[
-        "none", "four_headings", "canonical_frame", "o2_frame", "so2_frame", "so2_frame_shallow"
+        "none",
+        "four_headings",
+        "canonical_frame",
+        "device_heading",
+        "o2_frame",
+        "so2_frame",
+        "so2_frame_shallow",
     ] = "none"
     """How a network is made equivariant, so that its displacement turns with a window that is
     turned about the vertical. four_headings is the mean over four headings of the window, at
-    inference; canonical_frame uses a frame that a small network finds in the window. The others
-    are EqNIO's networks for the frame: with reflections (o2_frame), without them (so2_frame: around
+    inference; canonical_frame uses a frame that a small network finds in the window; device_heading
+    uses the heading of the device if its screen faces up, as people hold it ahead. The others are
+    EqNIO's networks for the frame: with reflections (o2_frame), without them (so2_frame: around
     TLIO, so2_frame_shallow: around RoNIN)."""
     corrector: Literal["none", "airimu"] = "none"
     """A network that corrects the samples before any other sees them (AirIMU)."""
@@ -699,10 +710,14 @@ class TrainConfig:
         if weights and len(weights) != len(names):
             problem = f"has {len(weights)} values for {len(names)} datasets"
             location.child("data.weights").refuse(problem, "give one for each, or none")
-        if self.model.equivariance == "four_headings" and not self.augment.yaw:
-            problem = "is four_headings without augment.yaw"
+        frame = self.model.equivariance
+        if frame in ("four_headings", "device_heading") and not self.augment.yaw:
+            problem = f"is {frame} without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"
             location.child("model.equivariance").refuse(problem, remedy)
+        if self.augment.hidden_axes_share and frame != "device_heading":
+            problem = "is for model.equivariance: device_heading, the network that uses them"
+            location.child("augment.hidden_axes_share").refuse(problem, "leave it out")
         self._check_segments(location)
         self._check_through_filter(location)
 

@@ -26,6 +26,9 @@ FRAME_FEATURES = 16
 """Features of the frame network's convolutions (ours)."""
 FRAME_SPAN = 7
 """Samples that each of these convolutions sees (ours)."""
+LEAST_UP = 0.5
+"""Smallest vertical component of the normal of a screen that faces up: it is within 60° of the
+vertical (ours)."""
 
 
 class Equivariant(nn.Module):
@@ -77,6 +80,39 @@ class FourHeadings(Equivariant):
             root_mean_square(by_heading(turn_log_std(prediction.log_std, opposite(heading)))),
             diagnostics,
         )
+
+
+class DeviceHeading(Equivariant):
+    """The network sees a device whose screen faces up in the frame of its own heading, and its
+    displacement is turned back (ours). Exact for every angle.
+
+    People hold a screen that they can read ahead of them. Seen in the frame of the device, their
+    direction hardly varies, and need not be inferred from the gait. Nothing follows from the
+    heading of any other device, e.g. in a pocket: its window keeps its frame, whose heading is drawn
+    in training. A learnt constant, which is added to the samples of the first kind, tells the
+    network which one it sees.
+
+    The x axis of the frame is the horizontal direction of the device's x axis, from the left of its
+    screen to its right, in the mean over the window. Windows have the axes of the body; where these
+    are zero (`augment.hidden_axes_share`), the heading is not known.
+    """
+
+    channels = 12
+
+    @nn.compact
+    def __call__(
+        self, windows: Float[Array, "b n 12"], train: bool = False, **constants: Any
+    ) -> Prediction:
+        windows = windows.astype(jnp.float32)
+        x_axis, y_axis = windows[..., 6:9], windows[..., 9:12]
+        normal = x_axis[..., 0] * y_axis[..., 1] - x_axis[..., 1] * y_axis[..., 0]  # its z component
+        faces_up = (normal.mean(axis=1) > LEAST_UP)[:, None]
+        mean = jnp.where(faces_up, x_axis.mean(axis=1)[:, :2], jnp.float32([[1, 0]]))
+        heading = jnp.stack(direction(mean[:, 0], mean[:, 1]), axis=-1)
+        constant = self.param("facing_up", nn.initializers.zeros, (6,), jnp.float32)
+        samples = turn_windows(windows[..., :6], opposite(heading))
+        samples = samples + jnp.where(faces_up, constant[None], 0.0)[:, None]
+        return turn_prediction(self.network(samples, train, **constants), heading)
 
 
 class CanonicalFrame(Equivariant):

@@ -28,7 +28,7 @@ from gnio_jax.models.convolution import winograd_pays
 from gnio_jax.models.ctin import CTIN
 from gnio_jax.models.deepils import DeepILS
 from gnio_jax.models.eqnio import EqNIO
-from gnio_jax.models.equivariance import CanonicalFrame, FourHeadings
+from gnio_jax.models.equivariance import CanonicalFrame, DeviceHeading, FourHeadings
 from gnio_jax.models.experts import Experts
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.gru import GRUNetwork
@@ -69,6 +69,7 @@ _PUBLISHED = frozenset(_MODELS)
 _EQUIVARIANT: dict[str, Callable[[nn.Module], nn.Module]] = {
     "four_headings": FourHeadings,
     "canonical_frame": CanonicalFrame,
+    "device_heading": DeviceHeading,
     "o2_frame": EqNIO,
     "so2_frame": functools.partial(EqNIO, reflections=False),
     "so2_frame_shallow": functools.partial(EqNIO, reflections=False, depth=1),
@@ -134,10 +135,11 @@ def check_experiment(model: nn.Module, config: TrainConfig, source: str = "confi
     rotation = location.child("data.window_rotation")
     in_filter = location.child("filter.window_rotation")
     if channels(model) == 12:
+        subject = f"{name}, its equivariance or its corrector sees the body"
         if config.data.window_rotation != "body_axes":
-            rotation.refuse(f"must be body_axes: {name} or its corrector sees the body")
+            rotation.refuse(f"must be body_axes: {subject}")
         if config.filter.window_rotation not in (None, "body_axes"):
-            in_filter.refuse(f"must be null: {name} or its corrector sees the body")
+            in_filter.refuse(f"must be null: {subject}")
     elif config.data.window_rotation == "body_axes":
         rotation.refuse(f"is body_axes, which {name} does not see", "leave it out")
     elif config.filter.window_rotation == "body_axes":
@@ -175,12 +177,12 @@ def create(name: str, **values: Any) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a
     `Prediction`.
 
-    `equivariance` is an option of all: "none", "four_headings", "canonical_frame"
-    (`models.equivariance`), or a frame of EqNIO (`models.eqnio`); so is `corrector`: "none" or
-    "airimu" (`models.airimu`). `winograd`, the way of computing convolutions in training, is chosen
-    for this machine unless it is given (`models.convolution`). Raises `InputError` for an unknown
-    name or option, naming the known ones, a value that is not one of an option's choices or beyond
-    its bounds, or options that do not fit together.
+    `equivariance` is an option of all: "none", "four_headings", "canonical_frame",
+    "device_heading" (`models.equivariance`), or a frame of EqNIO (`models.eqnio`); so is
+    `corrector`: "none" or "airimu" (`models.airimu`). `winograd`, the way of computing convolutions
+    in training, is chosen for this machine unless it is given (`models.convolution`). Raises
+    `InputError` for an unknown name or option, naming the known ones, a value that is not one of an
+    option's choices or beyond its bounds, or options that do not fit together.
     """
     subject, kinds = f"model '{name}'", options(name)
     for option, value in values.items():

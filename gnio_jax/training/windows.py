@@ -281,8 +281,8 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
     Each window has a constant bias, uniform in ± its half-width on each axis. It is tilted by up to
     `tilt_degrees` about a random horizontal axis, which is an error of gravity's direction and does
     not change the target. Window and target are turned together by a uniform yaw, because the
-    network must not depend on the choice of heading. White noise is added last. Everything is
-    float32.
+    network must not depend on the choice of heading. The axes of the body are hidden in a share of
+    the windows (ours). White noise is added last. Everything is float32.
     """
     bias_key, tilt_key, yaw_key, noise_key = jax.random.split(key, 4)
     if config.rest_share:
@@ -320,6 +320,11 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
             rotate_vectors(turn, windows.displacement[:, None, None])[:, 0, 0],
             rotate_vectors(turn, windows.steps[:, :, None])[:, :, 0],
         )
+    if config.hidden_axes_share:
+        share, shape = jnp.float32(config.hidden_axes_share), (count, 1, 1)
+        hidden = jax.random.bernoulli(jax.random.fold_in(key, 9), share, shape)
+        axes = jnp.where(hidden, 0, windows.imu[..., 6:])
+        windows = windows._replace(imu=jnp.concatenate([windows.imu[..., :6], axes], axis=-1))
     if any(config.noise):
         noise = jax.random.normal(noise_key, (*imu.shape[:2], 6), jnp.float32)
         noise = noise * _channels(*config.noise)

@@ -68,6 +68,10 @@ def test_what_is_no_yaml_is_one_line_that_names_the_file(text):
         "model.equivariance": [
             "model: {equivariance: so3}",
             "model: {equivariance: four_headings}\naugment: {yaw: false}",
+            "model: {equivariance: device_heading}\naugment: {yaw: false}",
+        ],
+        "augment.hidden_axes_share": [
+            *("augment: {hidden_axes_share: 0.3}", "augment: {hidden_axes_share: 2.0}"),
         ],
         "model.output_dim": ["model: {output_dim: 4}", "model: {output_dim: 2.0}"],
         "seed": [

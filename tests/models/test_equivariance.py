@@ -130,6 +130,62 @@ def test_four_headings_are_the_mean_of_the_network_turned_back():
     np.testing.assert_allclose(np.exp(2 * found["velocity_log_std"][0]), squares, rtol=1e-4)
 
 
+def held(tilt, heading):
+    """Axes x and y of a device in each of the windows, (b, n, 6): tilted by so much (rad) about its
+    x axis, which has this heading."""
+    attitude = Rotation.from_euler("ZX", np.stack([heading, tilt], axis=-1)).as_matrix()
+    return np.float32(attitude[..., :2].swapaxes(-1, -2).reshape(*tilt.shape, 6))
+
+
+def test_a_device_whose_screen_faces_up_is_seen_in_the_frame_of_its_heading():
+    """Its tilt and heading vary within the window. One whose screen does not face up, and one whose
+    axes are hidden, are seen in the frame of the window, without the constant."""
+    rng = np.random.default_rng(3)
+    tilt = np.array([0.4, 1.5, 0.4])[:, None] + 0.1 * rng.standard_normal((3, SAMPLES))
+    heading = np.array([2.0, 2.0, 2.0])[:, None] + 0.3 * rng.standard_normal((3, SAMPLES))
+    axes = held(tilt, heading)
+    axes[2] = 0.0
+    alone = {part: dict(tree) for part, tree in variables("device_heading").items()}
+    constant = alone["params"].pop("facing_up")
+    mean = np.mean(np.exp(1j * heading), axis=1)  # x is level, whatever the tilt
+    frame = about_z(np.where([True, False, False], np.angle(mean), 0.0))
+    pairs = np.einsum("bji,bnkj->bnki", frame, WINDOWS.reshape(3, SAMPLES, 2, 3))
+    seen = np.float32(pairs.reshape(WINDOWS.shape))
+    seen[0] += np.asarray(constant)
+    inner = plain("none", alone, seen)
+    windows = np.concatenate([np.float32(WINDOWS), axes], axis=-1)
+    said = plain("device_heading", variables("device_heading"), windows)
+    wanted = np.einsum("bij,bj->bi", frame, inner.displacement)
+    np.testing.assert_allclose(said.displacement, wanted, atol=1e-5 * np.abs(wanted).max())
+    squares = np.exp(2 * np.float64(inner.log_std))[..., None] * np.eye(3)
+    covariance = frame @ squares @ frame.swapaxes(1, 2)
+    np.testing.assert_allclose(said.covariance(-30.0, float), covariance, rtol=1e-3, atol=1e-4)
+    # The whole turned by any angle, axes and all.
+    for turn in TURNS:
+        vectors = np.einsum("ij,bnkj->bnki", turn, windows.reshape(3, SAMPLES, 4, 3))
+        turned_windows = np.float32(vectors.reshape(windows.shape))
+        found = plain("device_heading", variables("device_heading"), turned_windows).displacement
+        np.testing.assert_allclose(found[0], turn @ said.displacement[0], atol=2e-5)
+
+
+def test_no_device_axes_make_a_derivative_infinite():
+    """Its x axis on the vertical, both axes hidden, and a screen at 60°, where the frame changes."""
+    axes = np.zeros((3, SAMPLES, 6), np.float32)
+    axes[0, :, [2, 3]] = 1.0
+    axes[2] = held(np.full(SAMPLES, np.pi / 3), np.zeros(SAMPLES))
+    windows = np.concatenate([np.float32(WINDOWS), axes], axis=-1)
+    frozen = models.InferenceVariables(variables("device_heading"), {})
+
+    @quick
+    @jax.grad
+    def slope(windows):
+        said = models.Inference(network("device_heading"))(frozen, windows)
+        return said.displacement.sum() + said.covariance(-30.0, jnp.float32).sum()
+
+    found = slope(windows)
+    assert np.isfinite(found).all() and np.abs(found[..., :6]).max() > 0
+
+
 def test_the_network_sees_the_window_in_its_frame():
     own = {part: dict(tree) for part, tree in variables("canonical_frame").items()}
     of_frame = {part: tree.pop("frame") for part, tree in own.items()}
@@ -182,6 +238,9 @@ def test_parameters_keep_their_names():
     shape = lambda tree: jax.tree.map(np.shape, tree)  # noqa: E731
     alone = shape(variables("none"))
     assert shape(variables("four_headings")) == alone
+    of_device = shape(variables("device_heading"))
+    assert of_device["params"].pop("facing_up") == (6,)
+    assert of_device == alone
     framed = shape(variables("canonical_frame"))
     frame = {part: tree.pop("frame") for part, tree in framed.items()}
     assert framed == alone

@@ -195,6 +195,18 @@ def test_a_window_at_rest_has_gravity_alone_and_no_displacement():
         np.testing.assert_array_equal(new[~lies], old[~lies])
 
 
+def test_the_axes_of_a_share_of_the_windows_are_hidden():
+    before = batch()
+    axes = np.float32(np.random.default_rng(4).normal(size=(*before.imu.shape[:2], 6)))
+    before = before._replace(imu=np.concatenate([before.imu, axes], axis=-1))
+    after = augmented(before, hidden_axes_share=0.2)
+    hidden = np.asarray((after.imu[..., 6:] == 0).all(axis=(1, 2)))
+    assert 0.17 < hidden.mean() < 0.23
+    np.testing.assert_array_equal(after.imu[~hidden], before.imu[~hidden])
+    np.testing.assert_array_equal(after.imu[hidden, :, :6], before.imu[hidden, :, :6])
+    np.testing.assert_array_equal(after.displacement, before.displacement)
+
+
 def simulated_phone(mirrored):
     """Samples in the world, and positions, of a phone that moves and turns along smooth curves,
     from finite differences; behind the mirror x → −x if `mirrored`."""
