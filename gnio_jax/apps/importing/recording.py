@@ -29,8 +29,7 @@ GAPS = "lacks samples"
 WORTH_TELLING = 0.05
 """Time at both ends for which only one sensor has samples, beyond which a note has it, s (ours)."""
 SLOW = 50.0
-"""Rate below which the impacts of steps are lost, Hz; networks are trained on 100 Hz and more
-(ours)."""
+"""Rate below which the impacts of steps are lost, Hz (ours)."""
 
 
 class Track(NamedTuple):
@@ -93,8 +92,7 @@ def as_sequence(
     recorded = max(rounded_rate(gyro.time), rounded_rate(accel.time))
     notes.append(f"put on a uniform clock of {rate or recorded:g} Hz")
     if recorded < SLOW:
-        problem = f"it was recorded at {recorded:g} Hz, which is slow: steps need {SLOW:g} Hz, and"
-        notes.append(f"{problem} the networks were trained on 100 Hz and more")
+        notes.append(f"it was recorded at {recorded:g} Hz, which is slow: steps need {SLOW:g} Hz")
     attributes = {"dataset": "csv", "group": name, "truth": "none"}
     attributes |= {"imu_compensated": "no"} if raw.raw_gyro else {}
     samples = [Samples(one.time, one.values, str(one.file)) for one in (gyro, accel)]

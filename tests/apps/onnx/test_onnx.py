@@ -167,9 +167,9 @@ WINDOWED = {name: (name, SMALL[name]) for name in ("ctin", "experts", "imot", "i
 WINDOWED["fourier"] = ("trunk", SMALL["trunk"] | {"block": "fourier"})
 WINDOWED |= {
     frame: ("ronin_resnet", {"width": 4, "equivariance": frame})
-    for frame in ("o2_frame", "so2_frame")
+    for frame in ("o2_frame", "so2_frame", "device_heading")
 }
-"""Networks with an operation of their own that a conversion has lost, and EqNIO's frames."""
+"""Networks with an operation of their own that a conversion has lost, and frames."""
 
 
 @pytest.mark.slow
@@ -182,7 +182,9 @@ def test_the_network_alone_gives_the_displacements_of_the_package(converter, nam
     network, options = WINDOWED[name]
     model = registry.create(network, **options)
     variables = registry.initialise(model, jax.random.key(0), CONFIG.data.input_samples)
-    ekf = filtering.make_filter(CONFIG.data, CONFIG.filter)
+    rotation = "per_sample" if registry.channels(model) == 6 else "body_axes"
+    windows = dataclasses.replace(CONFIG.data, window_rotation=rotation)
+    ekf = filtering.make_filter(windows, CONFIG.filter)
     deployed = deploy_network(Network.of(model, variables), ekf)
     (program,) = (one for one in programs(deployed, ekf) if one.name == "network")
     session = onnxruntime.InferenceSession(
