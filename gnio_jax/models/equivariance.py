@@ -88,8 +88,8 @@ class DeviceHeading(Equivariant):
 
     People hold a screen that they can read ahead of them. Seen in the frame of the device, their
     direction hardly varies, and need not be inferred from the gait. Nothing follows from the
-    heading of any other device, e.g. in a pocket: its window keeps its frame, whose heading is drawn
-    in training. A learnt constant, which is added to the samples of the first kind, tells the
+    heading of any other device, e.g. in a pocket: its window keeps its frame, whose heading is
+    drawn in training. A learnt constant, which is added to the samples of the first kind, tells the
     network which one it sees.
 
     The x axis of the frame is the horizontal direction of the device's x axis, from the left of its
@@ -105,8 +105,9 @@ class DeviceHeading(Equivariant):
     ) -> Prediction:
         windows = windows.astype(jnp.float32)
         x_axis, y_axis = windows[..., 6:9], windows[..., 9:12]
-        normal = x_axis[..., 0] * y_axis[..., 1] - x_axis[..., 1] * y_axis[..., 0]  # its z component
-        faces_up = (normal.mean(axis=1) > LEAST_UP)[:, None]
+        # The vertical component of the screen's normal.
+        up = x_axis[..., 0] * y_axis[..., 1] - x_axis[..., 1] * y_axis[..., 0]
+        faces_up = (up.mean(axis=1) > LEAST_UP)[:, None]
         mean = jnp.where(faces_up, x_axis.mean(axis=1)[:, :2], jnp.float32([[1, 0]]))
         heading = jnp.stack(direction(mean[:, 0], mean[:, 1]), axis=-1)
         constant = self.param("facing_up", nn.initializers.zeros, (6,), jnp.float32)

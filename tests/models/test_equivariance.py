@@ -169,7 +169,7 @@ def test_a_device_whose_screen_faces_up_is_seen_in_the_frame_of_its_heading():
 
 
 def test_no_device_axes_make_a_derivative_infinite():
-    """Its x axis on the vertical, both axes hidden, and a screen at 60°, where the frame changes."""
+    """Its x axis on the vertical, hidden axes, and a screen at 60°, where the frame changes."""
     axes = np.zeros((3, SAMPLES, 6), np.float32)
     axes[0, :, [2, 3]] = 1.0
     axes[2] = held(np.full(SAMPLES, np.pi / 3), np.zeros(SAMPLES))
