@@ -3,7 +3,7 @@
 # make test-all   the tests that are marked slow, too: continuous integration runs these
 # make lint   ruff and pyright
 # make pedestrian   the network that comes with gnio-jax anew, from Tyrex and Indoor Location below
-#             $GNIO_DATA: an hour and a half on two cores
+#             $GNIO_DATA: three quarters of an hour on two cores
 # make docs   the documentation as a site, in site/index.html; its notebooks run
 # make links  ask every external link of the pages if it answers; needs a network
 #
@@ -50,21 +50,22 @@ demo: $(VENV)/.package
 	$(BIN)/gnio evaluate --network $(DEMO)
 
 # A network of a quarter of the width learns from poses between the waypoints, and makes truer ones
-# for the network of half the width. This learns the direction of a walk from the gait alone, and
-# then with the heading of the device.
+# for the network of half the width. Each learns the direction of a walk from the gait alone, and then
+# with the heading of the device.
+PLAIN := --set augment.mirror_share=0 --set augment.rocking_share=0 --set "augment.vertical_gain=[1,1]"
+GAIT := --set augment.hidden_axes_share=1
+POSES := --set data.poses_by=$(RUNS)/pedestrian_first_calibrated
 pedestrian: $(VENV)/.package
-	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_calibrated $(RUNS)/pedestrian_gait
-	rm -rf $(RUNS)/pedestrian_first $(RUNS)/pedestrian_first_calibrated
-	$(BIN)/gnio train --config pedestrian --model.width 16 --workdir $(RUNS)/pedestrian_first \
-		--optim.epochs 4 --set augment.mirror_share=0 --set augment.rocking_share=0 \
-		--set "augment.vertical_gain=[1,1]" --set augment.hidden_axes_share=0
+	rm -rf $(RUNS)/pedestrian_first $(RUNS)/pedestrian_first_gait $(RUNS)/pedestrian_first_calibrated
+	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_gait $(RUNS)/pedestrian_calibrated
+	$(BIN)/gnio train --config pedestrian --model.width 16 $(PLAIN) $(GAIT) --optim.epochs 3 \
+		--workdir $(RUNS)/pedestrian_first_gait
+	$(BIN)/gnio train --config pedestrian --model.width 16 $(PLAIN) --optim.epochs 4 \
+		--init-from $(RUNS)/pedestrian_first_gait --workdir $(RUNS)/pedestrian_first
 	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian_first
-	$(BIN)/gnio train --config pedestrian --workdir $(RUNS)/pedestrian_gait \
-		--set data.poses_by=$(RUNS)/pedestrian_first_calibrated \
-		--set augment.hidden_axes_share=1 --optim.epochs 6
-	$(BIN)/gnio train --config pedestrian --workdir $(RUNS)/pedestrian \
-		--set data.poses_by=$(RUNS)/pedestrian_first_calibrated \
-		--init-from $(RUNS)/pedestrian_gait
+	$(BIN)/gnio train --config pedestrian $(POSES) $(GAIT) --workdir $(RUNS)/pedestrian_gait
+	$(BIN)/gnio train --config pedestrian $(POSES) --init-from $(RUNS)/pedestrian_gait \
+		--workdir $(RUNS)/pedestrian
 	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian
 
 test: $(VENV)/.with-$(EXTRAS)
