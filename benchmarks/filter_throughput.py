@@ -40,15 +40,15 @@ def walk(seconds: float, config: filtering.FilterConfig) -> tuple[np.ndarray, ..
     """
     rng = np.random.default_rng(0)
     n, window = config.samples_per_clone, config.clones_per_window
-    intervals = int(seconds / DT) // n
-    t = np.arange(intervals * n) * DT
+    intervals = int(seconds / config.dt) // n
+    t = np.arange(intervals * n) * config.dt
     speed, rate = 1.2, 0.24
     bobbing = 9.81 + 2 * np.sin(4 * np.pi * t)
     gyro = np.stack([0 * t, 0 * t, np.full_like(t, rate)], 1)
     gyro += 1e-3 * rng.standard_normal((len(t), 3))
     accel = np.stack([0 * t, np.full_like(t, speed * rate), bobbing], 1)
     accel += 1e-2 * rng.standard_normal((len(t), 3))
-    turned = rate * window * n * DT
+    turned = rate * window * n * config.dt
     chord = speed / rate * np.array([np.sin(turned), 1 - np.cos(turned), 0.0])
     displacement = np.tile(chord, (intervals, 1))
     displacement += 0.02 * rng.standard_normal(displacement.shape)
