@@ -81,7 +81,8 @@ def align_recording(
         window_rotation: With "per_sample" every sample is rotated to the world by its own attitude,
             and a window needs only its start's yaw removed. With "single" the samples stay in the
             body, and a window is rotated by its start's attitude without yaw. "body_axes" is
-            "per_sample" with the x and y axes of the body as six more channels.
+            "per_sample" with the x and y axes of the body as six more channels, "hidden_axes" with
+            zeros there.
     """
     signals = np.stack([accel, gyro], axis=2)
     rotation = remove_yaw(attitude[start])
@@ -89,8 +90,9 @@ def align_recording(
         rotation = rotation @ attitude[start]
     else:
         signals = attitude @ signals
-    if window_rotation == "body_axes":
-        signals = np.concatenate([signals, attitude[:, :, :2]], axis=2)
+    if window_rotation in ("body_axes", "hidden_axes"):
+        shown = float(window_rotation == "body_axes")
+        signals = np.concatenate([signals, shown * attitude[:, :, :2]], axis=2)
     imu = signals.transpose(0, 2, 1).reshape(len(signals), -1)
     return AlignedRecording(imu.astype(np.float32), rotation.astype(np.float32))
 
@@ -152,11 +154,14 @@ class WindowCut(NamedTuple):
     """Slice of the window's bias-corrected rates that propagate attitude between its samples."""
     body_axes: bool = False
     """Whether the window has the x and y axes of the body as six more channels."""
+    hidden: bool = False
+    """Whether these axes are zero."""
 
 
 WINDOW_CUTS = {
     "per_sample": WindowCut(0, True, slice(-1)),
     "body_axes": WindowCut(0, True, slice(-1), body_axes=True),
+    "hidden_axes": WindowCut(0, True, slice(-1), body_axes=True, hidden=True),
     # No rate is integrated: all samples have the attitude of the first.
     "single": WindowCut(0, True, slice(0)),
     # In TLIO's tracker a sample with stamp t drives the filter from t − dt to t, and its own rate
@@ -212,7 +217,8 @@ def cut_window(
     attitudes = jnp.broadcast_to(attitudes, (3, 3, len(gyro)))
     signals = geometry.matmul(attitudes, jnp.stack([accel.T, gyro.T], axis=1))
     if cut.body_axes:
-        signals = jnp.concatenate([signals, attitudes[:, :2]], axis=1)
+        axes = jnp.zeros_like(attitudes[:, :2]) if cut.hidden else attitudes[:, :2]
+        signals = jnp.concatenate([signals, axes], axis=1)
     return signals.transpose(2, 1, 0).reshape(len(gyro), -1)
 
 

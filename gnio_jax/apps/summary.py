@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import numpy as np
 
-from gnio_jax.apps import drive
+from gnio_jax.apps import drive, heading
 from gnio_jax.apps.importing import GAPS, Imported
 from gnio_jax.apps.publish import describe_data, describe_error
 from gnio_jax.apps.sensors import SensorUse
@@ -151,7 +151,8 @@ def summarise(
         of_start = _warnings_of_car_start(ready, shown)
     else:
         shown = gait.has_steps
-        first = _warnings_of_gait(gait, summary.steps)
+        assert isinstance(source, TrainedNetwork)
+        first = [*_warnings_of_gait(gait, summary.steps), *_warnings_of_heading(ready, source)]
         of_walk = _warnings_of_walk(summary, recorded_rate, ekf)
         of_start = _warnings_of_start(ready, ekf)
     warnings = (
@@ -208,6 +209,19 @@ def _warnings_of_gait(gait: Gait, steps: float | None) -> list[str]:
         f"no walk in {others.mean():.0%} of the time, the longest from {start} s to {stop} s: it "
         "moves without steps. If it was in a vehicle or on a trolley, the path there is wrong, and "
         "the error is larger than expected"
+    ]
+
+
+def _warnings_of_heading(ready: PreparedRecording, source: TrainedNetwork) -> list[str]:
+    """A warning if the device does not look where the gait goes."""
+    angle = heading.angle_beside(ready, source) if heading.uses_heading(source) else np.nan
+    if not abs(angle) > heading.BESIDE:
+        return []
+    side = "left" if angle > 0 else "right"
+    return [
+        f"heading: by the gait, the carrier walks {abs(angle):.0f}° to the {side} of where the "
+        "device looks, and the path may be turned. If its x axis does not point from the left of a "
+        "screen to its right, as that of a phone does, give --heading gait"
     ]
 
 

@@ -138,6 +138,7 @@ def estimate_recording(
         ekf,
         init="static",
         gyro_bias="rest",
+        orientation="filter",
         from_first=True,
         corrector=load_corrector(config.filter, config.data.rate, trained),
     )

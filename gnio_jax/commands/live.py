@@ -30,6 +30,9 @@ class LiveOptions:
     network: str | None = None
     """Network: the folder of a run, a package or a name (see gnio weights); by default the one that
     comes with gnio-jax, else the newest run below runs/."""
+    heading: Literal["device", "gait"] = "device"
+    """What shows the direction of a walk while a screen faces up: where the device looks, or the
+    gait alone, for a device whose x axis does not point from the left of a screen to its right."""
     out: NewFile | None = None
     """File for the trajectory in TUM format, which is written when the stream has ended."""
     page: str | None = None
@@ -85,7 +88,7 @@ def live(request: LiveOptions, _call: options.Call) -> None:
     import jax  # late, so that mistakes do not wait for it
 
     from gnio_jax import networks
-    from gnio_jax.apps import rerun
+    from gnio_jax.apps import heading, rerun
     from gnio_jax.apps.export import export
     from gnio_jax.apps.live import session, tracking
 
@@ -95,6 +98,7 @@ def live(request: LiveOptions, _call: options.Call) -> None:
     if request.rerun:
         rerun.check(request.rerun)
     run, say = networks.load(request.network), console.say
+    run = heading.without_heading(run) if request.heading == "gait" else run
     interruption: BaseException | None = None
     with contextlib.ExitStack() as running:
         source, show_state = _open(request, running)

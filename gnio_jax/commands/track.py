@@ -37,6 +37,9 @@ class TrackOptions:
         tuple[Literal["magnetometer", "barometer", "gnss"], ...], Words(repeated=True)
     ] = ()
     """A sensor beside the IMU that is not used; may be repeated."""
+    heading: Literal["device", "gait"] = "device"
+    """What shows the direction of a walk while a screen faces up: where the device looks, or the
+    gait alone, for a device whose x axis does not point from the left of a screen to its right."""
     carrier: str | None = None
     """What carries the IMU: person, car, or a file with the filter of a car (as configs/drive.yaml,
     that of car). By default person, and car if a recording without steps has the fixes of a
@@ -61,6 +64,7 @@ def track(request: TrackOptions, call: options.Call) -> None:
       {prog} walk.csv --accel-sign ios --format csv mcap
       {prog} walk.zip --without magnetometer --format gpx
       {prog} drive.zip --carrier car --format geojson
+      {prog} imu.csv --heading gait                an IMU that is no phone
       {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
           accel_z=az
     """
@@ -73,7 +77,7 @@ def track(request: TrackOptions, call: options.Call) -> None:
     import jax  # late, so that mistakes do not wait for it
 
     from gnio_jax import networks
-    from gnio_jax.apps import drive, sensors
+    from gnio_jax.apps import drive, heading, sensors
     from gnio_jax.apps import track as tracking
     from gnio_jax.apps.importing import read_imported
 
@@ -85,7 +89,9 @@ def track(request: TrackOptions, call: options.Call) -> None:
     if carrier is None and drive.is_drive(recording.sequence, readings):
         console.say("no steps, and fixes as fast as a car: tracked as a car (--carrier)")
         source = drive.load_filter("car")
-    source = source or networks.load(request.network)
+    if source is None:
+        source = networks.load(request.network)
+        source = heading.without_heading(source) if request.heading == "gait" else source
     out = request.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)

@@ -138,11 +138,11 @@ class DataConfig:
     train_stride_seconds: Positive = 0.1
     """Distance between window starts in training, s (paper: 0.1 s). With a shorter distance the
     network sees the same steps at more phases."""
-    window_rotation: Literal["per_sample", "single", "body_axes"] = "per_sample"
+    window_rotation: Literal["per_sample", "single", "body_axes", "hidden_axes"] = "per_sample"
     """Rotate each sample with its own attitude, or the whole window with the attitude at its start
     (eq. 1 read literally). body_axes is per_sample with the x and y axes of the body as six more
-    channels, for networks that see the body (ai_imu, airio, device_heading, and a
-    corrector)."""
+    channels, for networks that see the body (ai_imu, airio, device_heading, and a corrector);
+    hidden_axes has zeros there (device_heading)."""
     train_split: str = "train"
     """Split of the dataset for training. train-0of4 leaves out the first of four folds of it, in
     which people and sessions are whole: with a network for each fold, gnio calibrate has walks that
@@ -579,10 +579,13 @@ class FilterSettings(FilterOptions):
     after the displacement of a clone interval, in this order. zero_velocity: {std: 0.02} measures a
     velocity of zero with a standard deviation of 0.02 m/s while the IMU rests. `null` takes one
     away. Others are those that a plugin registers (ours)."""
-    window_rotation: Literal["per_sample", "single", "body_axes", "tlio"] | None = None
+    window_rotation: Literal["per_sample", "single", "body_axes", "hidden_axes", "tlio"] | None = (
+        None
+    )
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without subtracting the filter's biases,
-    for weights trained that way."""
+    for weights trained that way. `hidden_axes` hides the axes of the body from a network with
+    model.equivariance: device_heading, for a device that is no phone."""
     corrector: str | None = None
     """Network with model.corrector (the folder of a run, a package or a name), whose corrector
     comes before network and filter: both get corrected samples, and the filter takes the variances

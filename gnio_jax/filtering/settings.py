@@ -80,11 +80,13 @@ class FilterConfig(FilterOptions):
     """IMU samples C before a measurement's window that the network sees too (ours)."""
     history: Literal["diagonal", "core"] = "diagonal"
     """Keep the diagonal of the core covariance at every interval, or the whole 15×15 block too."""
-    window_rotation: Literal["per_sample", "single", "body_axes", "tlio"] = "per_sample"
+    window_rotation: Literal["per_sample", "single", "body_axes", "hidden_axes", "tlio"] = (
+        "per_sample"
+    )
     """How the network's window is rotated. per_sample: each sample with its own attitude. single:
     all with that of the start (paper eq. 1 read literally). body_axes: as per_sample, with the x
-    and y axes of the body as six more channels. tlio: the window is cut and rotated as in TLIO's
-    tracker, one sample earlier and without subtracting the biases."""
+    and y axes of the body as six more channels; hidden_axes: with zeros there. tlio: the window is
+    cut and rotated as in TLIO's tracker, one sample earlier and without subtracting the biases."""
     gate_softness: NonNegative = 0.0
     """0 accepts or rejects; above 0 the gate has a slope, for training: a measurement's information
     is weighted by the logistic function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""

@@ -93,11 +93,13 @@ class DeviceHeading(Equivariant):
     network which one it sees.
 
     The x axis of the frame is the horizontal direction of the device's x axis, from the left of its
-    screen to its right, in the mean over the window. Windows have the axes of the body; where these
-    are zero (`augment.hidden_axes_share`), the heading is not known.
+    screen to its right, in the mean over the window. Windows have the axes of the body. Where these
+    are zero (`augment.hidden_axes_share`, `filter.window_rotation: hidden_axes`), the heading is
+    not known.
     """
 
     channels = 12
+    hides_axes = True
 
     @nn.compact
     def __call__(

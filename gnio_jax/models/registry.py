@@ -136,14 +136,16 @@ def check_experiment(model: nn.Module, config: TrainConfig, source: str = "confi
     in_filter = location.child("filter.window_rotation")
     if channels(model) == 12:
         subject = f"{name}, its equivariance or its corrector sees the body"
-        if config.data.window_rotation != "body_axes":
+        hidden = ("hidden_axes",) if getattr(model, "hides_axes", False) else ()
+        if config.data.window_rotation not in ("body_axes", *hidden):
             rotation.refuse(f"must be body_axes: {subject}")
-        if config.filter.window_rotation not in (None, "body_axes"):
+        if config.filter.window_rotation not in (None, "body_axes", *hidden):
             in_filter.refuse(f"must be null: {subject}")
-    elif config.data.window_rotation == "body_axes":
-        rotation.refuse(f"is body_axes, which {name} does not see", "leave it out")
-    elif config.filter.window_rotation == "body_axes":
-        in_filter.refuse(f"is body_axes, which {name} does not see", "leave it out")
+    else:
+        for place, setting in ((rotation, config.data), (in_filter, config.filter)):
+            if setting.window_rotation in ("body_axes", "hidden_axes"):
+                problem = f"is {setting.window_rotation}, which {name} does not see"
+                place.refuse(problem, "leave it out")
     if config.filter.measures not in quantities(model):
         problem = f"is {config.filter.measures}, which {name} does not predict"
         location.child("filter.measures").refuse(problem, f"known: {', '.join(quantities(model))}")
