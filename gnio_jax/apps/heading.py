@@ -58,17 +58,18 @@ def angle_beside(ready: PreparedRecording, trained: TrainedNetwork) -> float:
     samples = strides * windows.stride
     if samples < windows.input_samples + windows.stride or ready.attitude is None:
         return np.nan
+    attitude = ready.attitude[: samples + 1]
     minute = ready._replace(
         time=ready.time[: strides + 1],
         gyro=ready.gyro[:samples],
         accel=ready.accel[:samples],
         imu_valid=None if ready.imu_valid is None else ready.imu_valid[:samples],
-        attitude=ready.attitude[: samples + 1],
+        attitude=attitude,
     )
     network = Network.of(trained.model, trained.variables)
     (displacements,) = infer(network, [minute], windows)
     moved = displacements.value[:, 0] + 1j * displacements.value[:, 1]
-    up = minute.attitude[windows.stride :: windows.stride, 2, 2]
+    up = attitude[windows.stride :: windows.stride, 2, 2]
     directed = (np.abs(moved) > LEAST_MOVED) & (up > LEAST_UP)  # not where it is NaN
     if not directed.any():
         return np.nan
