@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from gnio_jax import networks
+from gnio_jax.apps.heading import without_heading
 from gnio_jax.apps.importing import units
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.readings import RawReadings
@@ -64,6 +65,7 @@ def track(
     accel: Any,
     network: str | Path = "pedestrian",
     sensors: Mapping[str, Any] = MappingProxyType({}),
+    heading: Literal["device", "gait"] = "device",
 ) -> Odometry:
     """The trajectory of a phone that somebody carries, from arrays of its IMU's samples.
 
@@ -88,11 +90,14 @@ def track(
               the altitude, or a standard deviation, is not known.
 
             A sensor of which the filter refuses most is left out, and a note says so.
+        heading: What shows the direction of a walk while a screen faces up: "device", where the
+            device looks, or "gait" alone, for a device whose x axis does not point from the left of
+            a screen to its right.
 
     Raises:
         InputError: An array has the wrong shape, a value that is not finite, or another unit; the
-            samples last less than two seconds or so; there is no such network or sensor. It is a
-            `ValueError`.
+            samples last less than two seconds or so; there is no such network or sensor; or the
+            network sees no heading that could be left out. It is a `ValueError`.
     """
     time, gyro, accel = _checked_samples(time, gyro, accel)
     others = tuple(_checked_readings(name, parts, time) for name, parts in sensors.items())
@@ -106,6 +111,7 @@ def track(
         others=others,
     )
     chosen = networks.load(network)
+    chosen = without_heading(chosen) if heading == "gait" else chosen
     with jax.enable_x64(True):  # for the filter; the network states its float32
         imported = as_sequence(recording, ImportOptions(), None, SOURCE)
         sequence = imported.sequence

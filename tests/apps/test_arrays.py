@@ -156,6 +156,8 @@ def test_what_is_refused(message, runs, samples):
     assert message in str(error.value) and isinstance(error.value, ValueError)
 
 
-def test_weights_that_do_not_exist(samples):
+def test_a_network_that_does_not_exist_or_sees_no_heading(runs, samples):
     with pytest.raises(InputError, match="did you mean 'pedestrian'"):
         gnio_jax.track(*samples, network="pedestrain")
+    with pytest.raises(InputError, match=r"heading gait: walker does not use the heading"):
+        gnio_jax.track(*samples, network=runs / "walker", heading="gait")
