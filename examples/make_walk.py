@@ -1,6 +1,6 @@
 """Writes walk.csv, the recording that `gnio track examples/walk.csv` is tried with: a minute of a
-computed person who strolls with the phone in the hand. The heading of a computed phone is arbitrary;
-this one looks ahead, as people hold theirs. No split has this person or this seed.
+computed person who strolls with the phone in the hand. The heading of a computed phone is
+arbitrary. This one looks ahead, as people hold theirs. No split has this person or this seed.
 
     python examples/make_walk.py
 
