@@ -64,8 +64,8 @@ def track(
     gyro: Any,
     accel: Any,
     network: str | Path = "pedestrian",
-    sensors: Mapping[str, Any] = MappingProxyType({}),
     heading: Literal["device", "gait"] = "device",
+    sensors: Mapping[str, Any] = MappingProxyType({}),
 ) -> Odometry:
     """The trajectory of a phone that somebody carries, from arrays of its IMU's samples.
 
@@ -80,6 +80,9 @@ def track(
         accel: (n, 3) specific force, body frame, m/s², with gravity in it: the axis that points up
             reads +9.81 at rest, as on Android.
         network: Name of a trained network, or its folder or zip.
+        heading: What shows the direction of a walk while a screen faces up: "device", where the
+            device looks, or "gait" alone, for a device whose x axis does not point from the left of
+            a screen to its right.
         sensors: Readings of the phone's other sensors, with the stamps of the sensor, f of them in
             any order, on the clock of `time`:
 
@@ -90,9 +93,6 @@ def track(
               the altitude, or a standard deviation, is not known.
 
             A sensor of which the filter refuses most is left out, and a note says so.
-        heading: What shows the direction of a walk while a screen faces up: "device", where the
-            device looks, or "gait" alone, for a device whose x axis does not point from the left of
-            a screen to its right.
 
     Raises:
         InputError: An array has the wrong shape, a value that is not finite, or another unit; the

@@ -142,10 +142,10 @@ def check_experiment(model: nn.Module, config: TrainConfig, source: str = "confi
         if config.filter.window_rotation not in (None, "body_axes", *hidden):
             in_filter.refuse(f"must be null: {subject}")
     else:
-        for place, setting in ((rotation, config.data), (in_filter, config.filter)):
+        for field, setting in ((rotation, config.data), (in_filter, config.filter)):
             if setting.window_rotation in ("body_axes", "hidden_axes"):
                 problem = f"is {setting.window_rotation}, which {name} does not see"
-                place.refuse(problem, "leave it out")
+                field.refuse(problem, "leave it out")
     if config.filter.measures not in quantities(model):
         problem = f"is {config.filter.measures}, which {name} does not predict"
         location.child("filter.measures").refuse(problem, f"known: {', '.join(quantities(model))}")
