@@ -1,18 +1,17 @@
 """Rate, units and sign of a stream, and sensors that contradict each other."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from gnio_jax.apps.live import checks, samples
 from gnio_jax.apps.live.checks import Nature, with_measured_rate
+from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError
 from tests.support import known_walk
 from tests.support.checks import unchecked
 from tests.support.live_streams import STILL, arrivals, as_lines, of_lines, samples_of, texts_of
 
-WALK = Path(__file__).parents[3] / "examples" / "walk.csv"
+WALK = pedestrian(30, 330, seconds=60.0, rate=100.0)
 
 
 def rate_of(lines, imu_rate=None):
@@ -92,9 +91,8 @@ def test_wrong_stamps_before_the_first_second_cost_no_memory():
 
 
 def walk(change=lambda gyro, accel: (gyro, accel), seconds=30):
-    rows = np.loadtxt(WALK, delimiter=",", skiprows=1)[: seconds * 100]
-    gyro, accel = change(rows[:, 1:4], rows[:, 4:])
-    return as_lines((rows[:, 0], gyro, accel))
+    time, gyro, accel = (part[: seconds * 100] for part in (WALK.time, WALK.gyro, WALK.accel))
+    return as_lines((time, *change(gyro, accel)))
 
 
 SWAP = [1, 0, 2]
@@ -154,7 +152,7 @@ def test_the_sign_of_ios_is_named_or_warned_of(sign, platform):
     negative = -1.0 if platform == "ios" else 1.0
     lines = walk(lambda gyro, accel: (gyro, negative * accel), seconds=3)
     stage = list(with_measured_rate(of_lines(lines), Nature("udp:5", None, sign), print))
-    wanted = np.loadtxt(WALK, delimiter=",", skiprows=1)[:300, 4:]
+    wanted = WALK.accel[:300]
     right = sign == "detect" or (sign or "android") == platform
     found = np.array([sample.accel for sample in samples_of(stage)])
     np.testing.assert_allclose(found, wanted if right else -wanted)
