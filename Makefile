@@ -3,7 +3,7 @@
 # make test-all   the tests that are marked slow, too: continuous integration runs these
 # make lint   ruff and pyright
 # make pedestrian   the network that comes with gnio-jax anew, from Tyrex and Indoor Location below
-#             $GNIO_DATA: three quarters of an hour on two cores
+#             $GNIO_DATA: half an hour on two cores
 # make docs   the documentation as a site, in site/index.html; its notebooks run
 # make links  ask every external link of the pages if it answers; needs a network
 #
@@ -50,13 +50,15 @@ demo: $(VENV)/.package
 	$(BIN)/gnio evaluate --network $(DEMO)
 
 # A network of a quarter of the width learns from poses between the waypoints, and makes truer ones
-# for the network of half the width. Each learns the direction of a walk from the gait alone, and then
-# with the heading of the device.
-PLAIN := --set augment.mirror_share=0 --set augment.rocking_share=0 --set "augment.vertical_gain=[1,1]"
+# for the network of half the width. Each learns the direction of a walk from the gait alone, and
+# then with the heading of the device.
+PLAIN := --set augment.mirror_share=0 --set augment.rocking_share=0 \
+	--set "augment.vertical_gain=[1,1]"
 GAIT := --set augment.hidden_axes_share=1
 POSES := --set data.poses_by=$(RUNS)/pedestrian_first_calibrated
 pedestrian: $(VENV)/.package
-	rm -rf $(RUNS)/pedestrian_first $(RUNS)/pedestrian_first_gait $(RUNS)/pedestrian_first_calibrated
+	rm -rf $(RUNS)/pedestrian_first $(RUNS)/pedestrian_first_gait
+	rm -rf $(RUNS)/pedestrian_first_calibrated
 	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_gait $(RUNS)/pedestrian_calibrated
 	$(BIN)/gnio train --config pedestrian --model.width 16 $(PLAIN) $(GAIT) --optim.epochs 3 \
 		--workdir $(RUNS)/pedestrian_first_gait

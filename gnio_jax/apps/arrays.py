@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -64,7 +64,7 @@ def track(
     gyro: Any,
     accel: Any,
     network: str | Path = "pedestrian",
-    heading: Literal["device", "gait"] = "device",
+    heading: str = "device",
     sensors: Mapping[str, Any] = MappingProxyType({}),
 ) -> Odometry:
     """The trajectory of a phone that somebody carries, from arrays of its IMU's samples.
@@ -81,8 +81,8 @@ def track(
             reads +9.81 at rest, as on Android.
         network: Name of a trained network, or its folder or zip.
         heading: What shows the direction of a walk while a screen faces up: "device", where the
-            device looks, or "gait" alone, for a device whose x axis does not point from the left of
-            a screen to its right.
+            device looks, or "gait" alone, for a phone that is held across and for a device that is
+            no phone.
         sensors: Readings of the phone's other sensors, with the stamps of the sensor, f of them in
             any order, on the clock of `time`:
 
@@ -111,6 +111,8 @@ def track(
         others=others,
     )
     chosen = networks.load(network)
+    if heading not in ("device", "gait"):
+        raise InputError("heading", f"must be 'device' or 'gait', found {heading!r}")
     chosen = without_heading(chosen) if heading == "gait" else chosen
     with jax.enable_x64(True):  # for the filter; the network states its float32
         imported = as_sequence(recording, ImportOptions(), None, SOURCE)

@@ -2,7 +2,7 @@
 
 A network with `model.equivariance: device_heading` expects a screen that faces up to look ahead.
 Devices other than phones may have their axes otherwise. The network infers the direction from the
-gait alone, too, and this is compared with the axes here.
+gait alone, too, and both are compared here.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from gnio_jax.evaluation.infer import infer
 from gnio_jax.models import Network
 from gnio_jax.models.equivariance import LEAST_UP
 from gnio_jax.networks import TrainedNetwork
+from gnio_jax.windows import window_starts
 
 COMPARED_SECONDS = 60.0
 """Time from the start whose directions are compared, s (ours): the attitude is that of the
@@ -26,19 +27,21 @@ LEAST_MOVED = 0.3
 LEAST_AGREEMENT = 0.5
 """Smallest length of the mean of the directions, as unit vectors, that is a direction itself
 (ours)."""
-BESIDE = 60.0
+LEAST_SECONDS = 10.0
+"""Shortest time with a direction, over all windows of the screen's heading, s (ours)."""
+MISALIGNED = 60.0
 """Angle from which the device does not look where its carrier walks, degrees (ours)."""
 
 
 def uses_heading(trained: TrainedNetwork) -> bool:
     """Whether a network sees the heading of the device."""
-    hides = getattr(trained.model, "hides_axes", False)
-    return hides and trained.config.filter.window_rotation != "hidden_axes"
+    rotation = trained.config.filter.window_rotation or trained.config.data.window_rotation
+    return getattr(trained.model, "hides_axes", False) and rotation != "hidden_axes"
 
 
 def without_heading(trained: TrainedNetwork) -> TrainedNetwork:
-    """The network that infers the direction from the gait alone. Raises `InputError` if it has no
-    other source."""
+    """The network with the axes of the device hidden, so that it infers the direction from the gait
+    alone. Raises `InputError` for a network that sees no axes."""
     if not uses_heading(trained):
         problem = f"{trained.name} does not use the heading of the device"
         raise InputError("--heading gait", problem, "leave it out")
@@ -46,12 +49,13 @@ def without_heading(trained: TrainedNetwork) -> TrainedNetwork:
     return trained._replace(config=dataclasses.replace(trained.config, filter=settings))
 
 
-def angle_beside(ready: PreparedRecording, trained: TrainedNetwork) -> float:
-    """The angle from the direction in which the device looks (its y axis) to that in which the gait
-    goes, while the screen faces up, in the mean over the first minute, degrees, positive to the
-    left. NaN if there is none.
+def misalignment(ready: PreparedRecording, trained: TrainedNetwork) -> float:
+    """The angle from the direction in which the device looks to that in which the gait goes, in the
+    mean over the windows of the first minute whose screen faces up for the network, degrees,
+    positive to the left. NaN if these are few, or do not agree.
 
-    `ready` has the attitude of the integrated gyro.
+    A device looks to the left of its x axis, along the ground. `ready` has the attitude of the
+    integrated gyro.
     """
     windows = dataclasses.replace(trained.config.data, window_rotation="hidden_axes")
     strides = min(ready.strides, round(COMPARED_SECONDS / windows.stride_seconds))
@@ -68,10 +72,14 @@ def angle_beside(ready: PreparedRecording, trained: TrainedNetwork) -> float:
     )
     network = Network.of(trained.model, trained.variables)
     (displacements,) = infer(network, [minute], windows)
-    moved = displacements.value[:, 0] + 1j * displacements.value[:, 1]
-    up = attitude[windows.stride :: windows.stride, 2, 2]
-    directed = (np.abs(moved) > LEAST_MOVED) & (up > LEAST_UP)  # not where it is NaN
-    if not directed.any():
+    start = window_starts(samples + 1, windows.input_samples, windows.stride)
+    moved = displacements.value[-len(start) :, 0] + 1j * displacements.value[-len(start) :, 1]
+    # The mean over the window with its context, as in `DeviceHeading`; windows begin at the yaw of
+    # the device after the context.
+    up = np.convolve(attitude[:-1, 2, 2], np.full(windows.input_samples, 1), "valid")
+    faces_up = up[start] / windows.input_samples > LEAST_UP
+    directed = (np.abs(moved) > LEAST_MOVED) & faces_up  # not where it is NaN
+    if directed.sum() * windows.stride_seconds < LEAST_SECONDS:
         return np.nan
     mean = np.mean(moved[directed] / np.abs(moved[directed]))
     return float(np.degrees(np.angle(mean / 1j))) if np.abs(mean) >= LEAST_AGREEMENT else np.nan

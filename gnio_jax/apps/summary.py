@@ -64,7 +64,8 @@ class Summary(NamedTuple):
     """Horizontal distance of the end from the start, m."""
     expected_error: float
     """Expected horizontal error at the end, root mean square by the filter's covariance, m. NaN if
-    there are no steps or the filter has diverged: no covariance shows how wrong the path is."""
+    there are no steps, the device does not look where its carrier walks, or the filter has
+    diverged: no covariance shows how wrong the path is."""
     steps: float | None
     """Share of the seconds that are within a walk (`detect_gait`); None if it is too short."""
     at_rest: float
@@ -150,9 +151,10 @@ def summarise(
         first, of_walk = _warnings_of_drive(summary, shown), []
         of_start = _warnings_of_car_start(ready, shown)
     else:
-        shown = gait.has_steps
         assert isinstance(source, TrainedNetwork)
-        first = [*_warnings_of_gait(gait, summary.steps), *_warnings_of_heading(ready, source)]
+        of_heading = _warnings_of_heading(ready, source) if gait.has_steps else []
+        shown = gait.has_steps and not of_heading
+        first = [*of_heading, *_warnings_of_gait(gait, summary.steps)]
         of_walk = _warnings_of_walk(summary, recorded_rate, ekf)
         of_start = _warnings_of_start(ready, ekf)
     warnings = (
@@ -214,14 +216,14 @@ def _warnings_of_gait(gait: Gait, steps: float | None) -> list[str]:
 
 def _warnings_of_heading(ready: PreparedRecording, source: TrainedNetwork) -> list[str]:
     """A warning if the device does not look where the gait goes."""
-    angle = heading.angle_beside(ready, source) if heading.uses_heading(source) else np.nan
-    if not abs(angle) > heading.BESIDE:
+    angle = heading.misalignment(ready, source) if heading.uses_heading(source) else np.nan
+    if not abs(angle) > heading.MISALIGNED:
         return []
     side = "left" if angle > 0 else "right"
     return [
         f"heading: by the gait, the carrier walks {abs(angle):.0f}° to the {side} of where the "
-        "device looks, and the path may be turned. If its x axis does not point from the left of a "
-        "screen to its right, as that of a phone does, give --heading gait"
+        "device looks, so the path may be turned, and no error can be stated. If the device is "
+        "held across, or is no phone, give --heading gait"
     ]
 
 

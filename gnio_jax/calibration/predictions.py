@@ -52,8 +52,10 @@ def average_over_headings(network: TrainedNetwork, source: str) -> TrainedNetwor
     """Average a network over four headings (`models.equivariance.FourHeadings`), which has the same
     weights. Raises `InputError` naming `source` for a network that was not trained on every
     heading, or is equivariant in another way."""
-    if network.config.model.equivariance not in ("none", "four_headings"):
-        raise InputError(source, "its network has a canonical frame: there is nothing to average")
+    frame = network.config.model.equivariance
+    if frame not in ("none", "four_headings"):
+        problem = f"its network has model.equivariance: {frame}, a frame of its own"
+        raise InputError(source, problem, "leave --average-headings out")
     averaged = dataclasses.replace(network.config.model, equivariance="four_headings")
     config = dataclasses.replace(network.config, model=averaged)
     configuration.validate(config, source)

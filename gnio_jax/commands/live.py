@@ -32,7 +32,7 @@ class LiveOptions:
     comes with gnio-jax, else the newest run below runs/."""
     heading: Literal["device", "gait"] = "device"
     """What shows the direction of a walk while a screen faces up: where the device looks, or the
-    gait alone, for a device whose x axis does not point from the left of a screen to its right."""
+    gait alone, for a phone that is held across and for a device that is no phone."""
     out: NewFile | None = None
     """File for the trajectory in TUM format, which is written when the stream has ended."""
     page: str | None = None

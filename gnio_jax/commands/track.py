@@ -39,7 +39,7 @@ class TrackOptions:
     """A sensor beside the IMU that is not used; may be repeated."""
     heading: Literal["device", "gait"] = "device"
     """What shows the direction of a walk while a screen faces up: where the device looks, or the
-    gait alone, for a device whose x axis does not point from the left of a screen to its right."""
+    gait alone, for a phone that is held across and for a device that is no phone."""
     carrier: str | None = None
     """What carries the IMU: person, car, or a file with the filter of a car (as configs/drive.yaml,
     that of car). By default person, and car if a recording without steps has the fixes of a
@@ -73,6 +73,9 @@ def track(request: TrackOptions, call: options.Call) -> None:
     if request.network and request.carrier not in (None, "person"):
         problem = f"{request.network} is a network, and a car has none"
         raise InputError("--network", problem, f"leave it out with --carrier {request.carrier}")
+    if request.heading == "gait" and request.carrier not in (None, "person"):
+        remedy = f"leave it out with --carrier {request.carrier}"
+        raise InputError("--heading gait", "is for people, and a car has no gait", remedy)
     console.compile_quickly()
     import jax  # late, so that mistakes do not wait for it
 
@@ -81,7 +84,8 @@ def track(request: TrackOptions, call: options.Call) -> None:
     from gnio_jax.apps import track as tracking
     from gnio_jax.apps.importing import read_imported
 
-    carrier = "person" if request.network else request.carrier
+    on_foot = request.network or request.heading == "gait"
+    carrier = "person" if on_foot else request.carrier
     source: Any = None if carrier in (None, "person") else drive.load_filter(carrier)
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     recording = read_imported(request.file, request.recording)

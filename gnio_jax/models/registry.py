@@ -138,9 +138,9 @@ def check_experiment(model: nn.Module, config: TrainConfig, source: str = "confi
         subject = f"{name}, its equivariance or its corrector sees the body"
         hidden = ("hidden_axes",) if getattr(model, "hides_axes", False) else ()
         if config.data.window_rotation not in ("body_axes", *hidden):
-            rotation.refuse(f"must be body_axes: {subject}")
+            rotation.refuse(f"must be {' or '.join(('body_axes', *hidden))}: {subject}")
         if config.filter.window_rotation not in (None, "body_axes", *hidden):
-            in_filter.refuse(f"must be null: {subject}")
+            in_filter.refuse(f"must be {' or '.join(('null', *hidden))}: {subject}")
     else:
         for field, setting in ((rotation, config.data), (in_filter, config.filter)):
             if setting.window_rotation in ("body_axes", "hidden_axes"):
@@ -206,6 +206,9 @@ def create(name: str, **values: Any) -> nn.Module:
             raise InputError(subject, problem, "leave model.equivariance out")
         network = _EQUIVARIANT[equivariance](network)
     if corrector != "none":
+        if equivariance != "none":
+            problem = "has a frame, before which no corrector can be"
+            raise InputError(subject, problem, "leave model.corrector or model.equivariance out")
         if memory:
             problem = "sees single samples, and a corrector needs windows"
             raise InputError(subject, problem, "leave model.corrector out")

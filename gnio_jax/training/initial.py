@@ -47,7 +47,7 @@ def _describe_network(config: TrainConfig) -> dict[str, Any]:
     # Any network can be averaged over headings, which adds no parameters.
     frame = config.model.equivariance
     frame = "none" if frame == "four_headings" else frame
-    parts = {"name": config.model.name, "frame": frame, "corrector": config.model.corrector}
+    parts = {"name": config.model.name, "equivariance": frame, "corrector": config.model.corrector}
     options = {**parts, **options}
     of_windows = ("rate", "window_seconds", "context_seconds", "window_rotation")
     windows = {f"data.{name}": getattr(config.data, name) for name in of_windows}

@@ -10,6 +10,7 @@ from flax import linen as nn
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import models
+from gnio_jax.errors import InputError
 from gnio_jax.models import equivariance, registry
 from gnio_jax.models.heads import root_mean_square
 from gnio_jax.models.layers import conv_norm, linear
@@ -281,3 +282,9 @@ def test_a_window_without_horizontal_vectors_has_a_heading_and_finite_derivative
     lengths, slope = jax.vjp(equivariance.length, vectors)
     np.testing.assert_array_equal(lengths, [5, 0])
     np.testing.assert_allclose(slope(jnp.ones(2, jnp.float32))[0], [[0.6, -0.8], [0, 0]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["four_headings", "device_heading"])
+def test_a_frame_after_a_corrector_is_refused(kind):
+    with pytest.raises(InputError, match=r"^model 'tlio': has a frame.*leave model.corrector"):
+        models.create("tlio", equivariance=kind, corrector="airimu")
