@@ -100,7 +100,7 @@ def test_the_path_of_a_recording_without_any_training(gnio, tmp_path):
     for name in ("trajectory.txt", "track.png", "report.html", "summary.json"):
         assert (folder / name).is_file()
     path = np.loadtxt(folder / "trajectory.txt")[:, 1:3]
-    # examples/make_walk.py tells the truth: 49.6 m in the plane, and 6.1 m from the start at the end.
+    # examples/make_walk.py tells the truth: 49.6 m in the plane, ending 6.1 m from the start.
     seconds = path[::5]
     length = np.linalg.norm(np.diff(seconds, axis=0), axis=1).sum()
     assert abs(length / 49.6 - 1) < 0.1

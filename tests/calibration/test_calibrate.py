@@ -778,7 +778,7 @@ REFUSED = [
     (compare_with_another_model, "fold0: differs from the calibrated run in 'model'"),
     (
         lambda x: average(x, model={"equivariance": "canonical_frame"}),
-        "^the run: its network has a canonical frame",
+        "^the run: its network has model.equivariance: canonical_frame",
     ),
     (lambda x: average(x, augment={"yaw": False}), "^the run.*four_headings without augment.yaw"),
     (

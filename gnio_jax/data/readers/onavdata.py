@@ -128,12 +128,12 @@ def read_zipped(
         (member,) = archive.infolist()
         if member.file_size > LARGEST_TABLE:
             raise damage_error(path, f"holds a table of {member.file_size / 2**30:.1f} GiB")
-        text = io.TextIOWrapper(archive.open(member), encoding="utf-8")
-        header = [name.strip() for name in text.readline().split(",")]
-        columns = {name: header.index(name) for name in names if name in header}
-        if missing := [name for name in names if name not in columns]:
-            raise InputError(path, f"field '{missing[0]}' is missing", "get the published file")
-        table = np.loadtxt(text, delimiter=",", usecols=list(columns.values()), ndmin=2)
+        with io.TextIOWrapper(archive.open(member), encoding="utf-8") as text:
+            header = [name.strip() for name in text.readline().split(",")]
+            columns = {name: header.index(name) for name in names if name in header}
+            if missing := [name for name in names if name not in columns]:
+                raise InputError(path, f"field '{missing[0]}' is missing", "get the published file")
+            table = np.loadtxt(text, delimiter=",", usecols=list(columns.values()), ndmin=2)
     rows = (table[:, 0] >= 0) & (table[:, 1] == ALIGNED) & np.isfinite(table).all(axis=1)
     table = table[rows]
     table = table[np.unique(table[:, 0], return_index=True)[1]]
