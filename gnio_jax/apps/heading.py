@@ -57,10 +57,11 @@ def misalignment(ready: PreparedRecording, trained: TrainedNetwork) -> float:
     A device looks to the left of its x axis, along the ground. `ready` has the attitude of the
     integrated gyro.
     """
+    assert ready.attitude is not None
     windows = dataclasses.replace(trained.config.data, window_rotation="hidden_axes")
     strides = min(ready.strides, round(COMPARED_SECONDS / windows.stride_seconds))
     samples = strides * windows.stride
-    if samples < windows.input_samples + windows.stride or ready.attitude is None:
+    if samples < windows.input_samples + windows.stride:
         return np.nan
     attitude = ready.attitude[: samples + 1]
     minute = ready._replace(
@@ -76,9 +77,9 @@ def misalignment(ready: PreparedRecording, trained: TrainedNetwork) -> float:
     moved = displacements.value[-len(start) :, 0] + 1j * displacements.value[-len(start) :, 1]
     # The mean over the window with its context, as in `DeviceHeading`; windows begin at the yaw of
     # the device after the context.
-    up = np.convolve(attitude[:-1, 2, 2], np.full(windows.input_samples, 1), "valid")
-    faces_up = up[start] / windows.input_samples > LEAST_UP
-    directed = (np.abs(moved) > LEAST_MOVED) & faces_up  # not where it is NaN
+    mean_of_window = np.full(windows.input_samples, 1 / windows.input_samples)
+    up = np.convolve(attitude[:-1, 2, 2], mean_of_window, "valid")[start]
+    directed = (np.abs(moved) > LEAST_MOVED) & (up > LEAST_UP)  # not where it is NaN
     if directed.sum() * windows.stride_seconds < LEAST_SECONDS:
         return np.nan
     mean = np.mean(moved[directed] / np.abs(moved[directed]))

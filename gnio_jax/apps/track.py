@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax import config as configuration
-from gnio_jax.apps import drive, export, rerun, sensors
+from gnio_jax.apps import drive, export, heading, rerun, sensors
 from gnio_jax.apps.importing import Imported
 from gnio_jax.apps.summary import Summary, summarise
 from gnio_jax.config import TrainConfig
@@ -138,7 +138,7 @@ def estimate_recording(
         ekf,
         init="static",
         gyro_bias="rest",
-        orientation="filter",
+        orientation="filter" if heading.uses_heading(trained) else None,
         from_first=True,
         corrector=load_corrector(config.filter, config.data.rate, trained),
     )

@@ -2,6 +2,7 @@
 the horizontal acceleration."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -182,3 +183,18 @@ def test_every_command_hides_the_axes(gnio, mistake, undrawn, held, tmp_path):
     assert "--heading gait: is for people" in told
     with pytest.raises(InputError, match=r"^heading: must be 'device' or 'gait', found 'Gait'"):
         gnio_jax.track(*samples, network=run, heading="Gait")
+
+
+def test_no_error_is_stated_beside_the_warning(gnio, undrawn, held, tmp_path, monkeypatch):
+    """And the warning comes first. The tiny network has no gait, so its angle is given."""
+    shown, words = "expected error at the end", ("track", held / "walk.csv", "--network")
+    words = (*words, held / "run", "--out")
+    monkeypatch.setattr(heading, "misalignment", lambda *_: heading.MISALIGNED - 1.0)
+    assert shown in gnio(*words, tmp_path / "ahead")
+    monkeypatch.setattr(heading, "misalignment", lambda *_: heading.MISALIGNED + 1.0)
+    told = gnio(*words, tmp_path / "across")
+    assert told.startswith("warning: heading: by the gait, the carrier walks 61° to the left")
+    assert shown not in told
+    summary = json.loads((tmp_path / "across" / "summary.json").read_text())
+    assert "expected_error" not in summary and summary["warnings"][0].startswith("heading: ")
+    assert shown in gnio(*words, tmp_path / "gait", "--heading", "gait")

@@ -15,17 +15,25 @@ START = Rotation.from_euler("ZYX", [2.0, 0.4, -0.7])
 FACTORS = {"body_axes": 1.0, "hidden_axes": 0.0}
 
 
-def by_hand(factor):
+def attitudes():
+    """Of every sample, in the world."""
     turns = [Rotation.from_rotvec(rate * DT) for rate in GYRO]
     attitude = START
     for turn in turns[:CONTEXT][::-1]:
         attitude = attitude * turn.inv()
-    level, rows = Rotation.from_euler("Z", -START.as_euler("ZYX")[0]), []
-    for turn, accel, gyro in zip(turns, ACCEL, GYRO, strict=True):
-        now = level * attitude
-        axes = factor * now.as_matrix()[:, :2].T
-        rows.append(np.concatenate([now.apply(accel), now.apply(gyro), *axes]))
+    rotations = []
+    for turn in turns:
+        rotations.append(attitude)
         attitude = attitude * turn
+    return rotations
+
+
+def by_hand(factor):
+    level, rows = Rotation.from_euler("Z", -START.as_euler("ZYX")[0]), []
+    for attitude, accel, gyro in zip(attitudes(), ACCEL, GYRO, strict=True):
+        turned = level * attitude
+        axes = factor * turned.as_matrix()[:, :2].T
+        rows.append(np.concatenate([turned.apply(accel), turned.apply(gyro), *axes]))
     return np.array(rows)
 
 
@@ -40,15 +48,8 @@ def test_the_window_of_the_filter_has_them(kind):
 
 @pytest.mark.parametrize("kind", FACTORS)
 def test_the_window_of_a_recording_has_them(kind):
-    turns = [Rotation.from_rotvec(rate * DT) for rate in GYRO]
-    attitude = START
-    for turn in turns[:CONTEXT][::-1]:
-        attitude = attitude * turn.inv()
-    matrices = []
-    for turn in turns:
-        matrices.append(attitude.as_matrix())
-        attitude = attitude * turn
-    imu, rotation = align_recording(ACCEL, GYRO, np.array(matrices), np.array([CONTEXT]), kind)
+    matrices = np.array([attitude.as_matrix() for attitude in attitudes()])
+    imu, rotation = align_recording(ACCEL, GYRO, matrices, np.array([CONTEXT]), kind)
     samples, turn = jnp.asarray(imu), jnp.asarray(rotation)
     (window,) = cut_windows(samples, jnp.zeros(1, jnp.int32), turn, SAMPLES)
     np.testing.assert_allclose(window, by_hand(FACTORS[kind]), atol=1e-5)
