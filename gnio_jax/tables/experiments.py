@@ -27,6 +27,28 @@ REGULARISATION: dict[str, dict[str, float]] = {
 uncertainty begins to learn, the gradients of the likelihood are so large that they destroy what its
 displacements have learnt."""
 
+
+class System(NamedTuple):
+    """A published system that is a network of this package with other options."""
+
+    network: str
+    options: dict[str, Any] = {}
+    """Fields of the model."""
+    loss: dict[str, Any] = {}
+    """Fields of the loss that differ from the network's."""
+
+
+SYSTEMS = {
+    "eqnio_tlio": System("tlio", {"equivariance": "o2_frame"}),
+    "eqnio_ronin": System("ronin_resnet", {"equivariance": "o2_frame"}),
+    "airimu": System("tlio", {"corrector": "airimu"}, {"preintegration_weight": 1e-3}),
+    "rio": System("ronin_resnet", loss={"rotation_weight": 1.0}),
+    "bins": System("gnio", {"bank_size": 0, "head": "bins"}, {"name": "bins"}),
+}
+"""Rows whose names are those of their recipes in configs/baselines. `rio` keeps the normalisation
+over batches (ours): with as many groups as channels, as in a narrow network, group normalisation
+takes the strength of every window away."""
+
 PUBLISHED = {
     ("oxiod", "seen"): {"tlio": 2.67, "ctin": 2.32, "imot": 1.86, "gnio": 0.74},
     ("oxiod", "unseen"): {"tlio": 2.54, "ctin": 3.34, "imot": 0.90, "gnio": 0.71},
@@ -76,18 +98,21 @@ class Experiment(NamedTuple):
 # --- one row
 
 
-def method(network: str, base: TrainConfig) -> TrainConfig:
-    """`base` with another network, its loss and regularisation: the same recordings, augmentation,
-    equivariance, batches, epochs and learning rate. A network that sees the body has its axes in
+def method(name: str, base: TrainConfig) -> TrainConfig:
+    """`base` with another network or one of `SYSTEMS`, its loss and regularisation: the same
+    recordings, augmentation, equivariance unless the system has its own, batches, epochs and
+    learning rate. A network that sees the body has its axes in
     its windows, and the filter measures the velocity of one that predicts it. A network with memory
     learns on the segments of `base`, if there are any, in batches with as many seconds of walks.
     Losses differ, so every row's checkpoint is the one with the smallest squared error on the
     validation split."""
-    equivariance = base.model.equivariance
-    model = ModelConfig(name=network, equivariance=equivariance, **scaled_size(network, base))
+    network, options, other_loss = SYSTEMS.get(name, System(name))
+    options = {"equivariance": base.model.equivariance, **scaled_size(network, base), **options}
+    model = ModelConfig(name=network, **options)
     regularisation = REGULARISATION.get(network, {})
     optim = dataclasses.replace(base.optim, best_by="squared_error", **regularisation)
-    config = dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)
+    of_network = dataclasses.replace(loss(network, base), **other_loss)
+    config = dataclasses.replace(base, model=model, loss=of_network, optim=optim)
     built = models.from_config(model)
     if not isinstance(built, NetworkWithMemory):
         config = dataclasses.replace(config, segments=SegmentTraining())

@@ -28,7 +28,7 @@ from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments, published
 from gnio_jax.tables.cost import device_name
 from gnio_jax.tables.duration import announce
-from gnio_jax.tables.experiments import Experiment
+from gnio_jax.tables.experiments import SYSTEMS, Experiment
 from gnio_jax.tables.runs import RowResult, run_row, unfinished_runs
 from gnio_jax.training import loop
 
@@ -139,18 +139,20 @@ def measured_dataset(options: TablesConfig, base: TrainConfig) -> str:
 
 
 def networks(options: TablesConfig) -> tuple[str, ...]:
-    """The networks named by --methods; "all" stands for those of this package that predict
-    displacements."""
+    """The networks and systems named by --methods; "all" stands for the networks of this package
+    that predict displacements."""
     if options.methods == "all":
-        return tuple(name for name in NETWORKS if _predicts_displacement(name))
-    names = _words(options.methods)
-    problems = [f"no network '{name}'" for name in names if name not in models.names()]
+        return tuple(filter(_predicts_displacement, NETWORKS))
+    names, known = _words(options.methods), (*models.names(), *SYSTEMS)
+    problems = [f"no network '{name}'" for name in names if name not in known]
     problems = problems or [
-        f"'{name}' predicts no displacement" for name in names if not _predicts_displacement(name)
+        f"'{name}' predicts no displacement"
+        for name in names
+        if name not in SYSTEMS and not _predicts_displacement(name)
     ]
     if problems or not names:
         problem = problems[0] if problems else "names no network"
-        raise InputError("--methods", problem, f"known: {', '.join(models.names())}")
+        raise InputError("--methods", problem, f"known: {', '.join(known)}")
     return names
 
 

@@ -14,7 +14,7 @@ from gnio_jax.training import loop
 from tests.support import small_tables
 from tests.support.networks import SMALL
 
-METHODS = make.networks(TablesConfig("comparison", methods="all"))
+METHODS = (*make.networks(TablesConfig("comparison", methods="all")), *experiments.SYSTEMS)
 METHOD = experiments.method
 IN_CONFIG = {field.name for field in dataclasses.fields(ModelConfig)}
 
@@ -24,8 +24,9 @@ def smallest(network, base):
     config = METHOD(network, base)
     if network == "ridi":  # it keeps as many support vectors as it needs
         return config
-    options = SMALL[network.removesuffix("_text")]
+    options = SMALL[config.model.name.removesuffix("_text")]
     fields = {name: value for name, value in options.items() if name in IN_CONFIG}
+    fields |= experiments.SYSTEMS.get(network, experiments.System(network)).options
     others = {name: value for name, value in options.items() if name not in IN_CONFIG}
     return dataclasses.replace(
         config, model=dataclasses.replace(config.model, **fields, options=others)
@@ -64,6 +65,7 @@ def test_a_method_is_trained_calibrated_and_measured_on_the_windows_of_the_base(
         configuration.load(tmp_path / "runs" / f"{network}_s0{ending}" / "config.yaml")
         for ending in ("", "_calibrated")
     )
-    assert trained.model == calibrated.model and trained.model.name == network
+    name = experiments.SYSTEMS[network].network if network in experiments.SYSTEMS else network
+    assert trained.model == calibrated.model and trained.model.name == name
     noises = (run.filter.noise.measurement_scale for run in (trained, calibrated))
     assert len({*noises}) == 2

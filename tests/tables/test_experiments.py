@@ -89,6 +89,20 @@ def test_the_search_for_a_width_ends_where_a_network_accepts_none(monkeypatch):
         experiments.method("ctin", BASE)
 
 
+def test_a_system_is_its_network_with_the_options_and_the_loss_of_its_recipe():
+    """Fields that no budget changes."""
+    for name, system in experiments.SYSTEMS.items():
+        config = experiments.method(name, BASE)
+        recipe = configuration.load(f"baselines/{name}")
+        assert recipe.model.name == config.model.name == system.network
+        for field in system.options:
+            assert getattr(config.model, field) == getattr(recipe.model, field)
+        for field in system.loss:
+            assert getattr(config.loss, field) == getattr(recipe.loss, field)
+        sees_body = config.data.window_rotation == "body_axes"
+        assert sees_body == (config.model.corrector == "airimu")
+
+
 def test_only_networks_with_memory_learn_on_segments_with_as_many_seconds_in_a_batch():
     optim = dataclasses.replace(BASE.optim, batch_size=128)
     base = dataclasses.replace(BASE, optim=optim, segments=SegmentTraining(6.0))

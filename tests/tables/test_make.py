@@ -226,5 +226,5 @@ def test_a_row_that_cannot_be_trained_is_refused_before_any_other_is(made, monke
 def test_all_methods_are_the_networks_with_displacements_each_with_a_sound_configuration():
     names = make.networks(TablesConfig("comparison", methods="all"))
     assert set(names) == set(models.names()) - {"ai_imu"}
-    for name in names:
+    for name in (*names, *experiments.SYSTEMS):
         configuration.validate(experiments.method(name, TrainConfig()), name)
