@@ -124,8 +124,9 @@ class TablesConfig:
     epochs: Count | None = None
     """Epochs of every run, instead of the config's."""
     methods: str = "tlio,ronin_resnet,deepils,ctin,imot,gnio"
-    """Networks of comparison, trajectories and standing, separated by commas, or all; the others
-    are compared with the first."""
+    """Networks of comparison, trajectories and standing, or systems (eqnio_tlio, eqnio_ronin,
+    airimu, rio, bins), separated by commas, or all networks; the others are compared with the
+    first."""
     sequences: str | None = None
     """Sequences that trajectories draws, separated by commas; by default the first eight."""
     out: Folder = Path("runs/tables")

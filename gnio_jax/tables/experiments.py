@@ -7,7 +7,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from gnio_jax import models
-from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, SegmentTraining, TrainConfig
+from gnio_jax.config import (
+    DataConfig,
+    LossConfig,
+    ModelConfig,
+    OptimConfig,
+    SegmentTraining,
+    TrainConfig,
+)
 from gnio_jax.errors import InputError
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.memory import NetworkWithMemory
@@ -29,7 +36,8 @@ displacements have learnt."""
 
 
 class System(NamedTuple):
-    """A published system that is a network of this package with other options."""
+    """A published system that is a network of this package with the main options of its recipe.
+    Its other losses and its regularisation are those of the network's own row."""
 
     network: str
     options: dict[str, Any] = {}
@@ -41,13 +49,15 @@ class System(NamedTuple):
 SYSTEMS = {
     "eqnio_tlio": System("tlio", {"equivariance": "o2_frame"}),
     "eqnio_ronin": System("ronin_resnet", {"equivariance": "o2_frame"}),
-    "airimu": System("tlio", {"corrector": "airimu"}, {"preintegration_weight": 1e-3}),
+    "airimu": System(
+        "tlio", {"equivariance": "none", "corrector": "airimu"}, {"preintegration_weight": 1e-3}
+    ),
     "rio": System("ronin_resnet", loss={"rotation_weight": 1.0}),
     "bins": System("gnio", {"bank_size": 0, "head": "bins"}, {"name": "bins"}),
 }
 """Rows whose names are those of their recipes in configs/baselines. `rio` keeps the normalisation
-over batches (ours): with as many groups as channels, as in a narrow network, group normalisation
-takes the strength of every window away."""
+over batches at every width (ours): with as many groups as channels, as in a narrow network, group
+normalisation takes the strength of every window away."""
 
 PUBLISHED = {
     ("oxiod", "seen"): {"tlio": 2.67, "ctin": 2.32, "imot": 1.86, "gnio": 0.74},
@@ -111,9 +121,13 @@ def method(name: str, base: TrainConfig) -> TrainConfig:
     model = ModelConfig(name=network, **options)
     regularisation = REGULARISATION.get(network, {})
     optim = dataclasses.replace(base.optim, best_by="squared_error", **regularisation)
-    of_network = dataclasses.replace(loss(network, base), **other_loss)
-    config = dataclasses.replace(base, model=model, loss=of_network, optim=optim)
+    network_loss = dataclasses.replace(loss(network, base), **other_loss)
+    config = dataclasses.replace(base, model=model, loss=network_loss, optim=optim)
     built = models.from_config(model)
+    if model.equivariance != base.model.equivariance:  # what only that of the base needs
+        changes = dataclasses.replace(base.augment, hidden_axes_share=0.0)
+        rotated = dataclasses.replace(base.data, window_rotation=DataConfig().window_rotation)
+        config = dataclasses.replace(config, augment=changes, data=rotated)
     if not isinstance(built, NetworkWithMemory):
         config = dataclasses.replace(config, segments=SegmentTraining())
     elif base.segments.seconds:

@@ -143,8 +143,8 @@ def networks(options: TablesConfig) -> tuple[str, ...]:
     that predict displacements."""
     if options.methods == "all":
         return tuple(filter(_predicts_displacement, NETWORKS))
-    names, known = _words(options.methods), (*models.names(), *SYSTEMS)
-    problems = [f"no network '{name}'" for name in names if name not in known]
+    names, rows = _words(options.methods), (*models.names(), *SYSTEMS)
+    problems = [f"no network or system '{name}'" for name in names if name not in rows]
     problems = problems or [
         f"'{name}' predicts no displacement"
         for name in names
@@ -152,7 +152,7 @@ def networks(options: TablesConfig) -> tuple[str, ...]:
     ]
     if problems or not names:
         problem = problems[0] if problems else "names no network"
-        raise InputError("--methods", problem, f"known: {', '.join(known)}")
+        raise InputError("--methods", problem, f"known: {', '.join(rows)}")
     return names
 
 

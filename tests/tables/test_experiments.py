@@ -89,7 +89,7 @@ def test_the_search_for_a_width_ends_where_a_network_accepts_none(monkeypatch):
         experiments.method("ctin", BASE)
 
 
-def test_a_system_is_its_network_with_the_options_and_the_loss_of_its_recipe():
+def test_a_system_is_its_network_with_the_main_options_of_its_recipe():
     """Fields that no budget changes."""
     for name, system in experiments.SYSTEMS.items():
         config = experiments.method(name, BASE)
@@ -101,6 +101,8 @@ def test_a_system_is_its_network_with_the_options_and_the_loss_of_its_recipe():
             assert getattr(config.loss, field) == getattr(recipe.loss, field)
         sees_body = config.data.window_rotation == "body_axes"
         assert sees_body == (config.model.corrector == "airimu")
+        of_heading = experiments.method(name, configuration.load("pedestrian"))
+        configuration.validate(of_heading, name)
 
 
 def test_only_networks_with_memory_learn_on_segments_with_as_many_seconds_in_a_batch():

@@ -158,7 +158,7 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
 @pytest.mark.parametrize(
     "more, words",
     [
-        (["--methods", "gnio,nosuch"], "no network 'nosuch'; known: ai_imu, airio"),
+        (["--methods", "gnio,nosuch"], "no network or system 'nosuch'; known: ai_imu, airio"),
         (["--methods", "gnio,ai_imu"], "'ai_imu' predicts no displacement"),
         (["--base", "nosuch.yaml"], "no such config file"),
         (["--base", "configs/baselines/tlio.yaml"], "is of the network 'tlio'"),
