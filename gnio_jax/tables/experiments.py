@@ -111,10 +111,10 @@ class Experiment(NamedTuple):
 def method(name: str, base: TrainConfig) -> TrainConfig:
     """`base` with another network or one of `SYSTEMS`, its loss and regularisation: the same
     recordings, augmentation, equivariance unless the system has its own, batches, epochs and
-    learning rate. A network that sees the body has its axes in
-    its windows, and the filter measures the velocity of one that predicts it. A network with memory
-    learns on the segments of `base`, if there are any, in batches with as many seconds of walks.
-    Losses differ, so every row's checkpoint is the one with the smallest squared error on the
+    learning rate. A network that sees the body has its axes in its windows, and no other has them.
+    The filter measures the velocity of a network that predicts it. A network with memory learns on
+    the segments of `base`, if there are any, in batches with as many seconds of walks. Losses
+    differ, so every row's checkpoint is the one with the smallest squared error on the
     validation split."""
     network, options, other_loss = SYSTEMS.get(name, System(name))
     options = {"equivariance": base.model.equivariance, **scaled_size(network, base), **options}
@@ -124,10 +124,9 @@ def method(name: str, base: TrainConfig) -> TrainConfig:
     network_loss = dataclasses.replace(loss(network, base), **other_loss)
     config = dataclasses.replace(base, model=model, loss=network_loss, optim=optim)
     built = models.from_config(model)
-    if model.equivariance != base.model.equivariance:  # what only that of the base needs
+    if model.equivariance != "device_heading":  # it alone hides axes
         changes = dataclasses.replace(base.augment, hidden_axes_share=0.0)
-        rotated = dataclasses.replace(base.data, window_rotation=DataConfig().window_rotation)
-        config = dataclasses.replace(config, augment=changes, data=rotated)
+        config = dataclasses.replace(config, augment=changes)
     if not isinstance(built, NetworkWithMemory):
         config = dataclasses.replace(config, segments=SegmentTraining())
     elif base.segments.seconds:
@@ -136,8 +135,10 @@ def method(name: str, base: TrainConfig) -> TrainConfig:
             optim, batch_size=max(round(seconds / base.segments.seconds), 1)
         )
         config = dataclasses.replace(config, optim=optim)
-    if models.channels(built) == 12:
-        rotated = dataclasses.replace(base.data, window_rotation="body_axes")
+    sees_body = models.channels(built) == 12
+    if sees_body != (base.data.window_rotation == "body_axes"):
+        rotation = "body_axes" if sees_body else DataConfig().window_rotation
+        rotated = dataclasses.replace(base.data, window_rotation=rotation)
         config = dataclasses.replace(config, data=rotated)
     if "velocity" in models.quantities(built):
         settings = dataclasses.replace(base.filter, measures="velocity")

@@ -65,7 +65,7 @@ def test_a_method_is_trained_calibrated_and_measured_on_the_windows_of_the_base(
         configuration.load(tmp_path / "runs" / f"{network}_s0{ending}" / "config.yaml")
         for ending in ("", "_calibrated")
     )
-    name = experiments.SYSTEMS[network].network if network in experiments.SYSTEMS else network
+    name = experiments.SYSTEMS.get(network, experiments.System(network)).network
     assert trained.model == calibrated.model and trained.model.name == name
     noises = (run.filter.noise.measurement_scale for run in (trained, calibrated))
     assert len({*noises}) == 2

@@ -103,6 +103,9 @@ def test_a_system_is_its_network_with_the_main_options_of_its_recipe():
         assert sees_body == (config.model.corrector == "airimu")
         of_heading = experiments.method(name, configuration.load("pedestrian"))
         configuration.validate(of_heading, name)
+        data = dataclasses.replace(BASE.data, window_rotation="single")
+        turned_whole = experiments.method(name, dataclasses.replace(BASE, data=data))
+        assert turned_whole.data.window_rotation == ("body_axes" if sees_body else "single")
 
 
 def test_only_networks_with_memory_learn_on_segments_with_as_many_seconds_in_a_batch():
