@@ -107,6 +107,7 @@ Probability = Annotated[float, SHARE]
 Width = Annotated[int, Bound(lambda value: 1 <= value <= 4096, "must be from 1 to 4096")]
 Share = Annotated[float, Bound(lambda value: 0 <= value <= 1, "must be from 0 to 1")]
 Factor = Annotated[float, PACE]
+Tilt = Annotated[float, Bound(lambda value: 0 < value < 90, "must be above 0 and below 90")]
 Count = Annotated[int, Bound(lambda value: 1 <= value < 2**31, "must be at least 1 and below 2^31")]
 NonNegativeCount = Annotated[
     int, Bound(lambda value: 0 <= value < 2**31, "must not be negative and below 2^31")
@@ -333,6 +334,12 @@ class ModelConfig:
     uses the heading of the device if its screen faces up, as people hold it ahead. The others are
     EqNIO's networks for the frame: with reflections (o2_frame), without them (so2_frame: around
     TLIO, so2_frame_shallow: around RoNIN)."""
+    frame_width: Count | None = None
+    """Vectors, and scalars, in a layer of EqNIO's network for the frame (o2_frame: 64, the others:
+    128)."""
+    largest_tilt: Tilt | None = None
+    """Angle from the vertical up to which the normal of a screen faces up for device_heading,
+    degrees (60)."""
     corrector: Literal["none", "airimu"] = "none"
     """A network that corrects the samples before any other sees them (AirIMU)."""
     options: Annotated[Mapping[str, float | int | bool | str | None], FILE_ONLY] = field(
@@ -721,6 +728,9 @@ class TrainConfig:
         if self.augment.hidden_axes_share and frame != "device_heading":
             problem = "is for model.equivariance: device_heading, the network that uses them"
             location.child("augment.hidden_axes_share").refuse(problem, "leave it out")
+        if self.loss.preintegration_weight and self.model.corrector == "none":
+            problem = "is for model.corrector, which learns from it"
+            location.child("loss.preintegration_weight").refuse(problem, "leave it out")
         self._check_segments(location)
         self._check_through_filter(location)
 

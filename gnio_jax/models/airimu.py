@@ -15,6 +15,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Int
 
 from gnio_jax import geometry
+from gnio_jax.errors import InputError
 from gnio_jax.models.airio import (
     LOG_VARIANCE_SHIFT,
     STRIDE,
@@ -258,14 +259,16 @@ def preintegration_loss(
 
     prediction: that of `Corrected`. windows: with the true attitude; steps: true displacements from
     sample to sample, m. Preintegration begins with the truth after the first 9 samples (ours: the
-    velocity there is the mean of both neighbouring steps). Raises `ValueError` for windows too
-    short to have a target.
+    velocity there is the mean of both neighbouring steps). Ours: the target of a window that is too
+    short for the first of them, e.g. of 50 samples, is its last sample. Raises `InputError` for
+    windows without a sample after the first 10.
     """
     truth, samples = body_axes(windows), windows.shape[1]
-    labels = np.arange(STRIDE + LABEL_STRIDE, samples, LABEL_STRIDE)
-    if "corrected" not in prediction.diagnostics or not len(labels):
-        problem = f"a corrector and windows of more than {STRIDE + LABEL_STRIDE} samples"
-        raise ValueError(f"the preintegration loss needs {problem}")
+    if samples < STRIDE + 2:
+        problem = f"needs windows of at least {STRIDE + 2} samples, and these have {samples}"
+        raise InputError("loss.preintegration_weight", problem, "raise data.window_seconds")
+    first = min(STRIDE + LABEL_STRIDE, samples - 1)
+    labels = np.arange(first, samples, LABEL_STRIDE)
     corrected, variance = (
         prediction.diagnostics[name] for name in ("corrected", "corrected_variance")
     )

@@ -16,6 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+LONG_BLOCK = 8
+"""Outputs of a long kernel that are computed by one product. For a kernel of 32 samples, 5 to 10
+outputs take the same time, and more take longer."""
 WINOGRAD_CHANNELS = 64
 """Number of channels below which the products that Winograd's algorithm saves cost less than its
 sums."""
@@ -34,6 +37,31 @@ def convolve(
     columns = shifted.reshape(-1, size * channels)
     product = columns @ kernel.reshape(size * channels, features)
     return product.reshape(-1, shifted.shape[1], features)
+
+
+def convolve_long(
+    x: Float[Array, "b n c"],
+    kernel: Float[Array, "k c d"],
+    window_strides: tuple[int],
+    padding: list[tuple[int, int]],
+    **_: object,
+) -> Float[Array, "b m d"]:
+    """A 1-D convolution of stride 1 with a long kernel, written as a product for each block of
+    `LONG_BLOCK` outputs: the inputs that a block needs times the kernel at every place in it. It
+    copies each input a few times, and `convolve` copies it once for every sample of the kernel."""
+    size, channels, features = kernel.shape
+    x = jnp.pad(x, ((0, 0), padding[0], (0, 0)))
+    outputs = x.shape[1] - size + 1
+    blocks, seen = -(-outputs // LONG_BLOCK), LONG_BLOCK + size - 1
+    parts = -(-seen // LONG_BLOCK)
+    missing = (blocks + parts - 1) * LONG_BLOCK - x.shape[1]
+    x = jnp.pad(x, ((0, 0), (0, missing), (0, 0)))
+    x = x.reshape(x.shape[0], blocks + parts - 1, LONG_BLOCK * channels)
+    columns = jnp.concatenate([x[:, i : i + blocks] for i in range(parts)], axis=-1)
+    places = [jnp.pad(kernel, ((i, LONG_BLOCK - 1 - i), (0, 0), (0, 0))) for i in range(LONG_BLOCK)]
+    matrix = jnp.stack(places, axis=2).reshape(seen * channels, LONG_BLOCK * features)
+    product = columns[..., : seen * channels].reshape(-1, seen * channels) @ matrix
+    return product.reshape(-1, blocks * LONG_BLOCK, features)[:, :outputs]
 
 
 def convolve_forward(

@@ -21,7 +21,9 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float
 
+from gnio_jax.config.schema import Count
 from gnio_jax.geometry import direction
+from gnio_jax.models.convolution import convolve_forward, convolve_long
 from gnio_jax.models.equivariance import (
     Equivariant,
     length,
@@ -60,22 +62,23 @@ class EqNIO(Equivariant):
     says whether the frame is that of O(2), in which windows may be reflected, or of SO(2).
 
     Its variances are along the axes of the frame, so the covariance is full in the plane. `depth`:
-    convolutions in time. Parameters of the frame's network: 595,584 for O(2) of depth 2; 3,460,224
-    for SO(2) of depth 2, 1,821,312 of depth 1.
+    convolutions in time; `frame_width`: vectors, and scalars, in a layer. Published: 64 of them for
+    O(2) of depth 2 (595,584 parameters of the frame's network), 128 for SO(2) of depth 2
+    (3,460,224) and of depth 1 (1,821,312).
     """
 
     reflections: bool = True
     depth: int = 2
+    frame_width: Count = 64
 
     def setup(self) -> None:
         super().setup()
-        width = 64 if self.reflections else 128
-        self.frame = EquivariantFrame(width, self.depth, self.reflections)
+        self.frame = EquivariantFrame(self.frame_width, self.depth, self.reflections)
 
     def __call__(
         self, windows: Float[Array, "b n 6"], train: bool = False, **constants: Any
     ) -> Prediction:
-        heading, sign = self.frame(windows)
+        heading, sign = self.frame(windows, train)
         turned = turn_windows(windows, opposite(heading))
         reflected = jnp.asarray(np.asarray(REFLECTED)[None], windows.dtype)
         signs = jnp.where(sign[:, None] < 0, reflected, 1)
@@ -98,14 +101,14 @@ class EquivariantFrame(nn.Module):
     reflections: bool
 
     @nn.compact
-    def __call__(self, windows: Float[Array, "b n 6"]) -> Frame:
+    def __call__(self, windows: Float[Array, "b n 6"], train: bool = False) -> Frame:
         width, turns = self.width, not self.reflections
         signals = with_reflections(windows) if self.reflections else without_reflections(windows)
         vectors = mix(signals.vectors, width, turns, "vectors")
         scalars = _dense(width, "scalars")(signals.scalars)
         x = Gate(width, name="gate")(Signals(vectors, scalars))
         for number in range(self.depth):
-            x = TimeMixing(width, turns, name=f"block{number + 1}")(x)
+            x = TimeMixing(width, turns, name=f"block{number + 1}")(x, train)
         mean = Signals(*(part.mean(axis=1, keepdims=True) for part in x))
         vectors = mix(mean.vectors, width, turns, "mean_vectors")
         scalars = _dense(width, "mean_scalars")(mean.scalars)
@@ -125,13 +128,13 @@ class TimeMixing(nn.Module):
     turns: bool
 
     @nn.compact
-    def __call__(self, x: Signals) -> Signals:
+    def __call__(self, x: Signals, train: bool) -> Signals:
         batch, samples = x.vectors.shape[:2]
         vectors = with_turns(x.vectors) if self.turns else x.vectors
         planar = vectors.swapaxes(1, 2).reshape(2 * batch, samples, -1)
-        planar = _conv(self.width, "vector_filter")(planar)
+        planar = _conv(self.width, train, "vector_filter")(planar)
         vectors = planar.reshape(batch, 2, samples, self.width).swapaxes(1, 2)
-        scalars = _conv(self.width, "scalar_filter")(x.scalars)
+        scalars = _conv(self.width, train, "scalar_filter")(x.scalars)
         x = Gate(self.width, name="gate")(Signals(vectors, scalars))
         return Signals(norm_vectors(x.vectors, "vector_norm"), _norm("scalar_norm")(x.scalars))
 
@@ -214,10 +217,16 @@ def _norm(name: str) -> nn.LayerNorm:
     return nn.LayerNorm(**options)
 
 
-def _conv(features: int, name: str) -> Any:
+def _conv(features: int, train: bool, name: str) -> Any:
     """A convolution in time that keeps the length; the first and last sample are repeated."""
     layer = nn.Conv(
-        features, (SPAN,), padding="VALID", use_bias=False, param_dtype=jnp.float32, name=name
+        features,
+        (SPAN,),
+        padding=[(0, 0)],
+        use_bias=False,
+        param_dtype=jnp.float32,
+        conv_general_dilated=convolve_long if train else convolve_forward,
+        name=name,
     )
     before = (SPAN - 1) // 2
     return lambda x: layer(repeat_ends(x, before, SPAN - 1 - before, axis=1))

@@ -7,6 +7,7 @@ so weights of the network alone fit `FourHeadings`.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float
 
+from gnio_jax.config.schema import Tilt
 from gnio_jax.geometry import direction
 from gnio_jax.models.heads import root_mean_square, to_axes
 from gnio_jax.models.layers import checked_windows, conv_norm, linear
@@ -26,9 +28,6 @@ FRAME_FEATURES = 16
 """Features of the frame network's convolutions (ours)."""
 FRAME_SPAN = 7
 """Samples that each of these convolutions sees (ours)."""
-LEAST_UP = 0.5
-"""Smallest vertical component of the normal of a screen that faces up: it is within 60° of the
-vertical (ours)."""
 
 
 class Equivariant(nn.Module):
@@ -95,11 +94,17 @@ class DeviceHeading(Equivariant):
     The x axis of the frame is the horizontal direction of the device's x axis, from the left of its
     screen to its right, in the mean over the window. Windows have the axes of the body. Where these
     are zero (`augment.hidden_axes_share`, `filter.window_rotation: hidden_axes`), the heading is
-    not known.
+    not known. A screen faces up if its normal is within `largest_tilt` degrees of the vertical.
     """
 
+    largest_tilt: Tilt = 60.0
     channels = 12
     hides_axes = True
+
+    @property
+    def least_up(self) -> float:
+        """The vertical component of the screen's normal above which it faces up."""
+        return math.cos(math.radians(self.largest_tilt))
 
     @nn.compact
     def __call__(
@@ -109,7 +114,7 @@ class DeviceHeading(Equivariant):
         x_axis, y_axis = windows[..., 6:9], windows[..., 9:12]
         # The vertical component of the screen's normal.
         up = x_axis[..., 0] * y_axis[..., 1] - x_axis[..., 1] * y_axis[..., 0]
-        faces_up = (up.mean(axis=1) > LEAST_UP)[:, None]
+        faces_up = (up.mean(axis=1) > jnp.float32(self.least_up))[:, None]
         mean = jnp.where(faces_up, x_axis.mean(axis=1)[:, :2], jnp.float32([[1, 0]]))
         heading = jnp.stack(direction(mean[:, 0], mean[:, 1]), axis=-1)
         constant = self.param("facing_up", nn.initializers.zeros, (6,), jnp.float32)

@@ -66,13 +66,13 @@ _MODELS: dict[str, type[nn.Module]] = {
 }
 _PUBLISHED = frozenset(_MODELS)
 
-_EQUIVARIANT: dict[str, Callable[[nn.Module], nn.Module]] = {
+_EQUIVARIANT: dict[str, Callable[..., nn.Module]] = {
     "four_headings": FourHeadings,
     "canonical_frame": CanonicalFrame,
     "device_heading": DeviceHeading,
     "o2_frame": EqNIO,
-    "so2_frame": functools.partial(EqNIO, reflections=False),
-    "so2_frame_shallow": functools.partial(EqNIO, reflections=False, depth=1),
+    "so2_frame": functools.partial(EqNIO, reflections=False, frame_width=128),
+    "so2_frame_shallow": functools.partial(EqNIO, reflections=False, depth=1, frame_width=128),
 }
 
 
@@ -95,9 +95,9 @@ def register(name: str, network: type[nn.Module]) -> None:
     _MODELS[name] = network
 
 
-def options(name: str) -> dict[str, Any]:
-    """The options of the network `name` and their types. Raises `InputError` for an unknown
-    name."""
+def options(name: str, equivariance: str = "none") -> dict[str, Any]:
+    """The options of the network `name`, with those of its equivariance, and their types. Raises
+    `InputError` for an unknown name."""
     if name not in _MODELS:
         _check_word(name, names(), f"model '{name}'", "unknown", "models", "; plugins add others")
     network = _MODELS[name]
@@ -105,7 +105,16 @@ def options(name: str) -> dict[str, Any]:
     kinds = {field.name: types[field.name] for field in dataclasses.fields(network)}
     kinds |= {"equivariance": Literal["none", *_EQUIVARIANT]}
     kinds |= {"corrector": Literal["none", "airimu"]}
+    kinds |= frame_options(equivariance)
     return {option: kind for option, kind in kinds.items() if option not in ("parent", "name")}
+
+
+def frame_options(equivariance: str) -> dict[str, Any]:
+    """The options of an equivariance and their types: the fields of its module that have bounds."""
+    construction: Any = _EQUIVARIANT.get(equivariance)
+    module = getattr(construction, "func", construction)
+    types = get_type_hints(module, include_extras=True) if module else {}
+    return {option: kind for option, kind in types.items() if get_origin(kind) is Annotated}
 
 
 def from_config(config: ModelConfig) -> nn.Module:
@@ -180,13 +189,14 @@ def create(name: str, **values: Any) -> nn.Module:
     `Prediction`.
 
     `equivariance` is an option of all: "none", "four_headings", "canonical_frame",
-    "device_heading" (`models.equivariance`), or a frame of EqNIO (`models.eqnio`); so is
-    `corrector`: "none" or "airimu" (`models.airimu`). `winograd`, the way of computing convolutions
-    in training, is chosen for this machine unless it is given (`models.convolution`). Raises
-    `InputError` for an unknown name or option, naming the known ones, a value that is not one of an
-    option's choices or beyond its bounds, or options that do not fit together.
+    "device_heading" (`models.equivariance`), or a frame of EqNIO (`models.eqnio`), each with the
+    options of its module; so is `corrector`: "none" or "airimu" (`models.airimu`). `winograd`, the
+    way of computing convolutions in training, is chosen for this machine unless it is given
+    (`models.convolution`). Raises `InputError` for an unknown name or option, naming the known
+    ones, a value that is not one of an option's choices or beyond its bounds, or options that do
+    not fit together.
     """
-    subject, kinds = f"model '{name}'", options(name)
+    subject, kinds = f"model '{name}'", options(name, values.get("equivariance", "none"))
     for option, value in values.items():
         kind = kinds[_check_word(option, kinds, subject, f"unknown option '{option}'", "options")]
         if get_origin(kind) in (Literal, Annotated):
@@ -194,6 +204,9 @@ def create(name: str, **values: Any) -> nn.Module:
     if "winograd" in kinds:
         values.setdefault("winograd", winograd_pays())
     equivariance, corrector = values.pop("equivariance", "none"), values.pop("corrector", "none")
+    of_frame = {
+        option: values.pop(option) for option in frame_options(equivariance) & values.keys()
+    }
     try:
         network = _MODELS[name](**values)
     except ValueError as error:
@@ -204,7 +217,7 @@ def create(name: str, **values: Any) -> nn.Module:
             problem = "turns with the world already, by its memory's frame"
             problem = problem if memory else "sees the body, whose axes a frame would not turn"
             raise InputError(subject, problem, "leave model.equivariance out")
-        network = _EQUIVARIANT[equivariance](network)
+        network = _EQUIVARIANT[equivariance](network, **of_frame)
     if corrector != "none":
         if equivariance != "none":
             problem = "has a frame, before which no corrector can be"

@@ -117,8 +117,16 @@ def method(name: str, base: TrainConfig) -> TrainConfig:
     differ, so every row's checkpoint is the one with the smallest squared error on the
     validation split."""
     network, options, other_loss = SYSTEMS.get(name, System(name))
-    options = {"equivariance": base.model.equivariance, **scaled_size(network, base), **options}
-    model = ModelConfig(name=network, **options)
+    equivariance = {
+        option: getattr(base.model, option)
+        for option in ("equivariance", *models.frame_options(base.model.equivariance))
+    }
+    if "equivariance" in options:
+        equivariance = scaled_size(
+            ("frame_width",), base, name=network, equivariance=options["equivariance"]
+        )
+    size = scaled_size(("width", "particles"), base, name=network)
+    model = ModelConfig(name=network, **equivariance, **size, **options)
     regularisation = REGULARISATION.get(network, {})
     optim = dataclasses.replace(base.optim, best_by="squared_error", **regularisation)
     network_loss = dataclasses.replace(loss(network, base), **other_loss)
@@ -146,14 +154,15 @@ def method(name: str, base: TrainConfig) -> TrainConfig:
     return config
 
 
-def scaled_size(network: str, base: TrainConfig) -> dict[str, int]:
-    """The option that makes a network wider or narrower, at the share of its published value that
+def scaled_size(sizes: tuple[str, ...], base: TrainConfig, **network: str) -> dict[str, int]:
+    """The first of the options `sizes` that a network has, at the share of its published value that
     `base` has of GNIO's width, or the next value that the network can have; if there is none near
-    it, the network says why. It is the width, and for iMoT, whose features are the samples of a
-    window, the number of particles. Empty, for the published size, for networks without such an
-    option, and for those with memory, which are small."""
-    published = models.create(network)
-    option = next((name for name in ("width", "particles") if hasattr(published, name)), None)
+    it, the network says why. Networks have a width; iMoT, whose features are the samples of a
+    window, has a number of particles, and EqNIO's network for the frame has a width of its own.
+    Empty, for the published size, for networks without such an option, and for those with memory,
+    which are small."""
+    published = models.create(**network)
+    option = next((size for size in sizes if hasattr(published, size)), None)
     if isinstance(published, NetworkWithMemory) or option is None or base.model.width is None:
         return {}
     full = getattr(published, option)
@@ -162,10 +171,10 @@ def scaled_size(network: str, base: TrainConfig) -> dict[str, int]:
     return {option: next(filter(partial(accepts, network, option), larger), size)}
 
 
-def accepts(network: str, option: str, value: int) -> bool:
+def accepts(network: dict[str, str], option: str, value: int) -> bool:
     """Whether a network can have this option: the width of CTIN is a multiple of its heads."""
     try:
-        models.create(network, **{option: value})
+        models.create(**network, **{option: value})
     except InputError:
         return False
     return True

@@ -41,14 +41,16 @@ def load_initial_network(config: TrainConfig) -> TrainedNetwork | None:
 def _describe_network(config: TrainConfig) -> dict[str, Any]:
     """What two experiments share if they have the same network: its name and options, and its
     windows."""
-    model: Any = models.innermost(models.from_config(config.model))
+    whole = models.from_config(config.model)
+    model: Any = models.innermost(whole)
     fields = (field.name for field in dataclasses.fields(model))
     options = {name: getattr(model, name) for name in fields if name not in ("parent", "name")}
     # Any network can be averaged over headings, which adds no parameters.
     frame = config.model.equivariance
     frame = "none" if frame == "four_headings" else frame
     parts = {"name": config.model.name, "equivariance": frame, "corrector": config.model.corrector}
-    options = {**parts, **options}
+    of_frame = models.frame_options(frame)
+    options = {**parts, **options, **{name: getattr(whole, name) for name in of_frame}}
     of_windows = ("rate", "window_seconds", "context_seconds", "window_rotation")
     windows = {f"data.{name}": getattr(config.data, name) for name in of_windows}
     return {f"model.{name}": value for name, value in options.items()} | windows

@@ -188,6 +188,10 @@ def _train(
     # `start`.
     state = parallel.copy_to_devices(task.initial_state(init_key, start and start.variables))
     position = RunPosition()
+    order, none, factor = task.order(order_key, 0, source), jnp.int32(0), jnp.float32(1)
+    task.trace_steps(
+        state, source, order, none, none, factor, step_key
+    )  # before anything is written
     with run_folder.open_run(config, data, state.variables, resume) as workdir:
         for line in task.description(state, workdir):
             reporter.line(line)

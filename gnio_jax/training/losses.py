@@ -84,7 +84,7 @@ def losses(
         dt: Time between the samples of a window, s, which the preintegration loss needs.
 
     Raises:
-        ValueError: The loss needs more than the network predicts (e.g. a velocity for every
+        InputError: The loss needs more than the network predicts (e.g. a velocity for every
             sample).
     """
     vectors = (prediction.displacement, prediction.log_std, windows.displacement)
@@ -127,10 +127,8 @@ def _velocity_and_covariance(
     """
     diagnostics = prediction.diagnostics
     if not {"velocity", "velocity_log_std", "task_log_std"} <= diagnostics.keys():
-        raise ValueError(
-            "loss 'velocity_and_covariance' needs a velocity for every sample, "
-            "which only the network 'ctin' gives"
-        )
+        need = "a velocity for every sample, as the network ctin gives"
+        network_losses.refuse("velocity_and_covariance", need)
     # For a context before the window CTIN would predict velocities for which there is no target.
     chex.assert_equal_shape(
         [windows.steps, diagnostics["velocity"], diagnostics["velocity_log_std"]]

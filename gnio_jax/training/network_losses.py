@@ -3,7 +3,7 @@ rotation consistency. All are means over the windows."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gnio_jax.config import LossConfig
+from gnio_jax.errors import InputError
 from gnio_jax.models.airimu import LIKELIHOOD_WEIGHT, huber_loss
 from gnio_jax.models.airio import body_axes, label_rows
 from gnio_jax.models.bins import centres_of
@@ -27,6 +28,11 @@ TILT_STEPS = 20
 """Newton steps that give VeloBins' label the true mean."""
 LEAST_SPEED = 0.5
 """RIO: no rotation consistency at or below this speed, m/s."""
+
+
+def refuse(name: str, need: str) -> NoReturn:
+    """Raise `InputError` for a loss that needs what the network does not predict."""
+    raise InputError("loss.name", f"is {name}, which needs {need}", "leave it out")
 
 
 def polar(prediction: Prediction, windows: Windows, config: LossConfig) -> Float[Array, ""]:
@@ -50,7 +56,7 @@ def polar(prediction: Prediction, windows: Windows, config: LossConfig) -> Float
         rows, moving = diagnostics["polar"], length > LEAST_LENGTH
         angle = _angle(moved[:, 1], moved[:, 0], moving)
     else:
-        raise ValueError("loss 'polar' needs a length and an angle, as the network 'ionet' gives")
+        refuse("polar", "a length and an angle, as the network ionet gives")
     error = rows[:, 1] - angle
     wrapped = jnp.arctan2(jnp.sin(error), jnp.cos(error))
     squared = jnp.where(moving, wrapped, 0.0) ** 2
@@ -62,7 +68,7 @@ def body_velocity(prediction: Prediction, windows: Windows) -> Float[Array, ""]:
     per window."""
     diagnostics, samples = prediction.diagnostics, windows.steps.shape[1]
     if "body_velocity" not in diagnostics:
-        raise ValueError("loss 'body_velocity' needs the network 'airio'")
+        refuse("body_velocity", "velocities of the body, as the network airio gives")
     rows = label_rows(samples)
     axes = body_axes(windows.imu[:, rows])
     truth = jnp.einsum("bnij,bni->bnj", axes, samples * windows.steps[:, rows])
@@ -80,7 +86,7 @@ def bins(prediction: Prediction, windows: Windows, axes: int) -> Float[Array, ""
     the exact mean. Its σ is the present error, at least a tenth of a bin, without gradient.
     """
     if "bin_logits" not in prediction.diagnostics:
-        raise ValueError("loss 'bins' needs a network with head: bins")
+        refuse("bins", "a network with model.head: bins")
     logits = prediction.diagnostics["bin_logits"][:, :axes]
     centres = centres_of(prediction.diagnostics["bin_reach"][0], logits.shape[-1])
     error = (windows.displacement - prediction.displacement)[:, :axes]

@@ -199,6 +199,11 @@ class Task(ABC):
         """`train_steps` of this task. The old state is used up."""
         return train_steps(*arguments, task=self)
 
+    def trace_steps(self, *arguments: Any) -> None:
+        """Trace `train_steps` of this task, and take none. JAX keeps the trace for the first one.
+        Raises `InputError` for a loss that the network does not fit."""
+        train_steps.eval_shape(*arguments, task=self)
+
 
 # The step
 # ------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from gnio_jax.config import LossConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import airimu
 from gnio_jax.training.losses import loss_stage, losses
-from gnio_jax.types import Windows
+from gnio_jax.types import Prediction, Windows
 from tests.support.compiling import quick
 from tests.support.networks import drawn
 from tests.support.numpy_layers import batch_norm, conv, float64, gelu, linear, recurrence
@@ -100,8 +100,11 @@ def windows_of(imu, dt):
     return Windows(jnp.float32(whole), jnp.float32(steps.sum(1)), jnp.float32(steps))
 
 
-def test_the_loss_is_small_for_true_samples_and_has_a_gradient_for_every_parameter():
-    samples, dt = 62, 0.01
+@pytest.mark.parametrize("samples", [62, 40])
+def test_the_loss_is_small_for_true_samples_and_has_a_gradient_for_every_parameter(samples):
+    """A window of 40 samples is too short for the published target, and its last one is the
+    target."""
+    dt = 0.01
     smooth = np.cumsum(RNG.normal(0, 0.05, (samples, 6)), axis=0)
     smooth[:, 2] += 9.8
     windows = windows_of(smooth, dt)
@@ -122,6 +125,16 @@ def test_the_loss_is_small_for_true_samples_and_has_a_gradient_for_every_paramet
     gradient = quick(jax.grad(loss))(variables["params"])
     for path, leaf in jax.tree.leaves_with_path(gradient["corrector"]):
         assert np.isfinite(leaf).all() and np.abs(leaf).max() > 1e-9, path
+
+
+def test_the_loss_needs_a_target():
+    config = LossConfig(preintegration_weight=1.0)
+    stage = loss_stage(config, 0, 1)
+    rest = np.tile([0, 0, 9.81, 0, 0, 0], (10, 1))
+    samples = {"corrected": jnp.zeros((1, 10, 6)), "corrected_variance": jnp.ones((1, 10, 6))}
+    said = Prediction(jnp.zeros((1, 3)), jnp.zeros((1, 3)), samples)
+    with pytest.raises(InputError, match="at least 11 samples, and these have 10; raise"):
+        losses(said, windows_of(rest, 0.01), config, stage)
 
 
 def test_the_network_sees_the_corrected_samples_in_its_frame():

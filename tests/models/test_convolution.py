@@ -13,6 +13,7 @@ from gnio_jax.models.convolution import (
     convolve_depthwise,
     convolve_forward,
     convolve_groups,
+    convolve_long,
     convolve_three,
 )
 from tests.support.compiling import quick
@@ -38,6 +39,7 @@ def by_definition(x, kernel, stride=1):
     [
         *((convolve, *shape, 1) for shape in ((7, 2, 11), (3, 2, 12), (3, 1, 5), (1, 2, 12))),
         *((convolve_forward, *shape, 1) for shape in ((7, 2, 11), (3, 1, 5))),
+        *((convolve_long, *shape, 1) for shape in ((31, 1, 50), (17, 1, 40), (3, 1, 5), (1, 1, 8))),
         *((convolve_three, 3, 1, length, 1) for length in (1, 4, 13)),
         *((convolve_depthwise, 3, stride, 11, 8) for stride in (1, 2)),
         (convolve_groups, 3, 1, 11, 4),
@@ -68,7 +70,7 @@ def test_values_and_derivatives_are_those_of_the_convolution(
         tangents = x[::-1], kernel[::-1]
         return *found, jax.jvp(function, (x, kernel), tangents)[1] if forward else found[0]
 
-    forward = function in (convolve, convolve_forward)
+    forward = function in (convolve, convolve_forward, convolve_long)
     both = quick(lambda *g: [with_derivatives(each, *g, forward) for each in (ours, native)])
     found, wanted = both(x, kernel)
     for one, other in zip(found, wanted, strict=True):
@@ -87,6 +89,7 @@ def test_it_loses_a_digit_at_most():
         return np.sqrt(np.mean((np.asarray(convolution(x, kernel)) - wanted) ** 2)) / size
 
     assert error(quick(lambda x, kernel: convolve(x, kernel, (1,), [(1, 1)]))) < 1e-6
+    assert error(quick(lambda x, kernel: convolve_long(x, kernel, (1,), [(1, 1)]))) < 1e-6
     assert error(quick(convolve_three)) < 5e-6
 
 

@@ -153,6 +153,8 @@ def test_the_frame_against_numpy_by_gram_and_schmidt(reflections, depth):
     shapes = jax.eval_shape(frame.init, jax.random.key(0), jnp.asarray(WINDOWS))
     variables = drawn(shapes)
     heading, sign = quick(frame.apply)(variables, jnp.asarray(WINDOWS))
+    in_training = quick(frame.apply, static_argnums=2)(variables, jnp.asarray(WINDOWS), True)
+    np.testing.assert_allclose(in_training.heading, heading, atol=1e-5)
     for window, x, s in zip(WINDOWS, np.asarray(heading), np.asarray(sign), strict=True):
         wanted = numpy_frame(window, variables["params"], reflections, depth)
         np.testing.assert_allclose(x, wanted[0], atol=1e-5)
@@ -187,6 +189,17 @@ def test_the_likelihood_has_the_full_covariance():
         wanted = 0.5 * e @ np.linalg.solve(covariance, e)
         wanted += 0.5 * np.log(np.linalg.det(covariance))
         np.testing.assert_allclose(found, wanted, rtol=1e-9)
+
+
+def test_the_frames_width_is_an_option_of_networks_with_a_frame():
+    narrow = models.create("tlio", width=8, equivariance="so2_frame", frame_width=4)
+    frame = models.variable_shapes(narrow, 40)["params"]["frame"]
+    assert frame["frame"]["kernel"].shape == (8, 2)
+    for equivariance in ("none", "four_headings", "device_heading"):
+        with pytest.raises(InputError, match="unknown option 'frame_width'"):
+            models.create("tlio", equivariance=equivariance, frame_width=4)
+    with pytest.raises(InputError, match="'frame_width' must be at least 1"):
+        models.create("tlio", equivariance="o2_frame", frame_width=0)
 
 
 def test_a_network_that_sees_the_body_has_no_frame():

@@ -169,6 +169,23 @@ def test_a_device_whose_screen_faces_up_is_seen_in_the_frame_of_its_heading():
         np.testing.assert_allclose(found[0], turn @ said.displacement[0], atol=2e-5)
 
 
+def test_the_largest_tilt_of_a_screen_that_faces_up():
+    """Screens at 64° and 66°, with limits of 65° and of 60°, which is the default."""
+    tilt = np.radians([64.0, 66.0, 50.0])[:, None] + np.zeros((3, SAMPLES))
+    axes = held(tilt, np.full((3, SAMPLES), 2.0))
+    windows = np.concatenate([np.float32(WINDOWS), axes], axis=-1)
+    hidden = np.concatenate([np.float32(WINDOWS), 0 * axes], axis=-1)
+    parts = variables("device_heading")
+    for limit, seen in ((None, [False, False, True]), (65.0, [True, False, True])):
+        options = {} if limit is None else {"largest_tilt": limit}
+        model = models.create("whole", equivariance="device_heading", **options)
+        known, unknown = (quick(model.apply)(parts, x).displacement for x in (windows, hidden))
+        np.testing.assert_array_equal(np.any(np.abs(known - unknown) > 1e-4, axis=1), seen)
+    for limit in (0.0, 90.0):
+        with pytest.raises(InputError, match="'largest_tilt' must be above 0 and below 90"):
+            models.create("gnio", equivariance="device_heading", largest_tilt=limit)
+
+
 def test_no_device_axes_make_a_derivative_infinite():
     """Its x axis on the vertical, hidden axes, and a screen at 60°, where the frame changes."""
     axes = np.zeros((3, SAMPLES, 6), np.float32)

@@ -81,10 +81,23 @@ def test_networks_on_windows_have_one_share_of_their_published_widths(width, wid
         assert experiments.method(name, base).model.particles == particles
 
 
+def test_a_frame_has_the_share_of_the_width_and_that_of_the_base_stays():
+    for width, widths in ((16, 16), (4, 4), (None, None)):
+        base = dataclasses.replace(BASE, model=dataclasses.replace(BASE.model, width=width))
+        for name in ("eqnio_tlio", "eqnio_ronin"):
+            assert experiments.method(name, base).model.frame_width == widths
+        assert experiments.method("airimu", base).model.frame_width is None
+    of_base = {"equivariance": "so2_frame", "frame_width": 5}
+    base = dataclasses.replace(BASE, model=dataclasses.replace(BASE.model, **of_base))
+    assert experiments.method("tlio", base).model.frame_width == 5
+    assert experiments.method("eqnio_tlio", base).model.frame_width != 5
+    assert experiments.method("airimu", base).model.frame_width is None
+
+
 def test_the_search_for_a_width_ends_where_a_network_accepts_none(monkeypatch):
     """The error of the network names what is wrong."""
     monkeypatch.setattr(experiments, "accepts", lambda network, option, value: False)
-    assert experiments.scaled_size("ctin", BASE) == {"width": 6}
+    assert experiments.scaled_size(("width",), BASE, name="ctin") == {"width": 6}
     with pytest.raises(InputError, match="width must be even"):
         experiments.method("ctin", BASE)
 

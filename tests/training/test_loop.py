@@ -160,6 +160,25 @@ def test_refused_before_anything_is_written(recording, finished, tmp_path):
         assert [path.name for path in tmp_path.rglob("*")] == ["run", "config.yaml"]
 
 
+@pytest.mark.parametrize(
+    "loss, problem",
+    [
+        ({"name": "polar"}, "loss.name: is polar, which needs a length and an angle"),
+        ({"name": "body_velocity"}, "loss.name: is body_velocity, which needs velocities"),
+        ({"name": "bins"}, "loss.name: is bins, which needs a network with model.head: bins"),
+        ({"name": "velocity_and_covariance"}, "loss.name: is velocity_and_covariance, which needs"),
+    ],
+)
+def test_a_loss_that_does_not_fit_the_network_is_refused_before_anything_is_written(
+    recording, tmp_path, loss, problem
+):
+    experiment = config(recording, tmp_path / "run")
+    experiment = dataclasses.replace(experiment, loss=LossConfig(**loss))
+    with pytest.raises(InputError, match=problem):
+        loop.train(experiment)
+    assert not (tmp_path / "run").exists()
+
+
 def test_two_trainings_in_one_folder(recording, tmp_path):
     """The second one is refused when both have passed the door before either has written, also
     where both resume."""
