@@ -330,10 +330,11 @@ class ModelConfig:
     ] = "none"
     """How a network is made equivariant, so that its displacement turns with a window that is
     turned about the vertical. four_headings is the mean over four headings of the window, at
-    inference; canonical_frame uses a frame that a small network finds in the window; device_heading
-    uses the heading of the device if its screen faces up, as people hold it ahead. The others are
-    EqNIO's networks for the frame: with reflections (o2_frame), without them (so2_frame: around
-    TLIO, so2_frame_shallow: around RoNIN)."""
+    inference, or over four memories of a network that has one; canonical_frame uses a frame that a
+    small network finds in the window; device_heading uses the heading of the device if its screen
+    faces up, as people hold it ahead. The others are EqNIO's networks for the frame: with
+    reflections (o2_frame), without them (so2_frame: around TLIO, so2_frame_shallow: around
+    RoNIN)."""
     frame_width: Count | None = None
     """Vectors, and scalars, in a layer of EqNIO's network for the frame (o2_frame: 64, the others:
     128)."""

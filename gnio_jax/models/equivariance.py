@@ -20,6 +20,7 @@ from gnio_jax.config.schema import Tilt
 from gnio_jax.geometry import direction
 from gnio_jax.models.heads import root_mean_square, to_axes
 from gnio_jax.models.layers import checked_windows, conv_norm, linear
+from gnio_jax.models.memory import NetworkWithMemory
 from gnio_jax.types import GRAVITY, Prediction
 
 QUARTER_TURNS = np.float32([[1, 0], [0, 1], [-1, 0], [0, -1]])
@@ -78,6 +79,69 @@ class FourHeadings(Equivariant):
             by_heading(turned_back.displacement).mean(axis=-2),
             root_mean_square(by_heading(turn_log_std(prediction.log_std, opposite(heading)))),
             diagnostics,
+        )
+
+
+class FourHeadingsWithMemory(NetworkWithMemory):
+    """At inference, four memories of a network side by side, which see the samples turned by 0, 90,
+    180 and 270°, and the mean of their displacements, turned back (ours).
+
+    A network with memory turns with the world whatever it is, but an error that is constant in the
+    frame of its memory, whose yaw is that of the walk's start, adds up along the walk. The frame of
+    a window turns with its carrier, so there it does not. In the mean over four headings it
+    cancels. Variances, diagnostics and training are as in `FourHeadings`.
+    """
+
+    network: Any = None
+    """A `NetworkWithMemory`, whose own options hold."""
+
+    def setup(self) -> None:
+        nn.share_scope(self, self.network)
+
+    @property
+    def features(self) -> int:
+        return self.network.features
+
+    @property
+    def multiple(self) -> int:
+        return self.network.multiple
+
+    @nn.nowrap
+    def constants(self, variables: Any) -> dict[str, Any]:
+        return self.network.constants(variables)
+
+    def begin(self, batch: int) -> Any:
+        turns = len(QUARTER_TURNS)
+        states = self.network.begin(turns * batch)
+        return jax.tree.map(lambda leaf: leaf.reshape(batch, turns, *leaf.shape[1:]), states)
+
+    def advance(
+        self,
+        state: Any,
+        signals: Float[Array, "b t 6"],
+        every: int,
+        train: bool = False,
+        **constants: Any,
+    ) -> tuple[Any, Prediction]:
+        signals, turns = checked_windows(signals), len(QUARTER_TURNS)
+        if train:
+            first = jax.tree.map(lambda leaf: leaf[:, 0], state)
+            first, prediction = self.network.advance(first, signals, every, train, **constants)
+            return jax.tree.map(lambda leaf, row: leaf.at[:, 0].set(row), state, first), prediction
+        batch = signals.shape[0]
+        heading = jnp.tile(jnp.asarray(QUARTER_TURNS), (batch, 1))
+        turned = turn_windows(jnp.repeat(signals, turns, axis=0), heading)
+        rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), state)
+        rows, prediction = self.network.advance(rows, turned, every, train, **constants)
+        displacement = turn(prediction.displacement, opposite(heading))
+        log_std = turn_log_std(prediction.log_std, opposite(heading))
+        by_turn = batch, turns, displacement.shape[1], 3
+        log_std = log_std.reshape(by_turn).swapaxes(1, 2)
+        state = jax.tree.map(lambda leaf: leaf.reshape(batch, turns, *leaf.shape[1:]), rows)
+        return state, Prediction(
+            displacement.reshape(by_turn).mean(axis=1),
+            jax.vmap(root_mean_square)(log_std),
+            {name: value[::turns] for name, value in prediction.diagnostics.items()},
         )
 
 

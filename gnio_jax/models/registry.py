@@ -28,7 +28,12 @@ from gnio_jax.models.convolution import winograd_pays
 from gnio_jax.models.ctin import CTIN
 from gnio_jax.models.deepils import DeepILS
 from gnio_jax.models.eqnio import EqNIO
-from gnio_jax.models.equivariance import CanonicalFrame, DeviceHeading, FourHeadings
+from gnio_jax.models.equivariance import (
+    CanonicalFrame,
+    DeviceHeading,
+    FourHeadings,
+    FourHeadingsWithMemory,
+)
 from gnio_jax.models.experts import Experts
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.gru import GRUNetwork
@@ -74,6 +79,9 @@ _EQUIVARIANT: dict[str, Callable[..., nn.Module]] = {
     "so2_frame": functools.partial(EqNIO, reflections=False, frame_width=128),
     "so2_frame_shallow": functools.partial(EqNIO, reflections=False, depth=1, frame_width=128),
 }
+
+
+_EQUIVARIANT_WITH_MEMORY = {"four_headings": FourHeadingsWithMemory}
 
 
 def names() -> list[str]:
@@ -213,18 +221,22 @@ def create(name: str, **values: Any) -> nn.Module:
         raise InputError(subject, str(error)) from None
     memory, body = isinstance(network, NetworkWithMemory), channels(network) != 6
     if equivariance != "none":
-        if memory or body:
-            problem = "turns with the world already, by its memory's frame"
-            problem = problem if memory else "sees the body, whose axes a frame would not turn"
+        if body:
+            problem = "sees the body, whose axes a frame would not turn"
             raise InputError(subject, problem, "leave model.equivariance out")
-        network = _EQUIVARIANT[equivariance](network, **of_frame)
+        if memory and equivariance not in _EQUIVARIANT_WITH_MEMORY:
+            problem = "turns with the world already, by its memory's frame"
+            remedy = f"known with it: none, {', '.join(_EQUIVARIANT_WITH_MEMORY)}"
+            raise InputError(subject, problem, remedy)
+        constructions = _EQUIVARIANT_WITH_MEMORY if memory else _EQUIVARIANT
+        network = constructions[equivariance](network=network, **of_frame)
     if corrector != "none":
-        if equivariance != "none":
-            problem = "has a frame, before which no corrector can be"
-            raise InputError(subject, problem, "leave model.corrector or model.equivariance out")
         if memory:
             problem = "sees single samples, and a corrector needs windows"
             raise InputError(subject, problem, "leave model.corrector out")
+        if equivariance != "none":
+            problem = "has a frame, before which no corrector can be"
+            raise InputError(subject, problem, "leave model.corrector or model.equivariance out")
         network = Corrected(network)
     return network
 

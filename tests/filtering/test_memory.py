@@ -23,8 +23,8 @@ EKF = filtering.Filter(CONFIG)
 
 
 @functools.cache
-def network(name="gru"):
-    model = models.create(name, **SMALL[name])
+def network(name="gru", equivariance="none"):
+    model = models.create(name, **SMALL[name], equivariance=equivariance)
     variables = drawn({"batch_stats": {}, **models.variable_shapes(model, N)}, size=0.2)
     return Network.of(model, variables)
 
@@ -47,14 +47,14 @@ def start(turn=0.0, ekf=EKF):
 
 
 @functools.cache
-def program(ekf=EKF, name="gru"):
-    predict = network(name).predict()
+def program(ekf=EKF, name="gru", equivariance="none"):
+    predict = network(name, equivariance).predict()
     return quick(functools.partial(filtering.run_odometry, predict, ekf))
 
 
 @functools.cache
-def run():
-    return program()(start(), *recording())
+def run(equivariance="none"):
+    return program(equivariance=equivariance)(start(), *recording())
 
 
 def assert_close(found, expected, rtol=1e-5, atol=1e-5):
@@ -123,10 +123,12 @@ def test_a_run_in_two_calls_is_one_run():
     assert np.nanmax(np.abs(empty.displacement - second.displacement)) > 1e-3
 
 
-def test_the_tracker_carries_it_too():
-    _, history = run()
+@pytest.mark.parametrize("equivariance", ["none", "four_headings"])
+def test_the_tracker_carries_it_too(equivariance):
+    end, history = run(equivariance)
     gyro, accel = recording()
-    tracker = Tracker(network().predict(), EKF, start())
+    predict = network(equivariance=equivariance).predict()
+    tracker = Tracker(predict, EKF, start())
     poses = []
     for k, (rate, force) in enumerate(zip(gyro, accel, strict=True)):
         pose = tracker.push(k * DT, rate, force)
@@ -135,10 +137,10 @@ def test_the_tracker_carries_it_too():
     for name in ("position", "velocity", "gyro_bias", "nis"):
         rows = [getattr(pose, name) for pose in poses]
         np.testing.assert_allclose(rows, getattr(history, name), rtol=1e-4, atol=1e-5)
-    state, expected = tracker.filter_state(), run()[0]
-    assert_close(state.memory, expected.memory)
-    later = Tracker(network().predict(), EKF, state)
-    assert_close(later.filter_state().memory, expected.memory)
+    state = tracker.filter_state()
+    assert_close(state.memory, end.memory)
+    later = Tracker(predict, EKF, state)
+    assert_close(later.filter_state().memory, end.memory)
 
 
 def test_a_batch_has_a_memory_for_each_of_its_sequences():

@@ -69,9 +69,10 @@ def in_frame(gyro, accel, attitude, heading):
 
 
 @pytest.mark.parametrize("name", WITH_MEMORY)
-@pytest.mark.parametrize("bank", [False, True])
-def test_steps_predict_what_the_whole_recording_predicts_at_once(name, bank):
-    options = {"bank_size": 3, "head": "gated"} if bank else {}
+@pytest.mark.parametrize(
+    "options", [{}, {"bank_size": 3, "head": "gated"}, {"equivariance": "four_headings"}]
+)
+def test_steps_predict_what_the_whole_recording_predicts_at_once(name, options):
     net, signals = network(name, **options), walk()
     memory, rows = stepwise(net, *signals)
     first = signals[2][0]
@@ -168,9 +169,77 @@ def test_intervals_that_do_not_fit_the_strides_are_refused():
             )
 
 
-def test_equivariance_around_a_memory_is_refused():
-    with pytest.raises(InputError, match="turns with the world already, by its memory's frame"):
-        models.create("gru", equivariance="four_headings")
+def about_z(degrees):
+    return Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+
+
+@pytest.mark.parametrize("name", WITH_MEMORY)
+def test_four_memories_are_the_mean_over_four_headings(name):
+    """Against one memory after the other, on two walks in one batch. Each has its heading."""
+    one, four = network(name), network(name, equivariance="four_headings")
+    walks = [np.float32(in_frame(*walk(seed), 0.0)) for seed in (0, 1)]
+    means, variances = [], []
+    for signals in walks:
+        displacements, covariances = [], []
+        for degrees in (0, 90, 180, 270):
+            turn = about_z(degrees)
+            turned = np.einsum("ij,tkj->tki", turn, signals.reshape(-1, 2, 3)).reshape(-1, 6)
+            prediction = whole(one, turned)
+            displacements.append(prediction.displacement[0] @ turn)
+            squares = np.exp(2 * np.float64(prediction.log_std[0]))[..., None] * np.eye(3)
+            covariances.append(np.diagonal(turn.T @ squares @ turn, axis1=1, axis2=2))
+        means.append(np.mean(displacements, axis=0))
+        variances.append(np.mean(covariances, axis=0))
+    model, ready = four.apply.model, four.variables
+
+    def run(signals):
+        start = model.apply(ready.variables, 2, method="begin")
+        return model.apply(ready.variables, start, signals, N, method="advance")[1]
+
+    prediction = jax.device_get(quick(run)(jnp.asarray(np.stack(walks))))
+    np.testing.assert_allclose(prediction.displacement, means, atol=2e-6)
+    np.testing.assert_allclose(np.exp(2 * prediction.log_std), variances, rtol=1e-4)
+
+
+def test_an_error_that_is_constant_in_the_frame_of_the_memory_cancels_at_four_headings():
+    """An output that is off by the same vector everywhere, e.g. by the bias of the last layer."""
+    signals = in_frame(*walk(), 0.0)
+    for equivariance, left in (("none", 1.0), ("four_headings", 0.0)):
+        net = network("gru", equivariance=equivariance)
+        params = dict(net.variables.variables["params"])
+        layer = params["head"]["displacement"]
+        error = np.float32([0.3, -0.2, 0.1])
+        off = {**layer, "bias": layer["bias"] + error}
+        params["head"] = {**params["head"], "displacement": off}
+        variables = {**net.variables.variables, "params": params}
+        shifted = net._replace(variables=net.variables._replace(variables=variables))
+        change = whole(shifted, signals).displacement - whole(net, signals).displacement
+        wanted = np.broadcast_to(error * [left, left, 1.0], change.shape)
+        np.testing.assert_allclose(change, wanted, atol=1e-5)
+
+
+def test_training_has_one_of_four_memories():
+    """The steps of a segment go on from the memory of the heading that was seen."""
+    model = models.create("gru", **SMALL["gru"], equivariance="four_headings")
+    plain = models.create("gru", **SMALL["gru"])
+    variables = drawn({"batch_stats": {}, **models.variable_shapes(plain, N)})
+    signals = jnp.asarray(np.float32(in_frame(*walk(), 0.0)))[None]
+    middle = N * INTERVALS // 2
+    rows = []
+    for network_in_training in (plain, model):
+        state = network_in_training.begin(1)
+        for part in (signals[:, :middle], signals[:, middle:]):
+            arguments = state, part, N, True
+            state, prediction = network_in_training.apply(variables, *arguments, method="advance")
+        rows.append(prediction)
+    jax.tree.map(np.testing.assert_array_equal, *rows)
+
+
+def test_other_equivariance_around_a_memory_is_refused():
+    problem = "turns with the world already, by its memory's frame; known with it: none, four_head"
+    for equivariance in ("canonical_frame", "device_heading", "o2_frame"):
+        with pytest.raises(InputError, match=problem):
+            models.create("gru", equivariance=equivariance)
     with pytest.raises(InputError, match="output_dim must be 3 with the head gated, found 2"):
         models.create("ronin_lstm", head="gated", output_dim=2)
 
