@@ -128,6 +128,7 @@ def test_from_training_to_live(
     network = NAMED.get(recipe, recipe)
     words = () if recipe in OTHERS else ("--config", f"baselines/{recipe}")
     words += ("--segments.seconds", "4") if network in WITH_MEMORY else ()
+    words += ("--model.equivariance", "four_headings") if network == "gru" else ()
     words += ("--model.name", network, *smallest(network), *CHANGED)
     if recipe == "ridi":  # which fits as many as it needs
         words = [word for word in words if "supports" not in word and word != "--set"]

@@ -215,13 +215,22 @@ def test_an_operation_that_cannot_be_converted_is_named_in_one_line(converter):
         conversion.to_model(program, ekf, 0)
 
 
-@pytest.fixture(scope="module", params=["gru", "state_space", "ronin_lstm", "ronin_tcn"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        *(("gru", equivariance) for equivariance in ("none", "four_headings")),
+        *((network, "none") for network in ("state_space", "ronin_lstm", "ronin_tcn")),
+    ],
+    ids="-".join,
+)
 def remembering(request, converter, tmp_path_factory):
     """A network with memory, whose weights are drawn, and the folder of its models."""
-    folder = tmp_path_factory.mktemp(request.param)
+    network, equivariance = request.param
+    folder = tmp_path_factory.mktemp(network)
     windows = DataConfig(rate=50.0, stride_seconds=0.2)
-    options = dict(SMALL[request.param])
-    model = ModelConfig(name=request.param, width=options.pop("width"), options=options)
+    options = {**SMALL[network], "equivariance": equivariance}
+    named = {option: options.pop(option) for option in ("width", "equivariance")}
+    model = ModelConfig(name=network, **named, options=options)
     config = dataclasses.replace(CONFIG, data=windows, model=model)
     run = drawn_run.save(
         folder / "run", config, lambda random, _, shape: random.normal(0, 0.3, shape)
