@@ -15,7 +15,6 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import PreparedRecording
 from gnio_jax.evaluation.infer import infer
 from gnio_jax.models import Network
-from gnio_jax.models.equivariance import DeviceHeading
 from gnio_jax.networks import TrainedNetwork
 from gnio_jax.windows import window_starts
 
@@ -57,7 +56,7 @@ def misalignment(ready: PreparedRecording, trained: TrainedNetwork) -> float:
     A device looks to the left of its x axis, along the ground. `ready` has the attitude of the
     integrated gyro.
     """
-    assert ready.attitude is not None and isinstance(trained.model, DeviceHeading)
+    assert ready.attitude is not None
     windows = dataclasses.replace(trained.config.data, window_rotation="hidden_axes")
     strides = min(ready.strides, round(COMPARED_SECONDS / windows.stride_seconds))
     samples = strides * windows.stride
@@ -79,7 +78,8 @@ def misalignment(ready: PreparedRecording, trained: TrainedNetwork) -> float:
     # the device after the context.
     mean_of_window = np.full(windows.input_samples, 1 / windows.input_samples)
     up = np.convolve(attitude[:-1, 2, 2], mean_of_window, "valid")[start]
-    directed = (np.abs(moved) > LEAST_MOVED) & (up > trained.model.least_up)  # not where it is NaN
+    least_up = getattr(trained.model, "least_up", -1.0)  # a network of your own may have no limit
+    directed = (np.abs(moved) > LEAST_MOVED) & (up > least_up)  # not where it is NaN
     if directed.sum() * windows.stride_seconds < LEAST_SECONDS:
         return np.nan
     mean = np.mean(moved[directed] / np.abs(moved[directed]))

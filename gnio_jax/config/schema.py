@@ -729,9 +729,6 @@ class TrainConfig:
         if self.augment.hidden_axes_share and frame != "device_heading":
             problem = "is for model.equivariance: device_heading, the network that uses them"
             location.child("augment.hidden_axes_share").refuse(problem, "leave it out")
-        if self.loss.preintegration_weight and self.model.corrector == "none":
-            problem = "is for model.corrector, which learns from it"
-            location.child("loss.preintegration_weight").refuse(problem, "leave it out")
         self._check_segments(location)
         self._check_through_filter(location)
 

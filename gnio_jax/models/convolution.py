@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,7 +49,9 @@ def convolve_long(
 ) -> Float[Array, "b m d"]:
     """A 1-D convolution of stride 1 with a long kernel, written as a product for each block of
     `LONG_BLOCK` outputs: the inputs that a block needs times the kernel at every place in it. It
-    copies each input a few times, and `convolve` copies it once for every sample of the kernel."""
+    copies each input a few times, and `convolve` copies it once for every sample of the kernel. The
+    padded input is at least as long as the kernel."""
+    chex.assert_equal(tuple(window_strides), (1,))
     size, channels, features = kernel.shape
     x = jnp.pad(x, ((0, 0), padding[0], (0, 0)))
     outputs = x.shape[1] - size + 1

@@ -86,10 +86,11 @@ class FourHeadingsWithMemory(NetworkWithMemory):
     """At inference, four memories of a network side by side, which see the samples turned by 0, 90,
     180 and 270°, and the mean of their displacements, turned back (ours).
 
-    A network with memory turns with the world whatever it is, but an error that is constant in the
-    frame of its memory, whose yaw is that of the walk's start, adds up along the walk. The frame of
-    a window turns with its carrier, so there it does not. In the mean over four headings it
-    cancels. Variances, diagnostics and training are as in `FourHeadings`.
+    A network with memory turns with the world whatever it is. But a horizontal error that is
+    constant in the frame of its memory, whose yaw is that of the walk's start, adds up along the
+    walk. The frame of a window turns with its carrier, so there it does not. What is the same at
+    all four headings cancels in the mean. Variances and diagnostics are as in `FourHeadings`.
+    Training on segments has one memory; validation and training through the filter have four.
     """
 
     network: Any = None

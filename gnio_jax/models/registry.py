@@ -79,8 +79,6 @@ _EQUIVARIANT: dict[str, Callable[..., nn.Module]] = {
     "so2_frame": functools.partial(EqNIO, reflections=False, frame_width=128),
     "so2_frame_shallow": functools.partial(EqNIO, reflections=False, depth=1, frame_width=128),
 }
-
-
 _EQUIVARIANT_WITH_MEMORY = {"four_headings": FourHeadingsWithMemory}
 
 
@@ -119,7 +117,7 @@ def options(name: str, equivariance: str = "none") -> dict[str, Any]:
 
 def frame_options(equivariance: str) -> dict[str, Any]:
     """The options of an equivariance and their types: the fields of its module that have bounds."""
-    construction: Any = _EQUIVARIANT.get(equivariance)
+    construction: Any = _EQUIVARIANT.get(str(equivariance))
     module = getattr(construction, "func", construction)
     types = get_type_hints(module, include_extras=True) if module else {}
     return {option: kind for option, kind in types.items() if get_origin(kind) is Annotated}

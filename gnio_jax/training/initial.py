@@ -49,8 +49,7 @@ def _describe_network(config: TrainConfig) -> dict[str, Any]:
     frame = config.model.equivariance
     frame = "none" if frame == "four_headings" else frame
     parts = {"name": config.model.name, "equivariance": frame, "corrector": config.model.corrector}
-    of_frame = models.frame_options(frame)
-    options = {**parts, **options, **{name: getattr(whole, name) for name in of_frame}}
+    options = {**parts, **options, "frame_width": getattr(whole, "frame_width", None)}
     of_windows = ("rate", "window_seconds", "context_seconds", "window_rotation")
     windows = {f"data.{name}": getattr(config.data, name) for name in of_windows}
     return {f"model.{name}": value for name, value in options.items()} | windows

@@ -188,10 +188,9 @@ def _train(
     # `start`.
     state = parallel.copy_to_devices(task.initial_state(init_key, start and start.variables))
     position = RunPosition()
-    order, none, factor = task.order(order_key, 0, source), jnp.int32(0), jnp.float32(1)
-    task.trace_steps(
-        state, source, order, none, none, factor, step_key
-    )  # before anything is written
+    if not resume:  # a loss that does not fit is refused before anything is written
+        order, none = task.order(order_key, 0, source), jnp.int32(0)
+        task.trace_steps(state, source, order, none, none, jnp.float32(1), step_key)
     with run_folder.open_run(config, data, state.variables, resume) as workdir:
         for line in task.description(state, workdir):
             reporter.line(line)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from gnio_jax.config import LossConfig
+from gnio_jax.errors import InputError
 from gnio_jax.models.airimu import preintegration_loss
 from gnio_jax.training import network_losses
 from gnio_jax.types import Prediction, Windows
@@ -111,6 +112,9 @@ def losses(
         balance = network_losses.balance(prediction.diagnostics["router"])
         total = total + config.balance_weight * balance
     if config.preintegration_weight:
+        if "corrected" not in prediction.diagnostics:
+            problem = "needs a network with a corrector, e.g. model.corrector: airimu"
+            raise InputError("loss.preintegration_weight", problem, "or set it to 0")
         corrected = preintegration_loss(prediction, windows.imu, windows.steps, dt)
         total = total + config.preintegration_weight * corrected
     return Losses(total, mse, nll)

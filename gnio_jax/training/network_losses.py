@@ -32,7 +32,7 @@ LEAST_SPEED = 0.5
 
 def refuse(name: str, need: str) -> NoReturn:
     """Raise `InputError` for a loss that needs what the network does not predict."""
-    raise InputError("loss.name", f"is {name}, which needs {need}", "leave it out")
+    raise InputError("loss.name", f"is {name}, which needs {need}", "take weighted_sum")
 
 
 def polar(prediction: Prediction, windows: Windows, config: LossConfig) -> Float[Array, ""]:

@@ -73,7 +73,6 @@ def test_what_is_no_yaml_is_one_line_that_names_the_file(text):
         "augment.hidden_axes_share": [
             *("augment: {hidden_axes_share: 0.3}", "augment: {hidden_axes_share: 2.0}"),
         ],
-        "loss.preintegration_weight": ["loss: {preintegration_weight: 1.0}"],
         "model.output_dim": ["model: {output_dim: 4}", "model: {output_dim: 2.0}"],
         "seed": [
             *("seed: 010", "seed: 1:30", "seed: 0b_", "seed: 0x1f", "seed: 2020-13-45"),

@@ -70,7 +70,13 @@ def in_frame(gyro, accel, attitude, heading):
 
 @pytest.mark.parametrize("name", WITH_MEMORY)
 @pytest.mark.parametrize(
-    "options", [{}, {"bank_size": 3, "head": "gated"}, {"equivariance": "four_headings"}]
+    "options",
+    [
+        {},
+        {"bank_size": 3, "head": "gated"},
+        {"equivariance": "four_headings"},
+        {"bank_size": 3, "head": "bins", "equivariance": "four_headings"},
+    ],
 )
 def test_steps_predict_what_the_whole_recording_predicts_at_once(name, options):
     net, signals = network(name, **options), walk()

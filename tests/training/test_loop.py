@@ -167,6 +167,7 @@ def test_refused_before_anything_is_written(recording, finished, tmp_path):
         ({"name": "body_velocity"}, "loss.name: is body_velocity, which needs velocities"),
         ({"name": "bins"}, "loss.name: is bins, which needs a network with model.head: bins"),
         ({"name": "velocity_and_covariance"}, "loss.name: is velocity_and_covariance, which needs"),
+        ({"preintegration_weight": 1.0}, "loss.preintegration_weight: needs a network with a corr"),
     ],
 )
 def test_a_loss_that_does_not_fit_the_network_is_refused_before_anything_is_written(
