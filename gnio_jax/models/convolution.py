@@ -55,15 +55,15 @@ def convolve_long(
     size, channels, features = kernel.shape
     x = jnp.pad(x, ((0, 0), padding[0], (0, 0)))
     outputs = x.shape[1] - size + 1
-    blocks, seen = -(-outputs // LONG_BLOCK), LONG_BLOCK + size - 1
-    parts = -(-seen // LONG_BLOCK)
+    blocks, inputs = -(-outputs // LONG_BLOCK), LONG_BLOCK + size - 1
+    parts = -(-inputs // LONG_BLOCK)
     missing = (blocks + parts - 1) * LONG_BLOCK - x.shape[1]
     x = jnp.pad(x, ((0, 0), (0, missing), (0, 0)))
     x = x.reshape(x.shape[0], blocks + parts - 1, LONG_BLOCK * channels)
     columns = jnp.concatenate([x[:, i : i + blocks] for i in range(parts)], axis=-1)
     places = [jnp.pad(kernel, ((i, LONG_BLOCK - 1 - i), (0, 0), (0, 0))) for i in range(LONG_BLOCK)]
-    matrix = jnp.stack(places, axis=2).reshape(seen * channels, LONG_BLOCK * features)
-    product = columns[..., : seen * channels].reshape(-1, seen * channels) @ matrix
+    matrix = jnp.stack(places, axis=2).reshape(inputs * channels, LONG_BLOCK * features)
+    product = columns[..., : inputs * channels].reshape(-1, inputs * channels) @ matrix
     return product.reshape(-1, blocks * LONG_BLOCK, features)[:, :outputs]
 
 

@@ -188,6 +188,7 @@ def choices(kind):
 def test_the_settings_have_the_options_and_choices_of_the_networks():
     """`ModelConfig` repeats them for YAML and the command line, which do not wait for JAX."""
     networks = [registry.options(name) for name in models.names()]
+    networks += [registry.frame_options(kind) for kind in registry._EQUIVARIANT]
     for option, kind in typing.get_type_hints(ModelConfig).items():
         if option in ("name", "options"):
             continue
