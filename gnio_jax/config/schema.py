@@ -335,10 +335,10 @@ class ModelConfig:
     faces up, as people hold it ahead. The others are EqNIO's networks for the frame: with
     reflections (o2_frame), without them (so2_frame: around TLIO, so2_frame_shallow: around
     RoNIN)."""
-    frame_width: Count | None = None
+    frame_width: Annotated[Count | None, FILE_ONLY] = None
     """Vectors, and scalars, in a layer of EqNIO's network for the frame (o2_frame: 64, the others:
     128)."""
-    largest_tilt: Tilt | None = None
+    largest_tilt: Annotated[Tilt | None, FILE_ONLY] = None
     """Angle from the vertical up to which the normal of a screen faces up for device_heading,
     degrees (60)."""
     corrector: Literal["none", "airimu"] = "none"
