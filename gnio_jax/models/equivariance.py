@@ -74,7 +74,7 @@ class FourHeadings(Equivariant):
             velocities = by_heading(turned_back.diagnostics["velocity"])
             log_stds = by_heading(turned_back.diagnostics["velocity_log_std"])
             diagnostics["velocity"] = velocities.mean(axis=-2)
-            diagnostics["velocity_log_std"] = jax.vmap(root_mean_square)(log_stds)
+            diagnostics["velocity_log_std"] = root_mean_square(log_stds)
         return Prediction(
             by_heading(turned_back.displacement).mean(axis=-2),
             root_mean_square(by_heading(turn_log_std(prediction.log_std, opposite(heading)))),
@@ -134,14 +134,16 @@ class FourHeadingsWithMemory(NetworkWithMemory):
         turned = turn_windows(jnp.repeat(signals, turns, axis=0), heading)
         rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), state)
         rows, prediction = self.network.advance(rows, turned, every, train, **constants)
+
+        def by_heading(axes: Array) -> Array:
+            return jnp.moveaxis(axes.reshape(batch, turns, *axes.shape[1:]), 1, -2)
+
         displacement = turn(prediction.displacement, opposite(heading))
         log_std = turn_log_std(prediction.log_std, opposite(heading))
-        by_turn = batch, turns, displacement.shape[1], 3
-        log_std = log_std.reshape(by_turn).swapaxes(1, 2)
         state = jax.tree.map(lambda leaf: leaf.reshape(batch, turns, *leaf.shape[1:]), rows)
         return state, Prediction(
-            displacement.reshape(by_turn).mean(axis=1),
-            jax.vmap(root_mean_square)(log_std),
+            by_heading(displacement).mean(axis=-2),
+            root_mean_square(by_heading(log_std)),
             {name: value[::turns] for name, value in prediction.diagnostics.items()},
         )
 

@@ -104,6 +104,7 @@ def to_axes(output: Float[Array, "b k"]) -> Float[Array, "b 3"]:
     return jnp.pad(output, ((0, 0), (0, 3 - output.shape[-1])))
 
 
-def root_mean_square(log_std: Float[Array, "b n 3"]) -> Float[Array, "b 3"]:
+def root_mean_square(log_std: Float[Array, "*b n 3"]) -> Float[Array, "*b 3"]:
     """log √(mean over n of exp 2u), without overflow."""
-    return 0.5 * (jax.nn.logsumexp(2 * log_std, axis=1) - jnp.log(jnp.float32(log_std.shape[1])))
+    count = jnp.float32(log_std.shape[-2])
+    return 0.5 * (jax.nn.logsumexp(2 * log_std, axis=-2) - jnp.log(count))

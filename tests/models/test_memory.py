@@ -180,8 +180,9 @@ def test_four_memories_are_the_mean_over_four_headings(name, options):
     """Against one memory after the other, on two walks in one batch. Each has its heading."""
     one, four = network(name, **options), network(name, **options, equivariance="four_headings")
     walks = [np.float32(in_frame(*walk(seed), 0.0)) for seed in (0, 1)]
-    means, variances = [], []
+    means, variances, at_zero = [], [], []
     for signals in walks:
+        at_zero.append(whole(one, signals).diagnostics)
         displacements, covariances = [], []
         for degrees in (0, 90, 180, 270):
             turn = about_z(degrees)
@@ -201,6 +202,11 @@ def test_four_memories_are_the_mean_over_four_headings(name, options):
     prediction = jax.device_get(quick(run)(jnp.asarray(np.stack(walks))))
     np.testing.assert_allclose(prediction.displacement, means, atol=2e-6)
     np.testing.assert_allclose(np.exp(2 * prediction.log_std), variances, rtol=1e-4)
+    for row, diagnostics in enumerate(at_zero):
+        for name, value in diagnostics.items():
+            np.testing.assert_allclose(
+                prediction.diagnostics[name][row], value[0], rtol=1e-3, atol=1e-3
+            )
 
 
 def test_an_error_that_is_constant_in_the_frame_of_the_memory_cancels_at_four_headings():

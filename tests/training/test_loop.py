@@ -180,6 +180,15 @@ def test_a_loss_that_does_not_fit_the_network_is_refused_before_anything_is_writ
     assert not (tmp_path / "run").exists()
 
 
+def test_the_trace_before_the_folder_is_that_of_the_steps(recording, tmp_path, monkeypatch):
+    """The loss is traced once for the check and the run."""
+    traces, losses = [], WindowTask.losses
+    count = lambda *arguments: traces.append(1) or losses(*arguments)  # noqa: E731
+    monkeypatch.setattr(WindowTask, "losses", count)
+    loop.train(config(recording, tmp_path / "run", epochs=1, learning_rate=1.234e-3))
+    assert len(traces) == 1
+
+
 def test_two_trainings_in_one_folder(recording, tmp_path):
     """The second one is refused when both have passed the door before either has written, also
     where both resume."""
