@@ -238,8 +238,8 @@ class AugmentConfig:
     rest_share: Annotated[Probability, FILE_ONLY] = 0.0
     """Share of the windows that are replaced by windows of a phone at rest (ours)."""
     hidden_axes_share: Annotated[Share, FILE_ONLY] = 0.0
-    """Share of the windows whose heading model.equivariance: device_heading does not know, so that
-    the network learns the direction from the gait, too (ours)."""
+    """Share of the windows or segments whose heading model.equivariance: device_heading does not
+    know, so that the network learns the direction from the gait, too (ours)."""
     mirror_share: Annotated[Share, FILE_ONLY] = 0.0
     """Share of the windows or segments that are mirrored from left to right, so that the left hand
     carries what the right one carried (ours). What is ahead of the phone remains ahead."""
@@ -332,7 +332,8 @@ class ModelConfig:
     turned about the vertical. four_headings is the mean over four headings of the window, at
     inference, or over four memories of a network that has one; canonical_frame uses a frame that a
     small network finds in the window; device_heading uses the heading of the device if its screen
-    faces up, as people hold it ahead. The others are EqNIO's networks for the frame: with
+    faces up, as people hold it ahead (a network with memory sees it beside its samples, by four
+    memories). The others are EqNIO's networks for the frame: with
     reflections (o2_frame), without them (so2_frame: around TLIO, so2_frame_shallow: around
     RoNIN)."""
     frame_width: Annotated[Count | None, FILE_ONLY] = None
@@ -743,7 +744,7 @@ class TrainConfig:
         if segments.seconds < 2 * data.window_seconds:
             problem = f"must be at least two windows of {data.window_seconds:g} s"
             location.child("segments.seconds").refuse(problem)
-        if data.context_seconds or data.window_rotation != "per_sample":
+        if data.context_seconds or data.window_rotation == "single":
             problem = "are for networks whose windows have no context and rotate every sample"
             location.child("segments").refuse(problem)
         if self.loss.name not in ("weighted_sum", "bins"):

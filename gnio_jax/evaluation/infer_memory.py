@@ -52,10 +52,10 @@ def remembered_displacements(
         origin = np.zeros(1, int)
         attitude = recording.attitude[rows]
         signals, turn = align_recording(
-            recording.accel[rows], rates[rows], attitude, origin, "per_sample"
+            recording.accel[rows], rates[rows], attitude, origin, windows.window_rotation
         )
-        vectors = signals.reshape(-1, 2, 3) @ turn[0].T
-        prediction = run_network(network, vectors.reshape(-1, 6), end - first, n, select)
+        signals = (signals.reshape(len(signals), -1, 3) @ turn[0].T).reshape(signals.shape)
+        prediction = run_network(network, signals, end - first, n, select)
         ends = np.arange(first + clones, end + 1) * n
         to_start = remove_yaw(recording.attitude[ends - windows.window])
         # From the frame of the first attitude to that of each window's start.
@@ -74,7 +74,7 @@ def remembered_displacements(
 
 def run_network(
     network: Network,
-    signals: Float[np.ndarray, "t 6"],
+    signals: Float[np.ndarray, "t c"],
     count: int,
     stride: int,
     select: Callable[[Prediction], Prediction],
@@ -92,6 +92,6 @@ def run_network(
 
 
 @functools.partial(jax.jit, static_argnames=("model", "every"))
-def _run(ready: Any, signals: Float[Array, "t 6"], *, model: Any, every: int) -> Prediction:
+def _run(ready: Any, signals: Float[Array, "t c"], *, model: Any, every: int) -> Prediction:
     arguments = model.begin(1), jnp.asarray(signals)[None], every
     return model.apply(ready.variables, *arguments, method="advance", **ready.constants)[1]

@@ -41,13 +41,14 @@ class PredictWithMemory(Protocol):
         ...
 
     def step(
-        self, memory: Memory, samples: Float[Array, "n 6"], attitude: Float[Array, "3 3 n+1"]
+        self, memory: Memory, samples: Float[Array, "n c"], attitude: Float[Array, "3 3 n+1"]
     ) -> tuple[Memory, Prediction]:
         """The memory after the n samples of one clone interval, and the displacement over the last
         window, in the frame of this memory.
 
-        samples: [accel m/s², gyro rad/s] in the body, without their biases; attitude: body → world,
-        at each sample and at the end of the interval.
+        samples: [accel m/s², gyro rad/s] in the body, without their biases, and with
+        `window_rotation` "body_axes" the x and y axes of the body after them (zeros with
+        "hidden_axes"); attitude: body → world, at each sample and at the end of the interval.
         """
         ...
 
@@ -73,14 +74,14 @@ def has_memory(predict: Predict | PredictWithMemory) -> TypeGuard[PredictWithMem
 
 def first_memory(predict: PredictWithMemory, ekf: Filter, state: FilterState) -> Memory:
     """The memory at the start of a run: that of the state, or an empty one. Raises `ValueError` if
-    the state has the memory of another network, if `window_rotation` is not "per_sample", or if the
-    filter measures something else than displacements."""
+    the state has the memory of another network, if `window_rotation` is "single" or "tlio", or
+    if the filter measures something else than displacements."""
     if ekf.config.measures != "displacement":
         problem = "a network with memory predicts displacements"
         raise ValueError(f"ekf.config.measures: {problem}: it must be 'displacement'")
-    if ekf.config.window_rotation != "per_sample":
+    if ekf.config.window_rotation in ("single", "tlio"):
         problem = "a network with memory rotates every sample with its own attitude"
-        raise ValueError(f"ekf.config.window_rotation: {problem}: it must be 'per_sample'")
+        raise ValueError(f"ekf.config.window_rotation: {problem}: leave it out")
     memory = predict.begin(state.offset.dtype)
     if state.memory is None:
         return memory
@@ -123,12 +124,16 @@ def memory_step(predict: PredictWithMemory, ekf: Filter) -> MemoryStep:
 
 def interval_samples(
     state: FilterState, imu: Imu, config: FilterConfig
-) -> tuple[Float[Array, "n 6"], Float[Array, "3 3 n+1"]]:
+) -> tuple[Float[Array, "n c"], Float[Array, "3 3 n+1"]]:
     """The samples and attitudes of a clone interval that begins with `state`, as
     `PredictWithMemory.step` takes them."""
     rates, forces = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
     attitude = geometry.integrate_turns(state.rotation, rates * config.dt)
-    return jnp.concatenate([forces, rates], axis=1), attitude
+    samples = [forces, rates]
+    if config.cut.body_axes:
+        axes = jnp.eye(2, 3, dtype=rates.dtype).reshape(1, 6) * (not config.cut.hidden)
+        samples.append(jnp.broadcast_to(axes, (len(rates), 6)))
+    return jnp.concatenate(samples, axis=1), attitude
 
 
 def recalled_displacement(

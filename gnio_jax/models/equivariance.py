@@ -119,12 +119,12 @@ class FourHeadingsWithMemory(NetworkWithMemory):
     def advance(
         self,
         state: Any,
-        signals: Float[Array, "b t 6"],
+        signals: Float[Array, "b t c"],
         every: int,
         train: bool = False,
         **constants: Any,
     ) -> tuple[Any, Prediction]:
-        signals, turns = checked_windows(signals), len(QUARTER_TURNS)
+        signals, turns = checked_windows(signals, self.network.inputs), len(QUARTER_TURNS)
         if train:
             first = jax.tree.map(lambda leaf: leaf[:, 0], state)
             first, prediction = self.network.advance(first, signals, every, train, **constants)
@@ -148,7 +148,21 @@ class FourHeadingsWithMemory(NetworkWithMemory):
         )
 
 
-class DeviceHeading(Equivariant):
+class SeesDevice:
+    """What the networks that see the heading of the device have in common: windows with the axes of
+    the body, which may be hidden, and the limit within which its screen faces up."""
+
+    channels = 12
+    hides_axes = True
+    largest_tilt: float
+
+    @property
+    def least_up(self) -> float:
+        """The vertical component of the screen's normal above which it faces up."""
+        return math.cos(math.radians(self.largest_tilt))
+
+
+class DeviceHeading(SeesDevice, Equivariant):
     """The network sees a device whose screen faces up in the frame of its own heading, and its
     displacement is turned back (ours). Exact for every angle.
 
@@ -165,13 +179,6 @@ class DeviceHeading(Equivariant):
     """
 
     largest_tilt: Tilt = 60.0
-    channels = 12
-    hides_axes = True
-
-    @property
-    def least_up(self) -> float:
-        """The vertical component of the screen's normal above which it faces up."""
-        return math.cos(math.radians(self.largest_tilt))
 
     @nn.compact
     def __call__(
@@ -179,8 +186,7 @@ class DeviceHeading(Equivariant):
     ) -> Prediction:
         windows = windows.astype(jnp.float32)
         x_axis, y_axis = windows[..., 6:9], windows[..., 9:12]
-        # The vertical component of the screen's normal.
-        up = x_axis[..., 0] * y_axis[..., 1] - x_axis[..., 1] * y_axis[..., 0]
+        up = vertical_of_normal(x_axis, y_axis)
         faces_up = (up.mean(axis=1) > jnp.float32(self.least_up))[:, None]
         mean = jnp.where(faces_up, x_axis.mean(axis=1)[:, :2], jnp.float32([[1, 0]]))
         heading = jnp.stack(direction(mean[:, 0], mean[:, 1]), axis=-1)
@@ -188,6 +194,49 @@ class DeviceHeading(Equivariant):
         samples = turn_windows(windows[..., :6], opposite(heading))
         samples = samples + jnp.where(faces_up, constant[None], 0.0)[:, None]
         return turn_prediction(self.network(samples, train, **constants), heading)
+
+
+class DeviceHeadingWithMemory(SeesDevice, FourHeadingsWithMemory):
+    """Four memories that see the heading of a device whose screen faces up beside its samples
+    (ours; why it helps: `DeviceHeading`).
+
+    Three channels come after acceleration and angular rate: the direction of the device's x axis
+    along the ground, from the left of its screen to its right, as a vector (cos, sin) in the frame
+    of the memory, and 1. All are 0 at samples whose screen does not face up, and where the axes are
+    hidden (`augment.hidden_axes_share`, `filter.window_rotation: hidden_axes`). The vector turns
+    with the samples in each of the four memories.
+    """
+
+    largest_tilt: Tilt = 60.0
+
+    def advance(
+        self,
+        state: Any,
+        signals: Float[Array, "b t 12"],
+        every: int,
+        train: bool = False,
+        **constants: Any,
+    ) -> tuple[Any, Prediction]:
+        signals = checked_windows(signals, self.channels)
+        x_axis, y_axis = signals[..., 6:9], signals[..., 9:12]
+        faces_up = vertical_of_normal(x_axis, y_axis) > jnp.float32(self.least_up)
+        cosine, sine = direction(x_axis[..., 0], x_axis[..., 1])
+        heading = jnp.stack([cosine, sine, jnp.ones_like(sine)], axis=-1)
+        heading = jnp.where(faces_up[..., None], heading, 0.0)
+        signals = jnp.concatenate([signals[..., :6], heading], axis=-1)
+        return super().advance(state, signals, every, train, **constants)
+
+
+def show_device_heading(network: NetworkWithMemory, **options: Any) -> DeviceHeadingWithMemory:
+    """Four memories of the network, which see the heading of the device."""
+    return DeviceHeadingWithMemory(network=network.clone(inputs=9), **options)
+
+
+def vertical_of_normal(
+    x_axis: Float[Array, "*k 3"], y_axis: Float[Array, "*k 3"]
+) -> Float[Array, "*k"]:
+    """The vertical component of the normal of a screen with these axes; 0 if they are hidden."""
+    return x_axis[..., 0] * y_axis[..., 1] - x_axis[..., 1] * y_axis[..., 0]
 
 
 class CanonicalFrame(Equivariant):

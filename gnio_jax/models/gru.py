@@ -22,7 +22,7 @@ STEM = (9, 5), (5, 2)
 class GRUState(NamedTuple):
     """The memory of a `GRUNetwork`."""
 
-    samples: Float[Array, "b 4 6"]
+    samples: Float[Array, "b 4 c"]
     """The samples that the first convolution needs again."""
     maps: Float[Array, "b 3 w"]
     """The features that the second convolution needs again."""
@@ -49,11 +49,11 @@ class GRUNetwork(NetworkWithMemory):
 
     def begin(self, batch: int) -> GRUState:
         past = [size - stride for size, stride in STEM]
-        shapes = (past[0], 6), (past[1], self.width), (self.features,)
+        shapes = (past[0], self.inputs), (past[1], self.width), (self.features,)
         return GRUState(*(jnp.zeros((batch, *shape), jnp.float32) for shape in shapes))
 
     def encode(
-        self, state: GRUState, signals: Float[Array, "b t 6"], train: bool
+        self, state: GRUState, signals: Float[Array, "b t c"], train: bool
     ) -> tuple[GRUState, Float[Array, "b m d"]]:
         samples, x = causal_conv(state.samples, signals, self.width, *STEM[0], train, "conv1")
         wide = 3 * self.width // 2

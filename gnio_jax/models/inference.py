@@ -61,7 +61,7 @@ class Stepwise:
         return with_memory.begin(self.model, self.ready.variables, dtype)
 
     def step(
-        self, memory: Memory, samples: Float[Array, "n 6"], attitude: Float[Array, "3 3 n+1"]
+        self, memory: Memory, samples: Float[Array, "n c"], attitude: Float[Array, "3 3 n+1"]
     ) -> tuple[Memory, Prediction]:
         """See `models.memory.step`."""
         variables, constants = self.ready

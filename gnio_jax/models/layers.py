@@ -29,10 +29,10 @@ FLOAT32: dict[str, Any] = {"dtype": jnp.float32, "param_dtype": jnp.float32}
 he_normal_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
 
-def checked_windows(windows: Array) -> Float[Array, "b n 6"]:
-    """The windows in float32. Raises `AssertionError` for another shape than (b, n, 6), which would
+def checked_windows(windows: Array, channels: int = 6) -> Float[Array, "b n c"]:
+    """The windows in float32. Raises `AssertionError` for another shape than (b, n, c), which would
     otherwise fail deep inside a convolution."""
-    chex.assert_shape(windows, (None, None, 6))
+    chex.assert_shape(windows, (None, None, channels))
     return windows.astype(jnp.float32)
 
 

@@ -64,13 +64,16 @@ class NetworkWithMemory(nn.Module):
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
     uncertainty: Literal["head", "calibrated", "constant"] = "head"
     reach: Positive = 3.0
+    inputs: int = 6
+    """Channels that the encoder sees: accel, gyro, and vectors that an equivariance adds to them
+    (`equivariance.DeviceHeadingWithMemory`). It is no option of the network."""
 
     def begin(self, batch: int) -> Any:
         """The state before the first sample: a tree of float32 arrays with `batch` rows."""
         raise NotImplementedError
 
     def encode(
-        self, state: Any, signals: Float[Array, "b t 6"], train: bool
+        self, state: Any, signals: Float[Array, "b t c"], train: bool
     ) -> tuple[Any, Float[Array, "b m d"]]:
         """The state after the signals, and features at m times that are spaced evenly, the last one
         at the end; gravity is taken off. It is called inside `advance` and may create modules."""
@@ -87,7 +90,7 @@ class NetworkWithMemory(nn.Module):
         return 1
 
     def __call__(
-        self, windows: Float[Array, "b n 6"], train: bool = False, **constants: Any
+        self, windows: Float[Array, "b n c"], train: bool = False, **constants: Any
     ) -> Prediction:
         count, samples, _ = windows.shape
         _, prediction = self.advance(self.begin(count), windows, samples, train, **constants)
@@ -97,7 +100,7 @@ class NetworkWithMemory(nn.Module):
     def advance(
         self,
         state: Any,
-        signals: Float[Array, "b t 6"],
+        signals: Float[Array, "b t c"],
         every: int,
         train: bool = False,
         bank: Any = None,
@@ -105,12 +108,12 @@ class NetworkWithMemory(nn.Module):
         """The state after k intervals of `every` samples, and the prediction (b, k, ...) at the end
         of each. The signals are [accel, gyro] in a frame with gravity on z. Raises `ValueError` if
         the intervals do not fit the network's strides."""
-        signals = checked_windows(signals)
+        signals = checked_windows(signals, self.inputs)
         batch, samples, _ = signals.shape
         if every % self.multiple or samples % every:
             problem = f"found {samples} samples in intervals of {every}"
             raise ValueError(f"intervals must be multiples of {self.multiple} samples, {problem}")
-        gravity = jnp.array([0, 0, GRAVITY, 0, 0, 0], jnp.float32)
+        gravity = jnp.zeros(self.inputs, jnp.float32).at[2].set(GRAVITY)
         state, h = self.encode(state, signals - gravity[None, None], train)
         intervals = samples // every
         h = h.reshape(batch, intervals, -1, self.features)[:, :, -1].reshape(-1, self.features)
@@ -168,15 +171,16 @@ def step(
     model: NetworkWithMemory,
     variables: Any,
     memory: Memory,
-    samples: Float[Array, "n 6"],
+    samples: Float[Array, "n c"],
     attitude: Float[Array, "3 3 n+1"],
     **constants: Any,
 ) -> tuple[Memory, Prediction]:
     """The memory after the n samples of one interval, and the displacement over the last window,
     in the frame of this memory. Jittable and differentiable.
 
-    samples: [accel m/s², gyro rad/s] in the body, without biases; attitude: body → world at each
-    sample and at the end of the interval. constants: those of the network.
+    samples: [accel m/s², gyro rad/s] in the body, without biases, and the body's x and y axes after
+    them for a network of 12 channels; attitude: body → world at each sample and at the end of the
+    interval. constants: those of the network.
     """
     after = advance_frame(memory, attitude)
     signals = express_samples(after.heading, samples, attitude)
@@ -192,20 +196,21 @@ def advance_frame(memory: Memory, attitude: Float[Array, "3 3 m"]) -> Memory:
 
 
 def express_samples(
-    heading: Float[Array, "2"], samples: Float[Array, "n 6"], attitude: Float[Array, "3 3 n+1"]
-) -> Float[Array, "n 6"]:
+    heading: Float[Array, "2"], samples: Float[Array, "n c"], attitude: Float[Array, "3 3 n+1"]
+) -> Float[Array, "n c"]:
     """The samples of one interval, as in `step`, in the frame with this heading."""
-    vectors = samples.reshape(-1, 2, 3).transpose(2, 1, 0)
+    count, channels = samples.shape
+    vectors = samples.reshape(count, -1, 3).transpose(2, 1, 0)
     vectors = geometry.matmul(attitude[:, :, :-1], vectors).reshape(3, -1)
     vectors = geometry.matmul(geometry.heading_rotation(*heading).T, vectors)
-    return vectors.reshape(3, 2, -1).transpose(2, 1, 0).reshape(-1, 6)
+    return vectors.reshape(3, -1, count).transpose(2, 1, 0).reshape(count, channels)
 
 
 def advance_interval(
     model: NetworkWithMemory,
     variables: Any,
     state: Any,
-    signals: Float[Array, "n 6"],
+    signals: Float[Array, "n c"],
     **constants: Any,
 ) -> tuple[Any, Prediction]:
     """The network's state after one interval, and the displacement over the last window, in the

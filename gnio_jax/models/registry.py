@@ -33,6 +33,7 @@ from gnio_jax.models.equivariance import (
     DeviceHeading,
     FourHeadings,
     FourHeadingsWithMemory,
+    show_device_heading,
 )
 from gnio_jax.models.experts import Experts
 from gnio_jax.models.gnio import GNIO
@@ -79,7 +80,10 @@ _EQUIVARIANT: dict[str, Callable[..., nn.Module]] = {
     "so2_frame": functools.partial(EqNIO, reflections=False, frame_width=128),
     "so2_frame_shallow": functools.partial(EqNIO, reflections=False, depth=1, frame_width=128),
 }
-_EQUIVARIANT_WITH_MEMORY = {"four_headings": FourHeadingsWithMemory}
+_EQUIVARIANT_WITH_MEMORY: dict[str, Callable[..., nn.Module]] = {
+    "four_headings": FourHeadingsWithMemory,
+    "device_heading": show_device_heading,
+}
 
 
 def names() -> list[str]:
@@ -112,7 +116,9 @@ def options(name: str, equivariance: str = "none") -> dict[str, Any]:
     kinds |= {"equivariance": Literal["none", *_EQUIVARIANT]}
     kinds |= {"corrector": Literal["none", "airimu"]}
     kinds |= frame_options(equivariance)
-    return {option: kind for option, kind in kinds.items() if option not in ("parent", "name")}
+    return {
+        option: kind for option, kind in kinds.items() if option not in ("parent", "name", "inputs")
+    }
 
 
 def frame_options(equivariance: str) -> dict[str, Any]:
@@ -158,6 +164,9 @@ def check_experiment(model: nn.Module, config: TrainConfig, source: str = "confi
             in_filter.refuse(f"must be {' or '.join(('null', *hidden))}: {subject}")
     else:
         for field, setting in ((rotation, config.data), (in_filter, config.filter)):
+            if setting.window_rotation == "single" and isinstance(model, NetworkWithMemory):
+                problem = f"is single, and {name} rotates every sample with its own attitude"
+                field.refuse(problem, "leave it out")
             if setting.window_rotation in ("body_axes", "hidden_axes"):
                 problem = f"is {setting.window_rotation}, which {name} does not see"
                 field.refuse(problem, "leave it out")

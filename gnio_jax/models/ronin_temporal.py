@@ -75,12 +75,12 @@ class RoNINLSTM(RoNINTemporal):
         return LSTMState(*jnp.zeros((2, batch, LSTM_LAYERS, self.width), jnp.float32))
 
     def encode(
-        self, state: LSTMState, signals: Float[Array, "b t 6"], train: bool
+        self, state: LSTMState, signals: Float[Array, "b t c"], train: bool
     ) -> tuple[LSTMState, Float[Array, "b t d"]]:
         uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
-        bilinear = self.param("bilinear_kernel", uniform, (36, MIXED), jnp.float32)
+        bilinear = self.param("bilinear_kernel", uniform, (self.inputs**2, MIXED), jnp.float32)
         bias = self.param("bilinear_bias", nn.initializers.zeros, (MIXED,), jnp.float32)
-        pairs = (signals[..., :, None] * signals[..., None, :]).reshape(*signals.shape[:2], 36)
+        pairs = (signals[..., :, None] * signals[..., None, :]).reshape(*signals.shape[:2], -1)
         x = mixed = jnp.concatenate([signals, pairs @ bilinear + bias[None, None]], axis=-1)
         hidden, cell = [], []
         for layer in range(LSTM_LAYERS):
@@ -118,7 +118,7 @@ class RoNINTCN(RoNINTemporal):
         return [max(1, self.width * channels // 16) for channels in TCN_CHANNELS]
 
     def begin(self, batch: int) -> list[tuple[Array, Array]]:
-        channels = [6, *self._channels()]
+        channels = [self.inputs, *self._channels()]
         return [
             (
                 jnp.zeros((batch, (TCN_SIZE - 1) * 2**i, channels[i]), jnp.float32),
@@ -128,7 +128,7 @@ class RoNINTCN(RoNINTemporal):
         ]
 
     def encode(
-        self, state: list[tuple[Array, Array]], signals: Float[Array, "b t 6"], train: bool
+        self, state: list[tuple[Array, Array]], signals: Float[Array, "b t c"], train: bool
     ) -> tuple[list[tuple[Array, Array]], Float[Array, "b t d"]]:
         x, after = signals, []
         for i, (features, past) in enumerate(zip(self._channels(), state, strict=True)):

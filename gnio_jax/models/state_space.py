@@ -31,7 +31,7 @@ STEPS = (1e-3, 1e-1)
 class StateSpaceMemory(NamedTuple):
     """The memory of a `StateSpaceNetwork`."""
 
-    samples: Float[Array, "b p 6"]
+    samples: Float[Array, "b p c"]
     """The samples that the low-pass needs again."""
     layers: Float[Array, "b l 2 p"]
     """Real and imaginary parts of every layer's memory."""
@@ -63,12 +63,12 @@ class StateSpaceNetwork(NetworkWithMemory):
     def begin(self, batch: int) -> StateSpaceMemory:
         past = 3 * self.decimation
         return StateSpaceMemory(
-            jnp.zeros((batch, past, 6), jnp.float32),
+            jnp.zeros((batch, past, self.inputs), jnp.float32),
             jnp.zeros((batch, self.layers, 2, self.state), jnp.float32),
         )
 
     def encode(
-        self, state: StateSpaceMemory, signals: Float[Array, "b t 6"], train: bool
+        self, state: StateSpaceMemory, signals: Float[Array, "b t c"], train: bool
     ) -> tuple[StateSpaceMemory, Float[Array, "b m d"]]:
         samples, x = decimate(state.samples, signals, self.decimation)
         x = linear(self.width, "input")(x)
@@ -81,8 +81,8 @@ class StateSpaceNetwork(NetworkWithMemory):
 
 
 def decimate(
-    past: Float[Array, "b p 6"], signals: Float[Array, "b t 6"], factor: int
-) -> tuple[Float[Array, "b p 6"], Float[Array, "b m 6"]]:
+    past: Float[Array, "b p c"], signals: Float[Array, "b t c"], factor: int
+) -> tuple[Float[Array, "b p c"], Float[Array, "b m c"]]:
     """The last 3 `factor` samples, which the next call needs, and the signals after a low-pass at
     every `factor`-th sample. The low-pass is a Hann window of 4 `factor` samples."""
     window = np.sin(np.pi * (np.arange(4 * factor) + 0.5) / (4 * factor)) ** 2

@@ -53,8 +53,9 @@ class WalkSegments(NamedTuple):
     """A batch of segments of k clone intervals of n samples, s = k n, in a frame with gravity on
     z."""
 
-    signals: Float[Array, "b s 6"]
-    """[accel m/s², gyro rad/s]."""
+    signals: Float[Array, "b s c"]
+    """[accel m/s², gyro rad/s], and the x and y axes of the body after them if the network sees
+    these."""
     displacement: Float[Array, "b m 3"]
     """Displacement over the window that ends with interval W − 1, W, ..., k − 1, m."""
     moved: Float[Array, "b m"]
@@ -110,6 +111,9 @@ class SegmentGrid(NamedTuple):
     """Clone intervals W in a window."""
     rate: float
     """Hz"""
+    window_rotation: str = "per_sample"
+    """With "body_axes" the signals have the x and y axes of the body after them, with "hidden_axes"
+    zeros (`data.window_rotation`)."""
 
     @property
     def samples(self) -> int:
@@ -120,7 +124,9 @@ def grid_of(config: TrainConfig) -> SegmentGrid:
     """The grid of an experiment."""
     data = config.data
     intervals = round(config.segments.seconds / data.stride_seconds)
-    return SegmentGrid(data.stride, intervals, data.window // data.stride, data.rate)
+    return SegmentGrid(
+        data.stride, intervals, data.window // data.stride, data.rate, data.window_rotation
+    )
 
 
 def cut_walks(
@@ -189,12 +195,20 @@ def cut_walks(
     displacement = displacement * mirror[:, None]
     displacement = rotate_vectors(turn, displacement[:, :, None])[:, :, 0]
     displacement = turn_rows(displacement, drift[:, : -grid.window])
-    signals = rotate_channels(turn, imu[:, inner])
+    signals = imu[:, inner]
+    if grid.window_rotation in ("body_axes", "hidden_axes"):
+        shown = jnp.full((len(rows), 1, 1), grid.window_rotation == "body_axes")
+        if config is not None and config.hidden_axes_share:
+            share = jnp.float32(config.hidden_axes_share)
+            shown &= ~jax.random.bernoulli(jax.random.fold_in(key, 6), share, shown.shape)
+        axes = rotation[:, inner, :, :2].swapaxes(2, 3).reshape(*signals.shape)
+        signals = jnp.concatenate([signals, jnp.where(shown, axes, 0)], axis=2)
+    signals = rotate_channels(turn, signals)
     if config is not None and (config.gyro_bias or config.rest_share):
         # The frame drifts with the bias that the gyro has left (`models.memory`).
-        angle = jnp.repeat(drift[:, :-1], grid.stride, axis=1)
-        halves = (turn_rows(signals[..., :3], angle), turn_rows(signals[..., 3:], angle))
-        signals = jnp.concatenate(halves, axis=2)
+        angle = jnp.repeat(drift[:, :-1], grid.stride, axis=1)[:, :, None]
+        vectors = turn_rows(signals.reshape(*signals.shape[:2], -1, 3), angle)
+        signals = vectors.reshape(signals.shape)
     segments = WalkSegments(signals, displacement, moved)
     if config is not None and config.rest_share:
         segments = at_rest(rest_key, segments, config.rest_share)
@@ -238,9 +252,10 @@ def with_errors(
 
 
 def turn_rows(
-    vectors: Float[jax.Array, "b m 3"], angle: Float[jax.Array, "b m"]
-) -> Float[jax.Array, "b m 3"]:
-    """Vectors turned about z, each by its own angle, rad."""
+    vectors: Float[jax.Array, "b m *k 3"], angle: Float[jax.Array, "b m *l"]
+) -> Float[jax.Array, "b m *k 3"]:
+    """Vectors turned about z, each by its own angle, rad. The angles may have length 1 where the
+    vectors have k."""
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     x, y, z = jnp.moveaxis(vectors, -1, 0)
     return jnp.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
@@ -253,7 +268,7 @@ def at_rest(key: PRNGKeyArray, segments: WalkSegments, share: float) -> WalkSegm
     lies = jax.random.bernoulli(key, jnp.float32(share), (len(signals), 1, 1))
     still = jnp.array([[[0, 0, GRAVITY, 0, 0, 0]]], jnp.float32)
     return WalkSegments(
-        jnp.where(lies, still, signals),
+        jnp.concatenate([jnp.where(lies, still, signals[..., :6]), signals[..., 6:]], axis=2),
         jnp.where(lies, 0, displacement),
         jnp.where(lies[..., 0], 0, moved),
     )

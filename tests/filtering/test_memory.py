@@ -20,6 +20,11 @@ CONFIG = filtering.FilterConfig(
     dt=DT, samples_per_clone=N, clones_per_window=W, history="core", log_std_min=-2.0
 )
 EKF = filtering.Filter(CONFIG)
+SEES_DEVICE = filtering.Filter(dataclasses.replace(CONFIG, window_rotation="body_axes"))
+
+
+def filter_for(equivariance):
+    return SEES_DEVICE if equivariance == "device_heading" else EKF
 
 
 @functools.cache
@@ -54,7 +59,8 @@ def program(ekf=EKF, name="gru", equivariance="none"):
 
 @functools.cache
 def run(equivariance="none"):
-    return program(equivariance=equivariance)(start(), *recording())
+    ekf = filter_for(equivariance)
+    return program(ekf, equivariance=equivariance)(start(ekf=ekf), *recording())
 
 
 def assert_close(found, expected, rtol=1e-5, atol=1e-5):
@@ -95,9 +101,11 @@ def test_it_measures_in_the_yaw_frame_of_the_oldest_clone():
     assert np.isnan(history.displacement[:W]).all()
 
 
-def test_a_turned_world_turns_all_that_comes_of_it():
-    _, history = run()
-    _, turned = program()(start(turn=2.0), *recording())
+@pytest.mark.parametrize("equivariance", ["none", "device_heading"])
+def test_a_turned_world_turns_all_that_comes_of_it(equivariance):
+    _, history = run(equivariance)
+    ekf = filter_for(equivariance)
+    _, turned = program(ekf, equivariance=equivariance)(start(2.0, ekf), *recording())
     turn = Rotation.from_euler("z", 2.0)
     for name in ("position", "velocity"):
         plain, other = getattr(history, name), getattr(turned, name)
@@ -123,12 +131,35 @@ def test_a_run_in_two_calls_is_one_run():
     assert np.nanmax(np.abs(empty.displacement - second.displacement)) > 1e-3
 
 
-@pytest.mark.parametrize("equivariance", ["none", "four_headings"])
+def test_the_heading_of_the_device_is_seen_until_it_is_hidden():
+    """The same walk with the axes of the body hidden is that of zeros in their place."""
+    hidden = dataclasses.replace(CONFIG, window_rotation="hidden_axes")
+    _, history = run("device_heading")
+    _, other = program(filtering.Filter(hidden), equivariance="device_heading")(
+        start(), *recording()
+    )
+    assert np.nanmax(np.abs(other.displacement - history.displacement)) > 1e-3
+
+    class Blind:
+        """The network with zeros in the place of the axes."""
+
+        def __init__(self):
+            self.predict = network(equivariance="device_heading").predict()
+            self.begin = self.predict.begin
+
+        def step(self, memory, samples, attitude):
+            return self.predict.step(memory, samples.at[:, 6:].set(0.0), attitude)
+
+    blind = quick(functools.partial(filtering.run_odometry, Blind(), SEES_DEVICE))
+    assert_close(other.displacement, blind(start(ekf=SEES_DEVICE), *recording())[1].displacement)
+
+
+@pytest.mark.parametrize("equivariance", ["none", "four_headings", "device_heading"])
 def test_the_tracker_carries_it_too(equivariance):
     end, history = run(equivariance)
     gyro, accel = recording()
-    predict = network(equivariance=equivariance).predict()
-    tracker = Tracker(predict, EKF, start())
+    predict, ekf = network(equivariance=equivariance).predict(), filter_for(equivariance)
+    tracker = Tracker(predict, ekf, start(ekf=ekf))
     poses = []
     for k, (rate, force) in enumerate(zip(gyro, accel, strict=True)):
         pose = tracker.push(k * DT, rate, force)
@@ -139,7 +170,7 @@ def test_the_tracker_carries_it_too(equivariance):
         np.testing.assert_allclose(rows, getattr(history, name), rtol=1e-4, atol=1e-5)
     state = tracker.filter_state()
     assert_close(state.memory, end.memory)
-    later = Tracker(predict, EKF, state)
+    later = Tracker(predict, ekf, state)
     assert_close(later.filter_state().memory, end.memory)
 
 

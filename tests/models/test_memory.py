@@ -50,15 +50,17 @@ def whole(net, signals):
     return jax.device_get(quick(run)(jnp.asarray(signals, jnp.float32)))
 
 
-def stepwise(net, gyro, accel, attitude):
-    """The same interval by interval, from the body."""
+def stepwise(net, gyro, accel, attitude, axes=None):
+    """The same interval by interval, from the body; with its axes, e.g. those that are hidden."""
     predict = net.predict()
     step, memory, rows = quick(predict.step), predict.begin(), []
     for k in range(INTERVALS):
         samples = slice(k * N, k * N + N)
         poses = jnp.asarray(attitude[k * N : k * N + N + 1]).transpose(1, 2, 0)
-        signals = jnp.asarray(np.concatenate([accel[samples], gyro[samples]], axis=1))
-        memory, prediction = step(memory, signals, poses)
+        signals = np.concatenate([accel[samples], gyro[samples]], axis=1)
+        if axes is not None:
+            signals = np.concatenate([signals, np.tile(np.ravel(axes), (N, 1))], axis=1)
+        memory, prediction = step(memory, jnp.asarray(signals), poses)
         rows.append(jax.device_get((prediction, memory.heading)))
     return memory, rows
 
@@ -243,9 +245,53 @@ def test_training_has_one_of_four_memories():
     jax.tree.map(np.testing.assert_array_equal, *rows)
 
 
+@pytest.mark.parametrize("name", WITH_MEMORY)
+def test_the_heading_of_the_device_is_seen_beside_the_samples(name):
+    """Against four memories of a network of nine channels, whose last three are made here: the
+    direction of the device's x axis along the ground, and 1, while its screen faces up. The walk
+    turns the screen away for a part of the time."""
+    gyro, accel, attitude = walk()
+    faces_up = attitude[:-1, 2, 2] > np.cos(np.radians(30))
+    assert faces_up.any() and not faces_up.all()
+    signals = in_frame(gyro, accel, attitude, heading := np.arctan2(*attitude[0, 1::-1, 0]))
+    x_axis = (about_z(-np.degrees(heading)) @ attitude[:-1])[:, :2, 0]
+    length = np.linalg.norm(x_axis, axis=1, keepdims=True)
+    channels = faces_up[:, None] * np.c_[x_axis / length, np.ones(len(length))]
+    net = network(name, equivariance="device_heading", largest_tilt=30.0)
+    nine = models.create(name, **SMALL[name], equivariance="four_headings")
+    nine = nine.clone(network=nine.network.clone(inputs=9))
+    expected = whole(Network.of(nine, net.variables.variables), np.c_[signals, channels])
+    hidden = whole(Network.of(nine, net.variables.variables), np.c_[signals, 0 * channels])
+    _, rows = stepwise(net, gyro, accel, attitude, np.eye(2, 3))
+    _, without = stepwise(net, gyro, accel, attitude, np.zeros((2, 3)))
+    for k in range(INTERVALS):
+        for prediction, whole_prediction in ((rows, expected), (without, hidden)):
+            row = whole_prediction.displacement[0, k]
+            np.testing.assert_allclose(prediction[k][0].displacement, row, atol=1e-5, rtol=1e-5)
+    assert np.abs(expected.displacement - hidden.displacement).max() > 1e-3
+    turned = stepwise(net, gyro, accel, about_z(115) @ attitude, np.eye(2, 3))[1]
+    for plain, other in zip(rows, turned, strict=True):
+        np.testing.assert_allclose(other[0].displacement, plain[0].displacement, atol=1e-5)
+
+
+def test_a_device_on_its_edge_has_finite_gradients():
+    """Its x axis is vertical, so it has no direction along the ground; nor have hidden axes."""
+    net = network("gru", equivariance="device_heading")
+    model, (variables, constants) = net.apply.model, net.variables
+    for axes in (np.float32([0, 0, 1, 0, 1, 0]), np.zeros(6, np.float32)):
+
+        def moved(axes):
+            signals = jnp.concatenate([jnp.ones((1, N, 6)), jnp.tile(axes, (1, N, 1))], axis=2)
+            arguments = model.begin(1), signals, N
+            prediction = model.apply(variables, *arguments, method="advance", **constants)[1]
+            return prediction.displacement.sum()
+
+        assert np.isfinite(jax.grad(moved)(jnp.asarray(axes))).all()
+
+
 def test_other_equivariance_around_a_memory_is_refused():
     problem = "turns with the world already, by its memory's frame; known with it: none, four_head"
-    for equivariance in ("canonical_frame", "device_heading", "o2_frame"):
+    for equivariance in ("canonical_frame", "o2_frame"):
         with pytest.raises(InputError, match=problem):
             models.create("gru", equivariance=equivariance)
     with pytest.raises(InputError, match="output_dim must be 3 with the head gated, found 2"):

@@ -158,6 +158,49 @@ def test_a_mirrored_segment_is_that_of_a_mirrored_walk():
     np.testing.assert_allclose(mirrored.moved, plain.moved, atol=1e-5)
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_axes_of_the_body_come_after_the_samples(mirrored):
+    """They are those of the attitude in the frame of the segment, by SciPy; behind the mirror those
+    of the mirrored walk, whose x axis points to the other side. Where the gyro has a bias, they
+    turn with the frame that drifts, as the samples do."""
+    sequence, grid = walk(), SegmentGrid(N, 20, W, RATE, "body_axes")
+    source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))
+    row, first = source.earliest[:1], int(source.earliest[0])
+    rotation = Rotation.from_quat(sequence.orientation[:, [1, 2, 3, 0]])[first : first + 20 * N]
+    signs = np.array([-1.0, 1, 1]) if mirrored else np.ones(3)
+    expected = signs[:, None] * rotation.as_matrix() * signs
+    expected = expected[:, :, :2].transpose(0, 2, 1).reshape(-1, 6)
+    augment = dataclasses.replace(OFF, mirror_share=float(mirrored))
+    cut = jax.device_get(draw_walks(jax.random.key(2), source, row, grid, augment))
+    np.testing.assert_allclose(cut.signals[0, :, 6:], expected, atol=1e-5)
+    with_bias = dataclasses.replace(augment, gyro_bias=0.5)
+    drifted = jax.device_get(draw_walks(jax.random.key(2), source, row, grid, with_bias))
+    turned = np.angle(
+        np.dot(drifted.signals[0, -1, 6:8], [1, 1j]) / np.dot(expected[-1, :2], [1, 1j])
+    )
+    forces = (np.dot(x.signals[0, -1, :2], [1, 1j]) for x in (drifted, cut))
+    assert abs(turned) > 0.05 and np.isclose(np.exp(1j * turned), np.divide(*forces), atol=1e-3)
+
+
+def test_the_axes_of_the_body_are_hidden_in_a_share_of_the_segments():
+    sequence, grid = walk(), SegmentGrid(N, 20, W, RATE, "body_axes")
+    source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))
+    rows, key = jnp.repeat(jnp.asarray(source.earliest[:1]), 400), jax.random.key(3)
+    config = dataclasses.replace(OFF, hidden_axes_share=0.3)
+    hidden, shown = (
+        jax.device_get(draw_walks(key, source, rows, grid, augment).signals)
+        for augment in (config, OFF)
+    )
+    blank = ~hidden[:, :, 6:].any(axis=(1, 2))
+    assert 0.22 < blank.mean() < 0.38
+    np.testing.assert_array_equal(hidden[..., :6], shown[..., :6])
+    np.testing.assert_array_equal(hidden[~blank], shown[~blank])
+    never = jax.device_get(
+        draw_walks(key, source, rows[:2], grid._replace(window_rotation="hidden_axes"), OFF).signals
+    )
+    assert not never[..., 6:].any() and never.shape[2] == 12
+
+
 def test_a_bias_is_constant_in_the_body_behind_the_mirror():
     sequence = walk()
     source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))

@@ -106,7 +106,7 @@ def _with_memory(network: Network, ekf: Filter) -> DeployedNetwork:
         after = next_arrays(name_leaves(state, OF_NETWORK))
         return _outputs(jax.tree.map(lambda leaf: leaf[None], prediction)) | after
 
-    def window(state: DeployedState, imu: Imu) -> Float[Array, "1 n 6"]:
+    def window(state: DeployedState, imu: Imu) -> Float[Array, "1 n c"]:
         """The samples of the interval in the memory's frame."""
         assert state.memory is not None
         samples, attitude = interval_samples(state.filter, imu, ekf.config)
@@ -123,7 +123,7 @@ def _with_memory(network: Network, ekf: Filter) -> DeployedNetwork:
         prediction = arrays["displacement"], arrays["covariance"]
         return turned_displacement(ekf, *prediction, memory.heading, state, oldest)
 
-    rows = jax.ShapeDtypeStruct((1, ekf.config.samples_per_clone, 6), jnp.float32)
+    rows = jax.ShapeDtypeStruct((1, ekf.config.samples_per_clone, ekf.config.channels), jnp.float32)
     shapes = {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
     frame = "memory.heading", "memory.attitude", "memory.intervals"
     return DeployedNetwork(

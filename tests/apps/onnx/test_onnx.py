@@ -218,7 +218,7 @@ def test_an_operation_that_cannot_be_converted_is_named_in_one_line(converter):
 @pytest.fixture(
     scope="module",
     params=[
-        *(("gru", equivariance) for equivariance in ("none", "four_headings")),
+        *(("gru", kind) for kind in ("none", "four_headings", "device_heading")),
         *((network, "none") for network in ("state_space", "ronin_lstm", "ronin_tcn")),
     ],
     ids="-".join,
@@ -227,7 +227,9 @@ def remembering(request, converter, tmp_path_factory):
     """A network with memory, whose weights are drawn, and the folder of its models."""
     network, equivariance = request.param
     folder = tmp_path_factory.mktemp(network)
-    windows = DataConfig(rate=50.0, stride_seconds=0.2)
+    sees_device = equivariance == "device_heading"
+    rotation = "body_axes" if sees_device else "per_sample"
+    windows = DataConfig(rate=50.0, stride_seconds=0.2, window_rotation=rotation)
     options = {**SMALL[network], "equivariance": equivariance}
     named = {option: options.pop(option) for option in ("width", "equivariance")}
     model = ModelConfig(name=network, **named, options=options)
