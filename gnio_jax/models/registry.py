@@ -164,12 +164,12 @@ def check_experiment(model: nn.Module, config: TrainConfig, source: str = "confi
             in_filter.refuse(f"must be {' or '.join(('null', *hidden))}: {subject}")
     else:
         for field, setting in ((rotation, config.data), (in_filter, config.filter)):
-            if setting.window_rotation == "single" and isinstance(model, NetworkWithMemory):
-                problem = f"is single, and {name} rotates every sample with its own attitude"
+            value = setting.window_rotation
+            if value in ("single", "tlio") and isinstance(model, NetworkWithMemory):
+                problem = f"is {value}, and {name} rotates every sample with its own attitude"
                 field.refuse(problem, "leave it out")
-            if setting.window_rotation in ("body_axes", "hidden_axes"):
-                problem = f"is {setting.window_rotation}, which {name} does not see"
-                field.refuse(problem, "leave it out")
+            if value in ("body_axes", "hidden_axes"):
+                field.refuse(f"is {value}, which {name} does not see", "leave it out")
     if config.filter.measures not in quantities(model):
         problem = f"is {config.filter.measures}, which {name} does not predict"
         location.child("filter.measures").refuse(problem, f"known: {', '.join(quantities(model))}")

@@ -1,6 +1,8 @@
 """Networks with memory: interval by interval they predict what they predict for a whole recording,
 and their frame turns with the world."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import models
+from gnio_jax.config import ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import Network
 from gnio_jax.models.memory import turned_heading
@@ -296,6 +299,23 @@ def test_other_equivariance_around_a_memory_is_refused():
             models.create("gru", equivariance=equivariance)
     with pytest.raises(InputError, match="output_dim must be 3 with the head gated, found 2"):
         models.create("ronin_lstm", head="gated", output_dim=2)
+
+
+@pytest.mark.parametrize(
+    "section, equivariance, rotation, problem",
+    [
+        ("data", "none", "single", "is single, and gru rotates every sample with its own attitude"),
+        ("filter", "none", "tlio", "is tlio, and gru rotates every sample with its own attitude"),
+        ("data", "four_headings", "body_axes", "is body_axes, which gru does not see"),
+        ("data", "device_heading", "per_sample", "must be body_axes or hidden_axes: gru"),
+    ],
+)
+def test_windows_that_a_memory_does_not_see_are_refused(section, equivariance, rotation, problem):
+    config = TrainConfig(model=ModelConfig("gru", equivariance=equivariance))
+    settings = dataclasses.replace(getattr(config, section), window_rotation=rotation)
+    config = dataclasses.replace(config, **{section: settings})
+    with pytest.raises(InputError, match=rf"{section}.window_rotation.* {problem}"):
+        models.from_experiment(config)
 
 
 def test_a_network_of_two_axes_has_no_vertical():
