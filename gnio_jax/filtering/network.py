@@ -34,7 +34,8 @@ Predict = Callable[[Any], Prediction]
 
 @runtime_checkable
 class PredictWithMemory(Protocol):
-    """A network that carries a memory from one clone interval to the next."""
+    """A network that carries a memory from one clone interval to the next. Its samples have the 6
+    channels [accel, gyro], or 12, if it has the attribute `channels` that says so."""
 
     def begin(self, dtype: Any) -> Memory:
         """An empty memory, whose attitude is of this type."""
@@ -74,14 +75,20 @@ def has_memory(predict: Predict | PredictWithMemory) -> TypeGuard[PredictWithMem
 
 def first_memory(predict: PredictWithMemory, ekf: Filter, state: FilterState) -> Memory:
     """The memory at the start of a run: that of the state, or an empty one. Raises `ValueError` if
-    the state has the memory of another network, if `window_rotation` is "single" or "tlio", or
-    if the filter measures something else than displacements."""
+    the state has the memory of another network, if `window_rotation` is not "per_sample" (with 12
+    channels "body_axes" or "hidden_axes"), or if the filter measures something else than
+    displacements."""
     if ekf.config.measures != "displacement":
         problem = "a network with memory predicts displacements"
         raise ValueError(f"ekf.config.measures: {problem}: it must be 'displacement'")
-    if ekf.config.window_rotation in ("single", "tlio"):
+    sees_axes = getattr(predict, "channels", 6) == 12
+    rotations = ("body_axes", "hidden_axes") if sees_axes else ("per_sample",)
+    if ekf.config.window_rotation not in rotations:
         problem = "a network with memory rotates every sample with its own attitude"
-        raise ValueError(f"ekf.config.window_rotation: {problem}: leave it out")
+        if sees_axes:
+            problem = "this network with memory sees the axes of the body"
+        remedy = f"it must be {' or '.join(map(repr, rotations))}"
+        raise ValueError(f"ekf.config.window_rotation: {problem}: {remedy}")
     memory = predict.begin(state.offset.dtype)
     if state.memory is None:
         return memory

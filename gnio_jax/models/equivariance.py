@@ -148,13 +148,13 @@ class FourHeadingsWithMemory(NetworkWithMemory):
         )
 
 
-class SeesDevice:
+class SeesDevice(nn.Module):
     """What the networks that see the heading of the device have in common: windows with the axes of
     the body, which may be hidden, and the limit within which its screen faces up."""
 
+    largest_tilt: Tilt = 60.0
     channels = 12
     hides_axes = True
-    largest_tilt: float
 
     @property
     def least_up(self) -> float:
@@ -177,8 +177,6 @@ class DeviceHeading(SeesDevice, Equivariant):
     are zero (`augment.hidden_axes_share`, `filter.window_rotation: hidden_axes`), the heading is
     not known. A screen faces up if its normal is within `largest_tilt` degrees of the vertical.
     """
-
-    largest_tilt: Tilt = 60.0
 
     @nn.compact
     def __call__(
@@ -204,10 +202,9 @@ class DeviceHeadingWithMemory(SeesDevice, FourHeadingsWithMemory):
     along the ground, from the left of its screen to its right, as a vector (cos, sin) in the frame
     of the memory, and 1. All are 0 at samples whose screen does not face up, and where the axes are
     hidden (`augment.hidden_axes_share`, `filter.window_rotation: hidden_axes`). The vector turns
-    with the samples in each of the four memories.
+    with the samples in each of the four memories. `show_device_heading` makes it, with a network
+    that has room for the three channels.
     """
-
-    largest_tilt: Tilt = 60.0
 
     def advance(
         self,

@@ -56,6 +56,11 @@ class Stepwise:
     select: Callable[[Prediction], Prediction]
     """A function of every prediction, which may leave out some of its diagnostics."""
 
+    @property
+    def channels(self) -> int:
+        """Channels of the samples."""
+        return self.model.channels
+
     def begin(self, dtype: Any = float) -> Memory:
         """An empty memory."""
         return with_memory.begin(self.model, self.ready.variables, dtype)

@@ -25,6 +25,7 @@ Corrected biases hold from the next sample on, and the memory keeps what it has 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from functools import partial
 from typing import Any, Literal
@@ -64,9 +65,12 @@ class NetworkWithMemory(nn.Module):
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
     uncertainty: Literal["head", "calibrated", "constant"] = "head"
     reach: Positive = 3.0
-    inputs: int = 6
-    """Channels that the encoder sees: accel, gyro, and vectors that an equivariance adds to them
-    (`equivariance.DeviceHeadingWithMemory`). It is no option of the network."""
+    inputs: int = dataclasses.field(default=6, metadata={"option": False})
+    """Channels that the encoder sees, and for which `begin` makes its state: accel, gyro, and
+    vectors that an equivariance adds to them (`equivariance.DeviceHeadingWithMemory`)."""
+
+    channels = 6
+    """Channels of the samples."""
 
     def begin(self, batch: int) -> Any:
         """The state before the first sample: a tree of float32 arrays with `batch` rows."""

@@ -1,7 +1,8 @@
-"""Names of networks to Flax modules; every one maps windows (b, n, 6) to a `Prediction`.
+"""Names of networks to Flax modules; every one maps windows (b, n, c) to a `Prediction`.
 
-The fields of a module are its options, their types the choices (`Literal`) or bounds (those of
-`gnio_jax.config.schema`) of each, and their defaults the published values.
+The fields of a module are its options, but for one whose metadata say `option: False`. Their types
+are the choices (`Literal`) or bounds (those of `gnio_jax.config.schema`) of each, and their
+defaults the published values.
 """
 
 from __future__ import annotations
@@ -112,13 +113,12 @@ def options(name: str, equivariance: str = "none") -> dict[str, Any]:
         _check_word(name, names(), f"model '{name}'", "unknown", "models", "; plugins add others")
     network = _MODELS[name]
     types = get_type_hints(network, include_extras=True)
-    kinds = {field.name: types[field.name] for field in dataclasses.fields(network)}
+    fields = [field for field in dataclasses.fields(network) if field.metadata.get("option", True)]
+    kinds = {field.name: types[field.name] for field in fields}
     kinds |= {"equivariance": Literal["none", *_EQUIVARIANT]}
     kinds |= {"corrector": Literal["none", "airimu"]}
     kinds |= frame_options(equivariance)
-    return {
-        option: kind for option, kind in kinds.items() if option not in ("parent", "name", "inputs")
-    }
+    return {option: kind for option, kind in kinds.items() if option not in ("parent", "name")}
 
 
 def frame_options(equivariance: str) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from gnio_jax.training.windows import (
     random_rocking,
 )
 from gnio_jax.types import GRAVITY, Array, Sequence
-from gnio_jax.windows import rotate_channels, rotate_vectors
+from gnio_jax.windows import WINDOW_CUTS, rotate_channels, rotate_vectors
 
 
 class WalkSource(NamedTuple):
@@ -196,8 +196,9 @@ def cut_walks(
     displacement = rotate_vectors(turn, displacement[:, :, None])[:, :, 0]
     displacement = turn_rows(displacement, drift[:, : -grid.window])
     signals = imu[:, inner]
-    if grid.window_rotation in ("body_axes", "hidden_axes"):
-        shown = jnp.full((len(rows), 1, 1), grid.window_rotation == "body_axes")
+    cut = WINDOW_CUTS[grid.window_rotation]
+    if cut.body_axes:
+        shown = jnp.full((len(rows), 1, 1), not cut.hidden)
         if config is not None and config.hidden_axes_share:
             share = jnp.float32(config.hidden_axes_share)
             shown &= ~jax.random.bernoulli(jax.random.fold_in(key, 6), share, shown.shape)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import models
@@ -17,18 +18,28 @@ from tests.support.networks import SMALL, drawn
 
 CONFIG = DataConfig(rate=RATE)
 N, W = CONFIG.stride, CONFIG.window // CONFIG.stride
-MODEL = models.create("ronin_tcn", bank_size=3, head="gated", **SMALL["ronin_tcn"])
-NETWORK = Network.of(MODEL, drawn({"batch_stats": {}, **models.variable_shapes(MODEL, N)}))
 
 
-def stepwise(recording, strides):
+def drawn_network(equivariance="none"):
+    options = {"bank_size": 3, "head": "gated", "equivariance": equivariance}
+    model = models.create("ronin_tcn", **options, **SMALL["ronin_tcn"])
+    return Network.of(model, drawn({"batch_stats": {}, **models.variable_shapes(model, N)}))
+
+
+NETWORK = drawn_network()
+
+
+def stepwise(network, recording, strides, axes):
     """Displacements in the yaw frame of each window's start, with the attitude of the
-    recording."""
-    predict = NETWORK.predict()
+    recording. The axes of the body, in the body, come after the samples."""
+    predict = network.predict()
     step, memory, rows = quick(predict.step), predict.begin(), []
     for k in strides:
         samples = slice(k * N, k * N + N)
-        signals = np.concatenate([recording.accel[samples], recording.gyro[samples]], axis=1)
+        of_body = np.tile(axes, (N, 1))
+        signals = np.concatenate(
+            [recording.accel[samples], recording.gyro[samples], of_body], axis=1
+        )
         poses = recording.attitude[k * N : k * N + N + 1].transpose(1, 2, 0)
         memory, prediction = step(memory, jnp.asarray(signals), jnp.asarray(poses))
         start = recording.attitude[max(k * N + N - CONFIG.window, 0)]
@@ -40,18 +51,28 @@ def stepwise(recording, strides):
     return rows
 
 
-def test_each_stretch_is_one_run_with_a_memory_of_its_own(walks):
+@pytest.mark.parametrize(
+    "rotation, equivariance, axes",
+    [
+        ("per_sample", "none", []),
+        ("body_axes", "device_heading", [1, 0, 0, 0, 1, 0]),
+        ("hidden_axes", "device_heading", [0, 0, 0, 0, 0, 0]),
+    ],
+)
+def test_each_stretch_is_one_run_with_a_memory_of_its_own(walks, rotation, equivariance, axes):
     """Behind a sample that was not measured the memory is empty."""
+    network, config = drawn_network(equivariance), DataConfig(rate=RATE, window_rotation=rotation)
     measured = np.ones(len(walks[0].time), bool)
     measured[203] = False
     sequence = walks[0]._replace(imu_valid=measured)
-    (recording,) = ready([sequence], CONFIG, orientation="reference")
-    (found,) = infer(NETWORK, [recording], CONFIG)
+    (recording,) = ready([sequence], config, orientation="reference")
+    (found,) = infer(network, [recording], config)
     turns = rotations(walks[0].orientation).as_matrix()
     np.testing.assert_allclose(recording.attitude[:50], turns[:50], atol=1e-9)
     hole, last = 203 // N, recording.strides
     for strides in (range(hole), range(hole + 1, last)):
-        for k, (value, covariance, gate) in zip(strides, stepwise(recording, strides), strict=True):
+        rows = stepwise(network, recording, strides, axes)
+        for k, (value, covariance, gate) in zip(strides, rows, strict=True):
             if k - strides.start < W - 1:
                 assert np.isnan(found.value[k]).all() and np.isnan(found.covariance[k]).all()
                 continue
@@ -59,7 +80,7 @@ def test_each_stretch_is_one_run_with_a_memory_of_its_own(walks):
             np.testing.assert_allclose(found.covariance[k], covariance, atol=2e-3, rtol=2e-3)
             np.testing.assert_allclose(found.diagnostics["gate"][k], gate, atol=2e-3)
     assert np.isnan(found.value[hole]).all() and set(found.diagnostics) == {"gate", "scale"}
-    assert np.isfinite(integrate(recording, found, CONFIG).trajectory.position).all()
+    assert np.isfinite(integrate(recording, found, config).trajectory.position).all()
 
 
 def test_the_filter_runs_with_it_over_several_recordings(walks):

@@ -143,6 +143,8 @@ def test_the_heading_of_the_device_is_seen_until_it_is_hidden():
     class Blind:
         """The network with zeros in the place of the axes."""
 
+        channels = 12
+
         def __init__(self):
             self.predict = network(equivariance="device_heading").predict()
             self.begin = self.predict.begin
@@ -288,6 +290,20 @@ def test_a_memory_of_another_network_is_refused():
     single = filtering.Filter(dataclasses.replace(CONFIG, window_rotation="single"))
     with pytest.raises(ValueError, match=r"^ekf\.config\.window_rotation: a network with memory"):
         filtering.run_odometry(network().predict(), single, start(), *recording())
+
+
+@pytest.mark.parametrize(
+    "equivariance, ekf, remedy",
+    [
+        ("none", SEES_DEVICE, "it must be 'per_sample'"),
+        ("four_headings", SEES_DEVICE, "it must be 'per_sample'"),
+        ("device_heading", EKF, "it must be 'body_axes' or 'hidden_axes'"),
+    ],
+)
+def test_samples_that_a_memory_does_not_see_are_refused(equivariance, ekf, remedy):
+    predict = network(equivariance=equivariance).predict()
+    with pytest.raises(ValueError, match=rf"^ekf\.config\.window_rotation: .* {remedy}$"):
+        filtering.run_odometry(predict, ekf, start(ekf=ekf), *recording())
 
 
 class Shapeless:

@@ -203,3 +203,16 @@ def test_a_network_of_ones_own_is_created_by_its_name(monkeypatch):
     assert "own" in models.names() and models.create("own", width=5) == Tiny(width=5)
     with pytest.raises(InputError, match="model 'gnio': is a network of gnio-jax"):
         models.register("gnio", Tiny)
+
+
+def test_the_channels_that_a_memory_has_room_for_are_no_option_but_those_of_ones_own_are(
+    monkeypatch,
+):
+    class Own(Tiny):
+        inputs: int = 4
+
+    monkeypatch.setattr(registry, "_MODELS", dict(registry._MODELS))
+    models.register("own", Own)
+    assert models.create("own", inputs=5) == Own(inputs=5)
+    with pytest.raises(InputError, match="unknown option 'inputs'"):
+        models.create("gru", inputs=9)

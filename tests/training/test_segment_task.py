@@ -145,7 +145,7 @@ def test_a_mirrored_segment_is_that_of_a_mirrored_walk():
         orientation=np.stack([w, x, -y, -z], axis=1),
         position=sequence.position * [-1, 1, 1],
     )
-    grid = SegmentGrid(N, 20, W, RATE)
+    grid = SegmentGrid(N, 20, W, RATE, "body_axes")
     source, expected = (
         jax.device_put(walk_source([walked], experiment(None, "unused"), training=False))
         for walked in (sequence, behind)
@@ -162,7 +162,7 @@ def test_a_mirrored_segment_is_that_of_a_mirrored_walk():
 def test_the_axes_of_the_body_come_after_the_samples(mirrored):
     """They are those of the attitude in the frame of the segment, by SciPy; behind the mirror those
     of the mirrored walk, whose x axis points to the other side. Where the gyro has a bias, they
-    turn with the frame that drifts, as the samples do."""
+    turn with the frame that drifts by what the gyro shows too much, as the samples do."""
     sequence, grid = walk(), SegmentGrid(N, 20, W, RATE, "body_axes")
     source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))
     row, first = source.earliest[:1], int(source.earliest[0])
@@ -178,6 +178,8 @@ def test_the_axes_of_the_body_come_after_the_samples(mirrored):
     turned = np.angle(
         np.dot(drifted.signals[0, -1, 6:8], [1, 1j]) / np.dot(expected[-1, :2], [1, 1j])
     )
+    extra = drifted.signals[0, : 19 * N, 5] - cut.signals[0, : 19 * N, 5]
+    assert np.isclose(np.exp(1j * turned), np.exp(1j * extra.sum() / RATE), atol=1e-3)
     forces = (np.dot(x.signals[0, -1, :2], [1, 1j]) for x in (drifted, cut))
     assert abs(turned) > 0.05 and np.isclose(np.exp(1j * turned), np.divide(*forces), atol=1e-3)
 
