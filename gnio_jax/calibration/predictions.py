@@ -54,7 +54,11 @@ def average_over_headings(network: TrainedNetwork, source: str) -> TrainedNetwor
     heading, or is equivariant in another way."""
     frame = network.config.model.equivariance
     if frame not in ("none", "four_headings"):
-        problem = f"its network has model.equivariance: {frame}, a frame of its own"
+        problem = f"its network has model.equivariance: {frame}"
+        if not getattr(network.model, "averages_headings", False):
+            problem += ", a frame of its own"
+        else:
+            problem += ", which averages over four headings"
         raise InputError(source, problem, "leave --average-headings out")
     averaged = dataclasses.replace(network.config.model, equivariance="four_headings")
     config = dataclasses.replace(network.config, model=averaged)

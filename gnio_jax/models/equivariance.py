@@ -55,6 +55,8 @@ class FourHeadings(Equivariant):
     network once, because augmentation draws the heading.
     """
 
+    averages_headings = True
+
     def __call__(
         self, windows: Float[Array, "b n 6"], train: bool = False, **constants: Any
     ) -> Prediction:
@@ -95,6 +97,8 @@ class FourHeadingsWithMemory(NetworkWithMemory):
 
     network: Any = None
     """A `NetworkWithMemory`, whose own options hold."""
+
+    averages_headings = True
 
     def setup(self) -> None:
         nn.share_scope(self, self.network)

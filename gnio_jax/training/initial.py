@@ -49,7 +49,8 @@ def _describe_network(config: TrainConfig) -> dict[str, Any]:
     frame = config.model.equivariance
     frame = "none" if frame == "four_headings" else frame
     parts = {"name": config.model.name, "equivariance": frame, "corrector": config.model.corrector}
-    options = {**parts, **options, "frame_width": getattr(whole, "frame_width", None)}
+    of_frame = {name: getattr(whole, name, None) for name in models.frame_options(frame)}
+    options = {**parts, **options, **of_frame}
     of_windows = ("rate", "window_seconds", "context_seconds", "window_rotation")
     windows = {f"data.{name}": getattr(config.data, name) for name in of_windows}
     return {f"model.{name}": value for name, value in options.items()} | windows

@@ -25,9 +25,11 @@ from gnio_jax.training.walkway import Pace, SlowMotion, change_pace, draw_pace, 
 from gnio_jax.training.windows import (
     low_pass_margin,
     mirror_channels,
+    on_samples,
     random_low_pass,
     random_mirror,
     random_rocking,
+    signals_at_rest,
 )
 from gnio_jax.types import GRAVITY, Array, Sequence
 from gnio_jax.windows import WINDOW_CUTS, rotate_channels, rotate_vectors
@@ -161,6 +163,14 @@ def cut_walks(
     accel, position = change_pace(accel, interpolate(source.position), slow, pace)
     imu = jnp.concatenate([accel, tau * imu[..., 3:]], axis=2)
     rotation = jnp.asarray(source.rotation)[index]
+    cut = WINDOW_CUTS[grid.window_rotation]
+    if cut.body_axes:
+        shown = jnp.full((len(rows), 1, 1), not cut.hidden)
+        if config is not None and config.hidden_axes_share:
+            share = jnp.float32(config.hidden_axes_share)
+            shown &= ~jax.random.bernoulli(jax.random.fold_in(key, 6), share, shown.shape)
+        axes = rotation[:, :, :, :2].swapaxes(2, 3).reshape(*imu.shape)
+        imu = jnp.concatenate([imu, jnp.where(shown, axes, 0)], axis=2)
     inner = slice(margin, margin + samples)
     ends = slice(margin, margin + samples + 1, grid.stride)
     drift = jnp.zeros((len(rows), grid.intervals + 1), jnp.float32)
@@ -195,18 +205,9 @@ def cut_walks(
     displacement = displacement * mirror[:, None]
     displacement = rotate_vectors(turn, displacement[:, :, None])[:, :, 0]
     displacement = turn_rows(displacement, drift[:, : -grid.window])
-    signals = imu[:, inner]
-    cut = WINDOW_CUTS[grid.window_rotation]
-    if cut.body_axes:
-        shown = jnp.full((len(rows), 1, 1), not cut.hidden)
-        if config is not None and config.hidden_axes_share:
-            share = jnp.float32(config.hidden_axes_share)
-            shown &= ~jax.random.bernoulli(jax.random.fold_in(key, 6), share, shown.shape)
-        axes = rotation[:, inner, :, :2].swapaxes(2, 3).reshape(*signals.shape)
-        signals = jnp.concatenate([signals, jnp.where(shown, axes, 0)], axis=2)
-    signals = rotate_channels(turn, signals)
-    if config is not None and (config.gyro_bias or config.rest_share):
-        # The frame drifts with the bias that the gyro has left (`models.memory`).
+    signals = rotate_channels(turn, imu[:, inner])
+    if config is not None:
+        # The frame drifts with what the gyro shows too much (`models.memory`).
         angle = jnp.repeat(drift[:, :-1], grid.stride, axis=1)[:, :, None]
         vectors = turn_rows(signals.reshape(*signals.shape[:2], -1, 3), angle)
         signals = vectors.reshape(signals.shape)
@@ -218,14 +219,14 @@ def cut_walks(
 
 def with_errors(
     key: PRNGKeyArray,
-    imu: Float[jax.Array, "b s 6"],
+    imu: Float[jax.Array, "b s c"],
     rotation: Float[jax.Array, "b s 3 3"],
     config: AugmentConfig,
-) -> tuple[Float[jax.Array, "b s 6"], Float[jax.Array, "b s"]]:
+) -> tuple[Float[jax.Array, "b s c"], Float[jax.Array, "b s"]]:
     """Samples in the world, with errors of the sensors that are constant in the body over a segment
-    (scale and bias), white noise, and an error of gravity's direction; and the rate at which a
-    heading that is integrated from these samples drifts, rad/s. Half-widths are those of
-    `windows.augment`."""
+    (scale and bias), white noise, and an error of gravity's direction, which the body's axes have,
+    too; and the rate at which a heading that is integrated from these samples drifts, rad/s.
+    Half-widths are those of `windows.augment`."""
     bias_key, scale_key, noise_key, axis_key, angle_key = jax.random.split(key, 5)
     count, true_rate = len(imu), imu[..., 5]
 
@@ -234,12 +235,12 @@ def with_errors(
 
     if any(config.scale):
         error = uniform(scale_key, (count, 1, 2)) * jnp.array([[config.scale[::-1]]], jnp.float32)
-        imu = imu * (1 + jnp.repeat(error, 3, axis=2))
+        imu = on_samples(imu, lambda x: x * (1 + jnp.repeat(error, 3, axis=2)))
     if config.gyro_bias or config.accel_bias:
         width = jnp.array([[config.accel_bias], [config.gyro_bias]], jnp.float32)
         bias = uniform(bias_key, (count, 2, 3)) * width[None]
         in_world = jnp.einsum("bsij,bkj->bski", rotation, bias)
-        imu = imu + in_world.reshape(count, -1, 6)
+        imu = on_samples(imu, lambda x: x + in_world.reshape(count, -1, 6))
     drift = imu[..., 5] - true_rate
     if config.tilt_degrees:
         heading = jnp.pi * uniform(axis_key, (count,))
@@ -248,7 +249,8 @@ def with_errors(
         imu = rotate_channels(jax.vmap(geometry.exp)(angle[:, None] * axis), imu)
     if any(config.noise):
         std = jnp.repeat(jnp.array(config.noise[::-1], jnp.float32), 3)[None, None]
-        imu = imu + std * jax.random.normal(noise_key, imu.shape, jnp.float32)
+        noise = jax.random.normal(noise_key, (*imu.shape[:2], 6), jnp.float32)
+        imu = on_samples(imu, lambda x: x + std * noise)
     return imu, drift
 
 
@@ -263,13 +265,11 @@ def turn_rows(
 
 
 def at_rest(key: PRNGKeyArray, segments: WalkSegments, share: float) -> WalkSegments:
-    """The segments, a random share of them replaced by those of a phone at rest, which measures
-    only gravity."""
+    """The segments, a random share of them replaced by those of a phone at rest."""
     signals, displacement, moved = segments
     lies = jax.random.bernoulli(key, jnp.float32(share), (len(signals), 1, 1))
-    still = jnp.array([[[0, 0, GRAVITY, 0, 0, 0]]], jnp.float32)
     return WalkSegments(
-        jnp.concatenate([jnp.where(lies, still, signals[..., :6]), signals[..., 6:]], axis=2),
+        jnp.where(lies, signals_at_rest(signals), signals),
         jnp.where(lies, 0, displacement),
         jnp.where(lies[..., 0], 0, moved),
     )

@@ -132,7 +132,7 @@ class WindowTask(Task):
         stage = self.last_stage(state)
         validations = [validate(state, source, stage, task=self) for source in held_out.values()]
         mean = jax.tree.map(lambda *figures: sum(figures) / len(figures), *validations)
-        isotropic = self.config.model.equivariance == "four_headings"
+        isotropic = getattr(self.model, "averages_headings", False)
         return calibrate_uncertainty(state, mean, isotropic)
 
     def figures_of(self, state: TrainState, held_out: WindowSource, key: PRNGKeyArray) -> Row:

@@ -299,13 +299,13 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
         imu = _with_bounce(jax.random.fold_in(key, 7), imu, config.vertical_gain)
     if any(config.scale):
         error = _uniform(jax.random.fold_in(key, 4), (count, 1, 2), -1.0, 1.0)
-        imu = _on_samples(
+        imu = on_samples(
             imu, lambda x: x * (1 + error.repeat(3, axis=2) * _channels(*config.scale))
         )
     if config.gyro_bias or config.accel_bias:
         offset = _uniform(bias_key, (count, 1, 6), -1.0, 1.0)
         offset = offset * _channels(config.gyro_bias, config.accel_bias)
-        imu = _on_samples(imu, lambda x: x + offset)
+        imu = on_samples(imu, lambda x: x + offset)
     if config.tilt_degrees:
         heading_key, angle_key = jax.random.split(tilt_key)
         heading = _uniform(heading_key, (count,), 0.0, 2 * math.pi)
@@ -328,7 +328,7 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
     if any(config.noise):
         noise = jax.random.normal(noise_key, (*imu.shape[:2], 6), jnp.float32)
         noise = noise * _channels(*config.noise)
-        windows = windows._replace(imu=_on_samples(windows.imu, lambda x: x + noise))
+        windows = windows._replace(imu=on_samples(windows.imu, lambda x: x + noise))
     return windows
 
 
@@ -350,18 +350,23 @@ def _with_bounce(
 
 
 def _at_rest(key: PRNGKeyArray, windows: Windows, share: float) -> Windows:
-    """The windows, with a random share of them replaced by those of a phone at rest, which measures
-    only gravity."""
+    """The windows, with a random share of them replaced by those of a phone at rest."""
     lies = jax.random.bernoulli(key, jnp.float32(share), (len(windows.imu), 1, 1))
-    still = jnp.array([[[0, 0, GRAVITY, 0, 0, 0]]], jnp.float32)
     return Windows(
-        _on_samples(windows.imu, lambda x: jnp.where(lies, still, x)),
+        jnp.where(lies, signals_at_rest(windows.imu), windows.imu),
         jnp.where(lies[:, 0], 0, windows.displacement),
         jnp.where(lies, 0, windows.steps),
     )
 
 
-def _on_samples(
+def signals_at_rest(imu: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b n c"]:
+    """Signals of a phone that lies still, in the attitude that it had at the first sample, and
+    measures only gravity."""
+    still = jnp.broadcast_to(imu[:, :1], imu.shape)
+    return on_samples(still, lambda _: jnp.zeros_like(imu[..., :6]).at[..., 2].set(GRAVITY))
+
+
+def on_samples(
     imu: Float[jax.Array, "b n c"], change: Callable[[jax.Array], jax.Array]
 ) -> Float[jax.Array, "b n c"]:
     """The windows with [accel, gyro] changed, and the body's axes as they are."""

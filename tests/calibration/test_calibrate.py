@@ -728,7 +728,8 @@ def average(runs, model=None, augment=None):
     model = dataclasses.replace(loaded.config.model, **(model or {}))
     augment = dataclasses.replace(loaded.config.augment, **(augment or {}))
     config = dataclasses.replace(loaded.config, model=model, augment=augment)
-    return predictions.average_over_headings(loaded._replace(config=config), "the run")
+    network = loaded._replace(config=config, model=models.from_config(model))
+    return predictions.average_over_headings(network, "the run")
 
 
 def compare_with_another_model(runs):
@@ -778,7 +779,12 @@ REFUSED = [
     (compare_with_another_model, "fold0: differs from the calibrated run in 'model'"),
     (
         lambda x: average(x, model={"equivariance": "canonical_frame"}),
-        "^the run: its network has model.equivariance: canonical_frame",
+        "^the run: its network has model.equivariance: canonical_frame, a frame of its own",
+    ),
+    (
+        lambda x: average(x, model={"name": "gru", "equivariance": "device_heading"}),
+        "^the run: its network has model.equivariance: device_heading, which averages over four "
+        "headings; leave --average-headings out",
     ),
     (lambda x: average(x, augment={"yaw": False}), "^the run.*four_headings without augment.yaw"),
     (

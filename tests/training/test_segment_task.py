@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import data
+from gnio_jax import data, models
 from gnio_jax.config import (
     AugmentConfig,
     DataConfig,
@@ -18,9 +18,9 @@ from gnio_jax.config import (
     ThroughFilter,
 )
 from gnio_jax.errors import InputError
-from gnio_jax.networks import read_network
+from gnio_jax.networks import TrainedNetwork, read_network
 from gnio_jax.reporting import Silence
-from gnio_jax.training import loop
+from gnio_jax.training import initial, loop
 from gnio_jax.training.losses import loss_stage
 from gnio_jax.training.recordings import set_up
 from gnio_jax.training.segment_task import BANDS, SegmentTask, horizon_error, validate
@@ -113,10 +113,11 @@ def test_a_segment_that_does_not_fit_is_refused():
         walk_source([walk()], config, training=False)
 
 
-def test_a_frame_drifts_as_its_gyro_says():
+@pytest.mark.parametrize("error", [{"gyro_bias": 0.5}, {"scale": (0.3, 0.0)}])
+def test_a_frame_drifts_as_its_gyro_says(error):
     """The displacement is turned by the integral of what the gyro shows too much until the window
     begins, and so are the samples."""
-    config, sequence = dataclasses.replace(OFF, gyro_bias=0.5), walk()
+    config, sequence = dataclasses.replace(OFF, **error), walk()
     source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))
     row, grid = source.earliest[:1], SegmentGrid(N, 20, W, RATE)
     plain, drifted = (
@@ -182,6 +183,36 @@ def test_the_axes_of_the_body_come_after_the_samples(mirrored):
     assert np.isclose(np.exp(1j * turned), np.exp(1j * extra.sum() / RATE), atol=1e-3)
     forces = (np.dot(x.signals[0, -1, :2], [1, 1j]) for x in (drifted, cut))
     assert abs(turned) > 0.05 and np.isclose(np.exp(1j * turned), np.divide(*forces), atol=1e-3)
+
+
+def test_an_error_of_gravitys_direction_turns_the_axes_of_the_body_with_the_samples():
+    sequence, grid = walk(), SegmentGrid(N, 20, W, RATE, "body_axes")
+    source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))
+    with_tilt = dataclasses.replace(OFF, tilt_degrees=30.0)
+    plain, tilted = (
+        jax.device_get(draw_walks(jax.random.key(2), source, source.earliest[:1], grid, augment))
+        for augment in (OFF, with_tilt)
+    )
+    vectors, turned = (cut.signals[0].reshape(-1, 4, 3) for cut in (plain, tilted))
+    tilt, _ = Rotation.align_vectors(turned[:, :2].reshape(-1, 3), vectors[:, :2].reshape(-1, 3))
+    assert np.radians(3) < tilt.magnitude() < np.radians(30)
+    np.testing.assert_allclose(tilt.as_rotvec()[2], 0, atol=1e-5)
+    for new, old in zip(turned[:, 2:], vectors[:, 2:], strict=True):
+        np.testing.assert_allclose(new, tilt.apply(old), atol=1e-5)
+
+
+def test_the_axes_of_a_phone_at_rest_stay():
+    sequence, grid = walk(), SegmentGrid(N, 20, W, RATE, "body_axes")
+    source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))
+    row, at_rest = source.earliest[:1], dataclasses.replace(OFF, rest_share=1.0)
+    plain, rest = (
+        jax.device_get(draw_walks(jax.random.key(2), source, row, grid, augment))
+        for augment in (OFF, at_rest)
+    )
+    assert np.abs(plain.signals[0, -1, 6:] - plain.signals[0, 0, 6:]).max() > 0.1
+    expected = np.concatenate([np.float32([0, 0, 9.81, 0, 0, 0]), plain.signals[0, 0, 6:]])
+    np.testing.assert_array_equal(rest.signals[0], np.tile(expected, (20 * N, 1)))
+    assert not rest.displacement.any() and not rest.moved.any()
 
 
 def test_the_axes_of_the_body_are_hidden_in_a_share_of_the_segments():
@@ -381,6 +412,17 @@ def test_a_run_learns_is_resumed_to_the_bit_and_goes_on_through_the_filter(root,
         after.variables["params"],
     )
     assert min(jax.tree.leaves(moved["conv1"])) > 0 and moved["recurrent_kernel"] > 0
+
+
+def test_a_network_with_another_limit_of_a_screen_that_faces_up_is_no_start(monkeypatch):
+    model = ModelConfig("gru", width=2, equivariance="device_heading")
+    first = experiment(None, "unused", model=model, init_from="first")
+    network = TrainedNetwork(first, models.from_config(model), None, epoch=0, step=0)
+    monkeypatch.setattr(initial.networks, "load", lambda _: network)
+    assert initial.load_initial_network(first).config is first
+    steeper = dataclasses.replace(model, largest_tilt=65.0)
+    with pytest.raises(InputError, match=r"model\.largest_tilt is 60\.0, and here it is 65\.0"):
+        initial.load_initial_network(dataclasses.replace(first, model=steeper))
 
 
 def test_settings_that_do_not_fit_are_refused(root, tmp_path):

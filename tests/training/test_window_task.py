@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gnio_jax import parallel
-from gnio_jax.config import ModelConfig, TrainConfig
+from gnio_jax import models, parallel
+from gnio_jax.config import TrainConfig
 from gnio_jax.models.heads import CalibratedUncertainty
 from gnio_jax.reporting import Silence
 from gnio_jax.training import task, window_task, windows
@@ -176,9 +176,18 @@ def test_the_uncertainty_takes_the_errors_of_the_validation():
     np.testing.assert_array_equal(head.apply(variables, h, True), 0.0)
 
 
-@pytest.mark.parametrize("equivariance", ["none", "four_headings", "canonical_frame"])
+@pytest.mark.parametrize(
+    "name, equivariance, averaged",
+    [
+        ("gnio", "none", False),
+        ("gnio", "four_headings", True),
+        ("gnio", "canonical_frame", False),
+        ("gnio", "device_heading", False),
+        ("gru", "device_heading", True),
+    ],
+)
 def test_constants_are_those_of_all_datasets_and_of_both_axes_in_a_mean_over_headings(
-    monkeypatch, equivariance
+    monkeypatch, name, equivariance, averaged
 ):
     """Their squares are the mean square errors over the datasets, and there over the plane."""
 
@@ -187,13 +196,13 @@ def test_constants_are_those_of_all_datasets_and_of_both_axes_in_a_mean_over_hea
         return validation(errors, errors)
 
     monkeypatch.setattr(window_task, "validate", found)
-    training = WindowTask(Tiny(), TrainConfig(model=ModelConfig(equivariance=equivariance)), 7)
+    model = models.create(name, equivariance=equivariance)
+    training = WindowTask(model, TrainConfig(), 7)
     fields = len(windows.WindowSource._fields)
     held_out = {str(k): windows.WindowSource(*[jnp.full(1, k)] * fields) for k in (0.5, 1.5)}
     kept, row = training.validate(
         with_uncertainty(log_std=np.zeros(3)), held_out, jax.random.key(0)
     )
-    averaged = equivariance == "four_headings"  # a frame has axes of its own
     wanted = [2.5, 2.5, 9.0] if averaged else [1.0, 4.0, 9.0]
     np.testing.assert_allclose(of_uncertainty(kept, "log_std") ** 2, wanted, rtol=1e-6)
     assert row["val_normalised/z"] == 9.0

@@ -184,12 +184,17 @@ def test_tilt_is_about_a_horizontal_axis_and_yaw_turns_the_target_too():
 
 
 def test_a_window_at_rest_has_gravity_alone_and_no_displacement():
+    """The axes of the body stay."""
     before = batch()
+    axes = np.float32(np.random.default_rng(4).normal(size=(*before.imu.shape[:2], 6)))
+    before = before._replace(imu=np.concatenate([before.imu, axes], axis=-1))
     after = augmented(before, rest_share=0.2)
     lies = np.asarray((after.displacement == 0).all(axis=1))
     assert 0.17 < lies.mean() < 0.23
-    still = np.broadcast_to(np.float32([0, 0, 9.81, 0, 0, 0]), after.imu[lies].shape)
-    np.testing.assert_array_equal(after.imu[lies], still)
+    still = np.broadcast_to(np.float32([0, 0, 9.81, 0, 0, 0]), after.imu[lies][..., :6].shape)
+    np.testing.assert_array_equal(after.imu[lies][..., :6], still)
+    first = np.broadcast_to(axes[lies][:, :1], axes[lies].shape)
+    np.testing.assert_array_equal(after.imu[lies][..., 6:], first)
     assert not after.steps[lies].any()
     for new, old in zip(after, before, strict=True):
         np.testing.assert_array_equal(new[~lies], old[~lies])
