@@ -45,8 +45,8 @@ class RunPosition(NamedTuple):
     """Epoch in progress, or finished if `step` is a multiple of the steps per epoch."""
     step: int = 0
     best: float | None = None
-    """Smallest value of `optim.best_by` on the validation split since the last change of what is
-    trained."""
+    """Value of `optim.best_by` on the validation split at the best epoch since the last change of
+    what is trained."""
     sums: dict[str, float] = {}
     """Figures summed over the steps of the epoch in progress (`task.DispatchSums`)."""
     seconds: float = 0.0

@@ -54,7 +54,7 @@ class TrainingResult(NamedTuple):
 
     workdir: Path
     best_loss: float | None
-    """Smallest value of `optim.best_by` on the validation split."""
+    """Value of `optim.best_by` on the validation split at the best epoch."""
     stopped_by: int | None
     """Signal that ended this run early, or prevented the seeds after it; the state is saved."""
 
@@ -291,7 +291,8 @@ def finish_epoch(
 
     The choice of the best epoch begins anew with the epoch that changes what is trained, and again
     with the first whole epoch after it. Losses before and after the change cannot be compared, and
-    a part that has just begun to learn has learnt little. NaN and infinity are never the best.
+    a part that has just begun to learn has learnt little. With `best_by: latest` every epoch is the
+    best one so far. NaN and infinity are never the best.
     """
     optim, means = task.config.optim, mean_figures(position.sums, task.steps_per_epoch)
     norms = {name: means.pop(name) for name in position.sums if name.startswith("gradient_norm/")}
@@ -309,7 +310,8 @@ def finish_epoch(
     before = position.step - 2 * task.steps_per_epoch
     changed = any(before < change < position.step for change in task.changes)
     best = None if changed else position.best
-    improved = math.isfinite(merit) and (best is None or merit < best)
+    better = optim.best_by == "latest" or best is None or merit < best
+    improved = math.isfinite(merit) and better
     plateau = optimizer.update_plateau(position.plateau, row["val_mse"], optim)
     best = merit if improved else best
     position = position._replace(epoch=position.epoch + 1, best=best, sums={}, plateau=plateau)

@@ -341,7 +341,9 @@ def counted(recording, tmp_path, monkeypatch):
     return train
 
 
-@pytest.mark.parametrize("criterion, best, epoch", [("loss", 6.0, 4), ("squared_error", 4.0, 3)])
+@pytest.mark.parametrize(
+    "criterion, best, epoch", [("loss", 6.0, 4), ("squared_error", 4.0, 3), ("latest", 5.0, 4)]
+)
 def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(
     counted, tmp_path, criterion, best, epoch
 ):
