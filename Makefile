@@ -3,7 +3,7 @@
 # make test-all   the tests that are marked slow, too: continuous integration runs these
 # make lint   ruff and pyright
 # make pedestrian   the network that comes with gnio-jax anew, from Tyrex and Indoor Location below
-#             $GNIO_DATA: half an hour on two cores
+#             $GNIO_DATA: an hour on two slow cores
 # make docs   the documentation as a site, in site/index.html; its notebooks run
 # make links  ask every external link of the pages if it answers; needs a network
 #
@@ -49,26 +49,27 @@ demo: $(VENV)/.package
 	$(BIN)/gnio evaluate --network $(DEMO) --estimator imu_only
 	$(BIN)/gnio evaluate --network $(DEMO)
 
-# A network of a quarter of the width learns from poses between the waypoints, and makes truer ones
-# for the network of half the width. Each learns the direction of a walk from the gait alone, and
-# then with the heading of the device.
-PLAIN := --set augment.mirror_share=0 --set augment.rocking_share=0 \
-	--set "augment.vertical_gain=[1,1]"
-GAIT := --set augment.hidden_axes_share=1
+# A network on windows of a quarter of the width learns from poses between the waypoints, the
+# direction of a walk from the gait alone first, and then with the heading of the device. With the
+# smoother it makes truer poses, from which a GRU learns.
+FIRST := --config pedestrian_windows --model.width 16 --set augment.mirror_share=0 \
+	--set augment.rocking_share=0 --set "augment.vertical_gain=[1,1]"
 POSES := --set data.poses_by=$(RUNS)/pedestrian_first_calibrated
+PATHS := --set segments.seconds=12 --set segments.horizon_weight=10 --optim.epochs 70 \
+	--optim.batch-size 12 --optim.learning-rate 5e-4 --optim.best-by latest
 pedestrian: $(VENV)/.package
 	rm -rf $(RUNS)/pedestrian_first $(RUNS)/pedestrian_first_gait
 	rm -rf $(RUNS)/pedestrian_first_calibrated
-	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_gait $(RUNS)/pedestrian_calibrated
-	$(BIN)/gnio train --config pedestrian --model.width 16 $(PLAIN) $(GAIT) --optim.epochs 3 \
+	rm -rf $(RUNS)/pedestrian $(RUNS)/pedestrian_6s $(RUNS)/pedestrian_calibrated
+	$(BIN)/gnio train $(FIRST) --set augment.hidden_axes_share=1 --optim.epochs 3 \
 		--workdir $(RUNS)/pedestrian_first_gait
-	$(BIN)/gnio train --config pedestrian --model.width 16 $(PLAIN) --optim.epochs 4 \
+	$(BIN)/gnio train $(FIRST) --optim.epochs 4 \
 		--init-from $(RUNS)/pedestrian_first_gait --workdir $(RUNS)/pedestrian_first
 	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian_first
-	$(BIN)/gnio train --config pedestrian $(POSES) $(GAIT) --workdir $(RUNS)/pedestrian_gait
-	$(BIN)/gnio train --config pedestrian $(POSES) --init-from $(RUNS)/pedestrian_gait \
+	$(BIN)/gnio train --config pedestrian $(POSES) --workdir $(RUNS)/pedestrian_6s
+	$(BIN)/gnio train --config pedestrian $(POSES) $(PATHS) --init-from $(RUNS)/pedestrian_6s \
 		--workdir $(RUNS)/pedestrian
-	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian
+	$(BIN)/gnio calibrate --network $(RUNS)/pedestrian --average-headings --fit measurement noise
 
 test: $(VENV)/.with-$(EXTRAS)
 	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) $(SHARED_OUT) -m 'not slow' $(PYTEST_ARGS)

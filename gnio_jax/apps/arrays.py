@@ -80,9 +80,10 @@ def track(
         accel: (n, 3) specific force, body frame, m/s², with gravity in it: the axis that points up
             reads +9.81 at rest, as on Android.
         network: Name of a trained network, or its folder or zip.
-        heading: What shows the direction of a walk while a screen faces up: "device", where the
-            device looks, or "gait" alone, for a phone that is held across and for a device that is
-            no phone.
+        heading: What shows a network with `model.equivariance: device_heading` the direction of a
+            walk while a screen faces up: "device", where the device looks, or "gait" alone, for a
+            phone that is held across and for a device that is no phone. Other networks, as the
+            included one, go by the gait anyway and refuse "gait".
         sensors: Readings of the phone's other sensors, with the stamps of the sensor, f of them in
             any order, on the clock of `time`:
 

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from gnio_jax import networks
+from gnio_jax.config import CalibrateConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import folder as results
 from gnio_jax.evaluation import tabulate
@@ -169,10 +170,18 @@ def _write_recipe(card: Card, network: TrainedNetwork) -> str:
             fitted = f"runs/{card.name}"
         steps = steps if "runs/" in fitted else []  # a published network has its own recipe
         headings = " --average-headings" if calibration.get("average_headings") else ""
-        steps.append(f"gnio calibrate --network {fitted}{headings}")
+        options = headings + _write_parts(calibration.get("fitted", ()))
+        steps.append(f"gnio calibrate --network {fitted}{options}")
         name = fitted.removeprefix("runs/")
         remark = f"\n\nThe filter is fitted to split `{calibration['split']}` of run `{name}`."
     return "\n".join(("```", *steps, "```")) + remark
+
+
+def _write_parts(fitted: list[str] | tuple[str, ...]) -> str:
+    """The option of `gnio calibrate` for the parts of the filter that were fitted, if these are not
+    its default."""
+    default = list(CalibrateConfig().fit)
+    return f" --fit {' '.join(fitted)}" if fitted and list(fitted) != default else ""
 
 
 def _write_text(

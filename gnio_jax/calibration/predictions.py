@@ -54,11 +54,9 @@ def average_over_headings(network: TrainedNetwork, source: str) -> TrainedNetwor
     heading, or is equivariant in another way."""
     frame = network.config.model.equivariance
     if frame not in ("none", "four_headings"):
-        problem = f"its network has model.equivariance: {frame}"
-        if not getattr(network.model, "averages_headings", False):
-            problem += ", a frame of its own"
-        else:
-            problem += ", which averages over four headings"
+        averages = getattr(network.model, "averages_headings", False)
+        reason = "which averages over four headings" if averages else "a frame of its own"
+        problem = f"its network has model.equivariance: {frame}, {reason}"
         raise InputError(source, problem, "leave --average-headings out")
     averaged = dataclasses.replace(network.config.model, equivariance="four_headings")
     config = dataclasses.replace(network.config, model=averaged)

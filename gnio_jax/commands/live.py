@@ -31,8 +31,9 @@ class LiveOptions:
     """Network: the folder of a run, a package or a name (see gnio weights); by default the one that
     comes with gnio-jax, else the newest run below runs/."""
     heading: Literal["device", "gait"] = "device"
-    """What shows the direction of a walk while a screen faces up: where the device looks, or the
-    gait alone, for a phone that is held across and for a device that is no phone."""
+    """What shows a network with model.equivariance device_heading the direction of a walk while a
+    screen faces up: where the device looks, or the gait alone, for a phone that is held across and
+    for a device that is no phone. Other networks, as the included one, go by the gait anyway."""
     out: NewFile | None = None
     """File for the trajectory in TUM format, which is written when the stream has ended."""
     page: str | None = None

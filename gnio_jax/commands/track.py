@@ -38,8 +38,9 @@ class TrackOptions:
     ] = ()
     """A sensor beside the IMU that is not used; may be repeated."""
     heading: Literal["device", "gait"] = "device"
-    """What shows the direction of a walk while a screen faces up: where the device looks, or the
-    gait alone, for a phone that is held across and for a device that is no phone."""
+    """What shows a network with model.equivariance device_heading the direction of a walk while a
+    screen faces up: where the device looks, or the gait alone, for a phone that is held across and
+    for a device that is no phone. Other networks, as the included one, go by the gait anyway."""
     carrier: str | None = None
     """What carries the IMU: person, car, or a file with the filter of a car (as configs/drive.yaml,
     that of car). By default person, and car if a recording without steps has the fixes of a
@@ -64,7 +65,7 @@ def track(request: TrackOptions, call: options.Call) -> None:
       {prog} walk.csv --accel-sign ios --format csv mcap
       {prog} walk.zip --without magnetometer --format gpx
       {prog} drive.zip --carrier car --format geojson
-      {prog} imu.csv --heading gait                an IMU that is no phone
+      {prog} imu.csv --network mine --heading gait   an IMU that is no phone
       {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
           accel_z=az
     """

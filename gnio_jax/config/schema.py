@@ -422,10 +422,11 @@ class OptimConfig:
     """Weight decay: this factor times the parameter is added to its gradient before Adam (CTIN:
     1e-6)."""
     best_by: Literal["loss", "squared_error", "latest"] = "loss"
-    """Mean over the validation split that chooses the best checkpoint: the loss, or the squared
-    error of the displacement. The choice begins anew where `loss.nll_from_epoch` or
-    `loss.log_std_from_epoch` changes what is trained. With "latest" it is always the latest one, as
-    fits a learning rate that falls to zero and validation walks of few people."""
+    """What chooses the checkpoint that is kept as the best: the smallest mean over the validation
+    split of the loss, or of the squared error of the displacement; or "latest", the last epoch
+    whose squared error is finite, as fits a learning rate that falls to zero and validation walks
+    of few people. The choice begins anew where `loss.nll_from_epoch` or `loss.log_std_from_epoch`
+    changes what is trained."""
     statistics_windows: NonNegativeCount = 16384
     """Augmented training windows from which the statistics of batch normalisation are estimated
     before every validation and checkpoint (ours); 0 keeps the running averages of the last

@@ -81,12 +81,12 @@ def first_memory(predict: PredictWithMemory, ekf: Filter, state: FilterState) ->
     if ekf.config.measures != "displacement":
         problem = "a network with memory predicts displacements"
         raise ValueError(f"ekf.config.measures: {problem}: it must be 'displacement'")
-    sees_axes = getattr(predict, "channels", 6) == 12
-    rotations = ("body_axes", "hidden_axes") if sees_axes else ("per_sample",)
+    if getattr(predict, "channels", 6) == 12:
+        rotations, sight = ("body_axes", "hidden_axes"), "sees the axes of the body"
+    else:
+        rotations, sight = ("per_sample",), "sees samples alone (its attribute channels is 6)"
     if ekf.config.window_rotation not in rotations:
-        problem = "a network with memory rotates every sample with its own attitude"
-        if sees_axes:
-            problem = "this network with memory sees the axes of the body"
+        problem = f"this network with memory {sight}"
         remedy = f"it must be {' or '.join(map(repr, rotations))}"
         raise ValueError(f"ekf.config.window_rotation: {problem}: {remedy}")
     memory = predict.begin(state.offset.dtype)

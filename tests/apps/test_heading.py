@@ -12,17 +12,15 @@ from flax import linen as nn
 from scipy.spatial.transform import Rotation
 
 import gnio_jax
-from gnio_jax import models, networks
+from gnio_jax import models
 from gnio_jax.apps import heading
 from gnio_jax.apps.summary import _warnings_of_heading
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
-from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import prepare
 from gnio_jax.evaluation.trajectory import read_tum
 from gnio_jax.models import registry
 from gnio_jax.networks import TrainedNetwork
-from gnio_jax.numerics import matrix_from_quaternion
 from gnio_jax.types import Prediction, Sequence
 from tests.support import tiny_run
 
@@ -110,21 +108,6 @@ def test_there_is_no_angle(trained, how):
 def test_a_screen_that_faces_up_for_ten_seconds_has_one(trained):
     ready = pushed(90.0, tilt=80.0, seconds=30, up=13.0)
     assert heading.misalignment(ready, trained) == pytest.approx(90.0, abs=1e-2)
-
-
-@pytest.mark.parametrize(("seed", "misaligned"), [(30, True), (63, False)])
-def test_the_included_network_tells_a_phone_that_is_held_across(seed, misaligned):
-    """Of two computed strollers, of whom one holds the phone ahead, and the other one across."""
-    walk = pedestrian(seed, 300 + seed, seconds=60.0, rate=100.0)
-    included = networks.load("pedestrian")
-    (ready,), _ = prepare([walk], included.config.data, orientation="filter")
-    angle = heading.misalignment(ready, included)
-    rotation, velocity = matrix_from_quaternion(walk.orientation), walk.velocity[:, :2]
-    level = rotation[:, :2, 0] @ [1, 1j] * 1j
-    moves = np.linalg.norm(velocity, axis=1) > 0.3
-    wanted = np.degrees(np.angle(np.mean((velocity[moves] @ [1, 1j]) / level[moves])))
-    assert angle == pytest.approx(wanted, abs=30.0)
-    assert (abs(angle) > heading.MISALIGNED) == misaligned
 
 
 def test_only_a_network_that_sees_the_axes_does_without(trained):

@@ -83,6 +83,11 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run,
         assert f"gnio calibrate --network runs/{shown}\n" in card
         assert f"The filter is fitted to split `val` of run `{shown}`." in card
     (line,) = (each for each in card.splitlines() if each.startswith("| mall_test_ekf"))
+    for fitted, options in (("measurement noise window", ""), ("noise", " --fit noise")):
+        calibration = {"run": "walk", "split": "val", "fitted": fitted.split()}
+        (own / "calibration.json").write_text(json.dumps(calibration))
+        publish(own, tmp_path / "package", "walk", *SAID)
+        assert f"--network runs/walk{options}\n" in read_text(tmp_path / "package")
     assert line.endswith("| – | – | 0.80 (0.71 to 0.89) | 2.00 (2.00 to 2.00) |")
 
 

@@ -1,5 +1,6 @@
 """Networks by path and by name, and the network that comes with gnio-jax."""
 
+import dataclasses
 import hashlib
 import os
 import shutil
@@ -105,7 +106,7 @@ def test_the_shipped_network_is_the_default_and_small(monkeypatch):
     monkeypatch.delenv("GNIO_WEIGHTS", raising=False)
     path = find.SHIPPED / "pedestrian"
     assert find.find_network() == path == find.find_network("pedestrian")
-    assert sum(file.stat().st_size for file in path.iterdir()) < 5.1e6
+    assert sum(file.stat().st_size for file in path.iterdir()) < 1.1e6
     text = folder.read_text(path)
     for words in ("Tyrex", "CeCILL 2.1", "gnio calibrate", "oxiod_sessions_test_ekf | 7 | 3 |"):
         assert words in text
@@ -115,19 +116,20 @@ def test_the_shipped_network_answers():
     """The arrays are those that were published; a phone that lies still goes next to nowhere."""
     name, published = (
         "pedestrian",
-        "e5006633ad4b0ff33a517aef359a6b18f8282b1c6e005002a2c4470abf3c3543",
+        "2dff7eeda7be55b01b8171843c03a4c0a0a8af712a9b691693eed5ac22b570ae",
     )
     path = find.SHIPPED / name
     digest = hashlib.sha256((path / folder.WEIGHTS).read_bytes()).hexdigest()
     assert digest == published
     network = gnio_jax.load_pretrained(name)
-    assert (network.name, network.digest, network.step) == (name, digest, 5238)
-    recipe = configuration.load(configuration.find_experiment(name))
-    assert network.config.augment == recipe.augment and network.config.optim == recipe.optim
-    config = network.config
-    assert config.datasets == ("tyrex", "indoor_location") and config.model.name == "gnio"
-    still = np.zeros((1, config.data.input_samples, 12), np.float32)
+    assert (network.name, network.digest, network.step) == (name, digest, 6020)
+    config, recipe = network.config, configuration.load(configuration.find_experiment(name))
+    assert config.augment == recipe.augment and config.segments.seconds == 12.0
+    of_last_stage = {"epochs": 70, "batch_size": 12, "learning_rate": 5e-4, "best_by": "latest"}
+    assert config.optim == dataclasses.replace(recipe.optim, **of_last_stage)
+    assert config.datasets == ("tyrex", "indoor_location")
+    assert (config.model.name, config.model.equivariance) == ("gru", "four_headings")
+    still = np.zeros((1, config.data.input_samples, 6), np.float32)
     still[..., 2] = 9.81
-    still[..., [6, 10]] = 1.0  # a phone that lies flat
     prediction = quick(network.model.apply)(network.variables, still)
     assert np.linalg.norm(prediction.displacement) < 0.1

@@ -114,7 +114,7 @@ def test_a_system_is_its_network_with_the_main_options_of_its_recipe():
             assert getattr(config.loss, field) == getattr(recipe.loss, field)
         sees_body = config.data.window_rotation == "body_axes"
         assert sees_body == (config.model.corrector == "airimu")
-        of_heading = experiments.method(name, configuration.load("pedestrian"))
+        of_heading = experiments.method(name, configuration.load("pedestrian_windows"))
         configuration.validate(of_heading, name)
         data = dataclasses.replace(BASE.data, window_rotation="single")
         turned_whole = experiments.method(name, dataclasses.replace(BASE, data=data))
