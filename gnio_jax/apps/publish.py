@@ -169,19 +169,14 @@ def _write_recipe(card: Card, network: TrainedNetwork) -> str:
         if fitted == f"runs/{folder.name.removesuffix('_calibrated')}":
             fitted = f"runs/{card.name}"
         steps = steps if "runs/" in fitted else []  # a published network has its own recipe
-        headings = " --average-headings" if calibration.get("average_headings") else ""
-        options = headings + _write_parts(calibration.get("fitted", ()))
+        options = " --average-headings" if calibration.get("average_headings") else ""
+        default = list(CalibrateConfig().fit)
+        if (parts := calibration.get("fitted") or default) != default:
+            options += f" --fit {' '.join(parts)}"
         steps.append(f"gnio calibrate --network {fitted}{options}")
         name = fitted.removeprefix("runs/")
         remark = f"\n\nThe filter is fitted to split `{calibration['split']}` of run `{name}`."
     return "\n".join(("```", *steps, "```")) + remark
-
-
-def _write_parts(fitted: list[str] | tuple[str, ...]) -> str:
-    """The option of `gnio calibrate` for the parts of the filter that were fitted, if these are not
-    its default."""
-    default = list(CalibrateConfig().fit)
-    return f" --fit {' '.join(fitted)}" if fitted and list(fitted) != default else ""
 
 
 def _write_text(

@@ -23,6 +23,7 @@ from gnio_jax.numerics import finite_rows, matrix_from_quaternion, spans
 from gnio_jax.training.segments import join_segments, segment_shares
 from gnio_jax.training.walkway import Pace, SlowMotion, change_pace, draw_pace, slow_motion
 from gnio_jax.training.windows import (
+    hide_axes,
     low_pass_margin,
     mirror_channels,
     on_samples,
@@ -165,12 +166,10 @@ def cut_walks(
     rotation = jnp.asarray(source.rotation)[index]
     cut = WINDOW_CUTS[grid.window_rotation]
     if cut.body_axes:
-        shown = jnp.full((len(rows), 1, 1), not cut.hidden)
-        if config is not None and config.hidden_axes_share:
-            share = jnp.float32(config.hidden_axes_share)
-            shown &= ~jax.random.bernoulli(jax.random.fold_in(key, 6), share, shown.shape)
         axes = rotation[:, :, :, :2].swapaxes(2, 3).reshape(*imu.shape)
-        imu = jnp.concatenate([imu, jnp.where(shown, axes, 0)], axis=2)
+        imu = jnp.concatenate([imu, jnp.zeros_like(axes) if cut.hidden else axes], axis=2)
+        if config is not None and config.hidden_axes_share:
+            imu = hide_axes(jax.random.fold_in(key, 6), imu, config.hidden_axes_share)
     inner = slice(margin, margin + samples)
     ends = slice(margin, margin + samples + 1, grid.stride)
     drift = jnp.zeros((len(rows), grid.intervals + 1), jnp.float32)

@@ -321,10 +321,9 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
             rotate_vectors(turn, windows.steps[:, :, None])[:, :, 0],
         )
     if config.hidden_axes_share:
-        share, shape = jnp.float32(config.hidden_axes_share), (count, 1, 1)
-        hidden = jax.random.bernoulli(jax.random.fold_in(key, 9), share, shape)
-        axes = jnp.where(hidden, 0, windows.imu[..., 6:])
-        windows = windows._replace(imu=jnp.concatenate([windows.imu[..., :6], axes], axis=-1))
+        hide_key = jax.random.fold_in(key, 9)
+        imu = hide_axes(hide_key, windows.imu, config.hidden_axes_share)
+        windows = windows._replace(imu=imu)
     if any(config.noise):
         noise = jax.random.normal(noise_key, (*imu.shape[:2], 6), jnp.float32)
         noise = noise * _channels(*config.noise)
@@ -357,6 +356,14 @@ def _at_rest(key: PRNGKeyArray, windows: Windows, share: float) -> Windows:
         jnp.where(lies[:, 0], 0, windows.displacement),
         jnp.where(lies, 0, windows.steps),
     )
+
+
+def hide_axes(
+    key: PRNGKeyArray, imu: Float[jax.Array, "b n 12"], share: float
+) -> Float[jax.Array, "b n 12"]:
+    """Signals of which a random share has zeros in the place of the body's axes."""
+    hidden = jax.random.bernoulli(key, jnp.float32(share), (len(imu), 1, 1))
+    return jnp.where(hidden, on_samples(jnp.zeros_like(imu), lambda _: imu[..., :6]), imu)
 
 
 def signals_at_rest(imu: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b n c"]:

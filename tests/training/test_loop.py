@@ -374,6 +374,8 @@ def test_nan_on_validation_is_never_the_best(counted, tmp_path):
     outcome, _ = counted([(nan, nan), (3.0, 3.0), (infinite, 1.0), (2.0, 2.0), (4.0, 4.0)])
     assert outcome.best_loss == 2.0
     assert read_network(tmp_path / "run").epoch == 4
+    assert counted([(1.0, 3.0), (nan, nan)], "latest", best_by="latest")[0].best_loss == 3.0
+    assert read_network(tmp_path / "latest").epoch == 1
     assert counted([(nan, nan)], "none")[0].best_loss is None
     with pytest.raises(InputError, match="none: holds no weights"):
         read_network(tmp_path / "none")

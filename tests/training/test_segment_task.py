@@ -185,6 +185,47 @@ def test_the_axes_of_the_body_come_after_the_samples(mirrored):
     assert abs(turned) > 0.05 and np.isclose(np.exp(1j * turned), np.divide(*forces), atol=1e-3)
 
 
+def test_the_axes_of_the_body_change_nothing_else_whatever_is_drawn():
+    """Samples and displacements are the same to the bit without the axes, with them, and where they
+    are hidden. Shown axes stay orthonormal, and hidden ones zero in the whole segment."""
+    augment = AugmentConfig(
+        gyro_bias=0.2,
+        accel_bias=0.2,
+        tilt_degrees=5.0,
+        noise=(0.1, 0.3),
+        scale=(0.1, 0.1),
+        low_pass_share=0.5,
+        low_pass_hertz=(3.0, 20.0),
+        rest_share=0.2,
+        mirror_share=0.5,
+        rocking_share=0.5,
+        walkway_share=0.5,
+        vertical_gain=(0.5, 1.2),
+        time_stretch=(0.9, 1.1),
+    )
+    config = experiment(None, "unused", augment=augment)
+    source = jax.device_put(walk_source([walk(1400)], config, training=True))
+    rows = jnp.repeat(jnp.asarray(source.earliest[:1]), 60)
+
+    def draw(rotation, share=0.0):
+        changes = dataclasses.replace(augment, hidden_axes_share=share)
+        grid = SegmentGrid(N, 20, W, RATE, rotation)
+        return jax.device_get(draw_walks(jax.random.key(3), source, rows, grid, changes))
+
+    plain, shown = draw("per_sample"), draw("body_axes")
+    some, none = draw("body_axes", 0.5), draw("hidden_axes")
+    for cut in (shown, some, none):
+        np.testing.assert_array_equal(cut.signals[..., :6], plain.signals)
+        np.testing.assert_array_equal(cut.displacement, plain.displacement)
+    x_axis, y_axis = shown.signals[..., 6:9], shown.signals[..., 9:]
+    for one, other, product in ((x_axis, x_axis, 1), (y_axis, y_axis, 1), (x_axis, y_axis, 0)):
+        np.testing.assert_allclose((one * other).sum(axis=2), product, atol=1e-5)
+    assert not none.signals[..., 6:].any()
+    hidden = ~some.signals[..., 6:].any(axis=(1, 2))
+    assert 15 < hidden.sum() < 45
+    np.testing.assert_array_equal(some.signals[~hidden], shown.signals[~hidden])
+
+
 def test_an_error_of_gravitys_direction_turns_the_axes_of_the_body_with_the_samples():
     sequence, grid = walk(), SegmentGrid(N, 20, W, RATE, "body_axes")
     source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))

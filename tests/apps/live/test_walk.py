@@ -107,7 +107,7 @@ def test_phyphox_gives_the_path_of_its_lines(gnio, follow, run, port, tmp_path):
 
 @pytest.mark.slow
 def test_the_example_by_a_phone_is_the_example_by_lines(gnio, port, tmp_path):
-    """With the network that comes with gnio-jax."""
+    """With the network that comes with gnio-jax; the true path goes 4.2 m away from its start."""
     rows, seen = np.loadtxt(WALK, delimiter=",", skiprows=1)[:1500], []
     recorded = rows[:, 0], rows[:, 1:4], rows[:, 4:]
     thread = pushed_by_a_phone(port, messages(*recorded, period=1.0, kind="total"), seen)
@@ -117,7 +117,7 @@ def test_the_example_by_a_phone_is_the_example_by_lines(gnio, port, tmp_path):
     gnio("live", "--out", tmp_path / "lines.txt", lines=lines)
     found, wanted = read_tum(tmp_path / "http.txt"), read_tum(tmp_path / "lines.txt")
     assert_same_path(found, wanted, 1.7e9)
-    assert np.ptp(found.position[:, :2], axis=0).max() > 5
+    assert 3 < np.linalg.norm(found.position[:, :2] - found.position[0, :2], axis=1).max() < 6
 
 
 # --- what a browser shows
