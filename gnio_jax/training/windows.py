@@ -321,9 +321,8 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
             rotate_vectors(turn, windows.steps[:, :, None])[:, :, 0],
         )
     if config.hidden_axes_share:
-        hide_key = jax.random.fold_in(key, 9)
-        imu = hide_axes(hide_key, windows.imu, config.hidden_axes_share)
-        windows = windows._replace(imu=imu)
+        hide_key, share = jax.random.fold_in(key, 9), config.hidden_axes_share
+        windows = windows._replace(imu=hide_axes(hide_key, windows.imu, share))
     if any(config.noise):
         noise = jax.random.normal(noise_key, (*imu.shape[:2], 6), jnp.float32)
         noise = noise * _channels(*config.noise)
@@ -363,7 +362,7 @@ def hide_axes(
 ) -> Float[jax.Array, "b n 12"]:
     """Signals of which a random share has zeros in the place of the body's axes."""
     hidden = jax.random.bernoulli(key, jnp.float32(share), (len(imu), 1, 1))
-    return jnp.where(hidden, on_samples(jnp.zeros_like(imu), lambda _: imu[..., :6]), imu)
+    return jnp.concatenate([imu[..., :6], jnp.where(hidden, 0, imu[..., 6:])], axis=-1)
 
 
 def signals_at_rest(imu: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b n c"]:
