@@ -35,9 +35,14 @@ uncertainty begins to learn, the gradients of the likelihood are so large that t
 displacements have learnt."""
 
 
+OTHER_BLOCKS = ("rep", "fourier", "wavelet")
+"""Blocks of the trunk besides the one that it has by default."""
+
+
 class System(NamedTuple):
-    """A published system that is a network of this package with the main options of its recipe.
-    Its other losses and its regularisation are those of the network's own row."""
+    """A network of this package with other options than its own row: a published system with the
+    main options of its recipe, or a block of the trunk. Its other losses and its regularisation are
+    those of the network's own row."""
 
     network: str
     options: dict[str, Any] = {}
@@ -54,10 +59,11 @@ SYSTEMS = {
     ),
     "rio": System("ronin_resnet", loss={"rotation_weight": 1.0}),
     "bins": System("gnio", {"bank_size": 0, "head": "bins"}, {"name": "bins"}),
+    **{f"trunk_{block}": System("trunk", {"block": block}) for block in OTHER_BLOCKS},
 }
-"""Rows whose names are those of their recipes in configs/baselines. `rio` keeps the normalisation
-over batches at every width (ours): with as many groups as channels, as in a narrow network, group
-normalisation takes the strength of every window away."""
+"""Rows by their names. Those of systems are the names of their recipes in configs/baselines. `rio`
+keeps the normalisation over batches at every width (ours): with as many groups as channels, as in a
+narrow network, group normalisation takes the strength of every window away."""
 
 PUBLISHED = {
     ("oxiod", "seen"): {"tlio": 2.67, "ctin": 2.32, "imot": 1.86, "gnio": 0.74},

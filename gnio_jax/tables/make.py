@@ -28,7 +28,7 @@ from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments, published
 from gnio_jax.tables.cost import device_name
 from gnio_jax.tables.duration import announce
-from gnio_jax.tables.experiments import SYSTEMS, Experiment
+from gnio_jax.tables.experiments import OTHER_BLOCKS, SYSTEMS, Experiment
 from gnio_jax.tables.runs import RowResult, run_row, unfinished_runs
 from gnio_jax.training import loop
 
@@ -140,9 +140,9 @@ def measured_dataset(options: TablesConfig, base: TrainConfig) -> str:
 
 def networks(options: TablesConfig) -> tuple[str, ...]:
     """The networks and systems named by --methods; "all" stands for the networks of this package
-    that predict displacements."""
+    that predict displacements, and the systems."""
     if options.methods == "all":
-        return tuple(filter(_predicts_displacement, NETWORKS))
+        return (*filter(_predicts_displacement, NETWORKS), *SYSTEMS)
     names, rows = _words(options.methods), (*models.names(), *SYSTEMS)
     problems = [f"no network or system '{name}'" for name in names if name not in rows]
     problems = problems or [
@@ -384,7 +384,6 @@ def make_standing(
 
 # --- complexity
 
-BLOCKS = ("rep", "fourier", "wavelet")
 NETWORKS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "imot_text", "gnio")
 NETWORKS += ("ronin_lstm", "ronin_tcn", "gru", "state_space")
 NETWORKS += ("ionet", "ai_imu", "airio", "ionext", "experts", "trunk", "ridi")
@@ -398,7 +397,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "equivariance": "so2_frame_shallow",
     },
     "gnio with bins": {"name": "gnio", "head": "bins"},
-    **{f"trunk of {block}": {"name": "trunk", "block": block} for block in BLOCKS},
+    **{f"trunk of {block}": {"name": "trunk", "block": block} for block in OTHER_BLOCKS},
 }
 """Networks with options, by the names of their rows."""
 PAPERS_COST = {

@@ -13,6 +13,8 @@ from tests.support.known_walk import KNOWN, Term, Walk
 
 G = 9.80665
 EPOCH = 1_495_463_250.0
+FIELD = Rotation.from_euler("z", -1.1).apply([20.0, 0.0, -40.0])
+"""The earth's field in the world of the walk, µT."""
 
 
 def eight(period: float) -> Walk:
@@ -52,7 +54,7 @@ def iphone_columns(time, truth):
     own = Rotation.from_euler("z", 1.1) * truth.walk.attitude(time)
     gravity = -own.inv().apply([0.0, 0.0, 1.0])
     user = -truth.walk.force(time - truth.accel_delay) / G - gravity
-    magnet = own.inv().apply([20.0, 0.0, -40.0])
+    magnet = truth.walk.attitude(time).inv().apply(FIELD)
     angles, gyro = own.as_euler("ZXY")[:, [2, 1, 0]], truth.walk.rate(time) + truth.gyro_bias
     return np.concatenate([angles, gyro, gravity, user, magnet], axis=1)
 
@@ -130,7 +132,7 @@ def write_nexus_raw(folder, number, truth, seconds):
     rows = []
     for kind, first, values in (
         (1, 0, truth.walk.force(time)),
-        (2, 0, np.full((len(time), 3), 20.0)),
+        (2, 0, truth.walk.attitude(time).inv().apply(FIELD)),
         (4, 12, truth.walk.rate(time) + truth.gyro_bias),
     ):
         stamps = np.round((EPOCH + time) * 1e3)

@@ -14,7 +14,7 @@ from gnio_jax.training import loop
 from tests.support import small_tables
 from tests.support.networks import SMALL
 
-METHODS = (*make.networks(TablesConfig("comparison", methods="all")), *experiments.SYSTEMS)
+METHODS = make.networks(TablesConfig("comparison", methods="all"))
 METHOD = experiments.method
 IN_CONFIG = {field.name for field in dataclasses.fields(ModelConfig)}
 

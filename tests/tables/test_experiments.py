@@ -1,6 +1,7 @@
 """What the tables vary, and what they do not."""
 
 import dataclasses
+import typing
 
 import pytest
 
@@ -8,6 +9,7 @@ from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import LossConfig, SegmentTraining, TablesConfig
 from gnio_jax.errors import InputError
+from gnio_jax.models.trunk import Trunk
 from gnio_jax.tables import experiments, make
 from tests.support.reports import BASE
 
@@ -104,7 +106,9 @@ def test_the_search_for_a_width_ends_where_a_network_accepts_none(monkeypatch):
 
 def test_a_system_is_its_network_with_the_main_options_of_its_recipe():
     """Fields that no budget changes."""
-    for name, system in experiments.SYSTEMS.items():
+    published = set(experiments.SYSTEMS) - {f"trunk_{name}" for name in experiments.OTHER_BLOCKS}
+    for name in published:
+        system = experiments.SYSTEMS[name]
         config = experiments.method(name, BASE)
         recipe = configuration.load(f"baselines/{name}")
         assert recipe.model.name == config.model.name == system.network
@@ -119,6 +123,16 @@ def test_a_system_is_its_network_with_the_main_options_of_its_recipe():
         data = dataclasses.replace(BASE.data, window_rotation="single")
         turned_whole = experiments.method(name, dataclasses.replace(BASE, data=data))
         assert turned_whole.data.window_rotation == ("body_axes" if sees_body else "single")
+
+
+def test_every_block_of_the_trunk_has_a_row_with_the_same_loss_and_size():
+    names = ["trunk", *(f"trunk_{block}" for block in experiments.OTHER_BLOCKS)]
+    configs = [experiments.method(name, BASE) for name in names]
+    networks = [models.from_config(config.model) for config in configs]
+    blocks = typing.get_args(typing.get_type_hints(Trunk)["block"])
+    assert sorted(network.block for network in networks) == sorted(blocks)
+    assert {network.width for network in networks} == {networks[0].width}
+    assert {config.loss for config in configs} == {BASE.loss}
 
 
 def test_only_networks_with_memory_learn_on_segments_with_as_many_seconds_in_a_batch():

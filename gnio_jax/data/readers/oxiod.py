@@ -13,7 +13,7 @@ attitude is unusable, and `alignment.align_positions` finds the phone's attitude
 
 `gyro` and `accel` are those of the phone, including their biases. The accelerometer's delay
 relative to the gyro (6 to 22 ms on an iPhone 7 Plus, 44 to 52 ms on an iPhone 5, 2 to 3 ms on a
-Nexus 5) is removed.
+Nexus 5) is removed. The readings of the magnetometer are beside them, in the phone's axes.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ from gnio_jax.data.alignment.positions import align_positions
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.parsing.tables import Table, damage_error, read_text, shorten
+from gnio_jax.data.sensors import MAGNETOMETER, SENSOR_KINDS, usual_size
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_in
 from gnio_jax.numerics import quaternions
-from gnio_jax.types import STANDARD_G, Sequence
+from gnio_jax.types import STANDARD_G, Readings, Sequence
 
 RATE = 100.0
 """Hz."""
@@ -356,11 +357,15 @@ def read_phone(path: Path, kind: str) -> Streams:
         awake = values[:, 3:].any(axis=1)  # the gyro starts some rows after the accelerometer
         rows = _fresh_samples(np.flatnonzero(awake) / RATE, values[awake], path)
         streams = Streams.of_imu("", path, rows.time, rows.values[:, 3:], rows.values[:, :3])
-        return streams._replace(attributes={"imu_compensated": "no"})
-    values = table.take(*_IPHONE[:13])
+        field = table.take(*_NEXUS[7:], gaps=True)[awake][_is_fresh(values[awake])]
+        return streams._replace(
+            attributes={"imu_compensated": "no"}, readings=field_readings(rows.time, field)
+        )
+    values, field = table.take(*_IPHONE[:13]), table.take(*_IPHONE[13:], gaps=True)
     stamps, start = np.arange(len(values)) / RATE, 0.0
     if kind == "raw":  # the stamps are right, but some rows are in the wrong order
-        values = values[np.argsort(values[:, 0], kind="stable")]
+        order = np.argsort(values[:, 0], kind="stable")
+        values, field = values[order], field[order]
         start = float(values[0, 0])
         stamps = values[:, 0] - start
     rows = _fresh_samples(stamps, values[:, 1:], path)
@@ -375,7 +380,26 @@ def read_phone(path: Path, kind: str) -> Streams:
         attributes={"imu_compensated": "CoreMotion's gyro bias"},
         start=start,
         device=rows._replace(values=quaternions(attitude)),
+        readings=field_readings(rows.time, field[_is_fresh(values[:, 1:])]),
     )
+
+
+def field_readings(
+    time: Float[np.ndarray, "n"], field: Float[np.ndarray, "n 3"]
+) -> dict[str, Readings]:
+    """The field (µT) of each row as readings of the magnetometer, without rows that repeat the one
+    before, zeros (CoreMotion's are those before its calibration) and gaps.
+
+    There are none if the strength is not the earth's: on the trolleys CoreMotion has taken the
+    vertical part of the earth's field for the phone's own.
+    """
+    present = np.isfinite(field).all(axis=1) & (field != 0).any(axis=1) & _is_fresh(field)
+    present &= np.concatenate([[True], np.diff(time) > 0])
+    least, most = SENSOR_KINDS[MAGNETOMETER].usual
+    if present.sum() < 2 or not least <= usual_size(MAGNETOMETER, field[present]) <= most:
+        return {}
+    readings = Readings(time[present], field[present], np.full_like(field[present], np.nan))
+    return {MAGNETOMETER: readings}
 
 
 def _nexus_events(table: Table) -> Streams:
@@ -393,7 +417,11 @@ def _nexus_events(table: Table) -> Streams:
         time = restore_clock(stamps[rows] / 1e3 - start, table.path)
         sensors.append(Samples(time, values[rows], str(table.path)))
     gyro, accel = sensors
-    return Streams("", str(table.path), gyro, accel, {"imu_compensated": "no"}, start)
+    rows = np.flatnonzero(kind == 2)
+    rows = rows[np.argsort(stamps[rows], kind="stable")]
+    readings = field_readings(stamps[rows] / 1e3 - start, values[rows])
+    attributes: dict[str, str | float] = {"imu_compensated": "no"}
+    return Streams("", str(table.path), gyro, accel, attributes, start, readings=readings)
 
 
 def _read_table(path: Path, *layouts: list[str]) -> Table:

@@ -55,6 +55,11 @@ def compare(sequence, truth, time):
     yaw = a["extrinsic_yaw_degrees"] - truth.extrinsic.as_euler("ZXY", degrees=True)[0]
     assert (yaw + 180) % 360 - 180 == pytest.approx(0, abs=0.5)
     assert self_check(sequence).failures == ()
+    # The field is in the phone's axes, on its clock.
+    field, start = sequence.readings["magnetometer"], time[0] - sequence.time[0]
+    expected = walk.attitude(field.time + start).inv().apply(files.FIELD)
+    assert len(field.time) > 0.95 * len(time) and np.isnan(field.std).all()
+    np.testing.assert_allclose(field.values, expected, atol=1.0)
 
 
 def check_delay(tmp_path, sequence, truth, kind):
@@ -116,6 +121,21 @@ def test_nexus_events_come_back(tmp_path):
     assert sequence.device_orientation is None
     assert sequence.attributes["device"] == "nexus 5"
     assert sequence.attributes["imu_compensated"] == "no"
+
+
+def test_readings_of_a_field_leave_out_zeros_gaps_and_repeats_and_what_is_not_the_earths():
+    time, turn = np.arange(8) * 0.01, np.linspace(0, 1, 8)
+    field = 20 * np.stack([np.cos(turn), np.sin(turn), -2 * np.ones(8)], axis=1)
+    dirty = field.copy()
+    dirty[0], dirty[3], dirty[5, 1] = 0.0, dirty[2], np.nan
+    readings = oxiod.field_readings(np.where(np.arange(8) == 7, 0.06, time), dirty)
+    time, values, std = readings["magnetometer"]
+    np.testing.assert_array_equal(time, [0.01, 0.02, 0.04, 0.06])
+    np.testing.assert_array_equal(values, field[[1, 2, 4, 6]])
+    assert std.shape == values.shape and np.isnan(std).all()
+    # A trolley's: the vertical part is missing.
+    assert oxiod.field_readings(np.arange(8.0), field * [0.7, 0.7, 0.05]) == {}
+    assert oxiod.field_readings(np.arange(8.0), np.zeros((8, 3))) == {}
 
 
 def refused(tmp_path):
