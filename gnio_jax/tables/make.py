@@ -139,10 +139,11 @@ def measured_dataset(options: TablesConfig, base: TrainConfig) -> str:
 
 
 def networks(options: TablesConfig) -> tuple[str, ...]:
-    """The networks and systems named by --methods; "all" stands for the networks of this package
-    that predict displacements, and the systems."""
+    """The networks and systems named by --methods; "all" stands for GNIO, with which the others are
+    compared, the other networks of this package that predict displacements, and the systems."""
     if options.methods == "all":
-        return (*filter(_predicts_displacement, NETWORKS), *SYSTEMS)
+        others = (name for name in NETWORKS if name != "gnio" and _predicts_displacement(name))
+        return ("gnio", *others, *SYSTEMS)
     names, rows = _words(options.methods), (*models.names(), *SYSTEMS)
     problems = [f"no network or system '{name}'" for name in names if name not in rows]
     problems = problems or [
