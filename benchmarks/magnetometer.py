@@ -17,7 +17,6 @@ a smaller error with it. A walk without readings is left out.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import fnmatch
 
 import jax
@@ -27,11 +26,11 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402
 
 from gnio_jax import data, filtering, networks  # noqa: E402
-from gnio_jax.apps.sensors import LARGEST_MISFIT, LEAST_ACCEPTED, LEAST_BIAS, RAW_BIAS  # noqa: E402
+from gnio_jax.apps import sensors  # noqa: E402
 from gnio_jax.data.sensors import MAGNETOMETER  # noqa: E402
+from gnio_jax.errors import InputError  # noqa: E402
 from gnio_jax.evaluation import SequenceEstimate, estimate, metrics, prepare  # noqa: E402
 from gnio_jax.models import Network  # noqa: E402
-from gnio_jax.numerics import matrix_from_quaternion  # noqa: E402
 from gnio_jax.types import Sequence  # noqa: E402
 
 METRICS = ("yaw_rmse", "ate_2d")
@@ -47,33 +46,17 @@ def estimate_both(
     ekf = filtering.make_filter(windows, trained.config.filter)
     ready, _ = prepare(walks, windows, ekf, init="static", gyro_bias="rest", from_first=True)
     without = estimate(ready, network, windows, ekf, 8)
-    readings = {walk.name: walk.readings[MAGNETOMETER] for walk in walks}
-    rows, misfits = [], []
-    considered = ekf.considered or filtering.ConsideredStd()
-    for walk, path in zip(ready, without, strict=True):
-        field, start = readings[walk.name], walk.start
-        bias_std = np.hypot(float(start.std.gyro_bias), float(considered.gyro_bias))
-        fit = filtering.fit_field(
-            field.time,
-            field.values,
-            matrix_from_quaternion(path.trajectory.orientation[1:]),
-            ekf.config,
-            walk.time[0],
-            bias_std=RAW_BIAS if start.raw_gyro else bias_std,
-        )
-        std = start.std._replace(gyro_bias=max(fit.gyro_bias_std, LEAST_BIAS))
-        start = start._replace(gyro_bias=start.gyro_bias + fit.gyro_bias, std=std, raw_gyro=False)
-        rows.append(walk._replace(start=start, measurements=(fit.rows,)))
-        misfits.append(fit.misfit)
-    considered = considered._replace(gyro_bias=0.0, raw_gyro_bias=0.0)  # the filter estimates it
-    ekf = dataclasses.replace(ekf, considered=considered if any(considered) else None)
-    with_field = estimate(rows, network, windows, ekf, 8)
-    usable = [
-        misfit <= LARGEST_MISFIT and share_used(path) >= LEAST_ACCEPTED
-        for path, misfit in zip(with_field, misfits, strict=True)
-    ]
-    paths = zip(without, with_field, usable, strict=True)
-    return without, [second if good else first for first, second, good in paths]
+    readings, rows = {walk.name: walk.readings[MAGNETOMETER] for walk in walks}, []
+    for recording, path in zip(ready, without, strict=True):
+        try:
+            field = sensors.fit_magnetometer(readings[recording.name], path, recording, ekf)
+        except InputError as error:
+            print(f"left out: {recording.name}: {error}")
+        else:
+            rows.append(recording._replace(start=field.start, measurements=(field.rows,)))
+    runs = estimate(rows, network, windows, sensors.without_considered_bias(ekf), 8)
+    kept = {run.name: run for run in runs if share_used(run) >= sensors.LEAST_ACCEPTED}
+    return without, [kept.get(path.name, path) for path in without]
 
 
 def share_used(path: SequenceEstimate) -> float:

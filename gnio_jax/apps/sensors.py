@@ -140,12 +140,14 @@ def fuse(
         fits |= _try(refused, BAROMETER, lambda: _heights(readings[BAROMETER], ready, ekf))
     if MAGNETOMETER in readings:
         field = _try(
-            refused, MAGNETOMETER, lambda: _field(readings[MAGNETOMETER], first, ready, ekf)
+            refused,
+            MAGNETOMETER,
+            lambda: fit_magnetometer(readings[MAGNETOMETER], first, ready, ekf),
         ).get(MAGNETOMETER)
         if field is not None:
             fits[MAGNETOMETER] = field.rows
             start = ready._replace(start=field.start)
-            by_field = bare._replace(ready=start, ekf=_without_bias(ekf))
+            by_field = bare._replace(ready=start, ekf=without_considered_bias(ekf))
     without_fixes, sensors = bare, tuple[str, ...]()
     while True:
         fits = {sensor: rows for sensor, rows in fits.items() if sensor not in refused}
@@ -250,16 +252,18 @@ def _heights(readings: Readings, ready: PreparedRecording, ekf: Filter) -> Measu
     return barometer_on_intervals(readings.time, pressure, ready.strides, ekf.config, start)
 
 
-class _Field(NamedTuple):
+class FieldStart(NamedTuple):
     """The rows of a magnetometer, and the start with the bias of the gyro that it shows."""
 
     rows: Magnetometer
     start: Start
 
 
-def _field(
+def fit_magnetometer(
     readings: Readings, first: SequenceEstimate, ready: PreparedRecording, ekf: Filter
-) -> _Field:
+) -> FieldStart:
+    """The field along the path of the run without it, and the start with the bias of the gyro that
+    it shows. Raises `InputError` if the readings are not those of the earth's field."""
     last = _last_row(first)
     rotation = matrix_from_quaternion(first.trajectory.orientation[1:])
     rotation[last:] = rotation[last - 1]
@@ -272,7 +276,7 @@ def _field(
     start = ready.start
     std = start.std._replace(gyro_bias=max(fit.gyro_bias_std, LEAST_BIAS))
     start = start._replace(gyro_bias=start.gyro_bias + fit.gyro_bias, std=std, raw_gyro=False)
-    return _Field(fit.rows, start)
+    return FieldStart(fit.rows, start)
 
 
 def _bias_std(ready: PreparedRecording, ekf: Filter) -> float:
@@ -283,7 +287,7 @@ def _bias_std(ready: PreparedRecording, ekf: Filter) -> float:
     return math.hypot(float(ready.start.std.gyro_bias), float(considered.gyro_bias), of_raw)
 
 
-def _without_bias(ekf: Filter, **zeros: float) -> Filter:
+def without_considered_bias(ekf: Filter, **zeros: float) -> Filter:
     """The filter without the considered error of the gyro's bias, which it estimates."""
     if ekf.considered is None:
         return ekf
@@ -411,7 +415,7 @@ def _for_fixes(ekf: Filter) -> Filter:
     least = max(ekf.config.log_std_min, math.log(DISPLACEMENT_STD * seconds))
     config = dataclasses.replace(ekf.config, log_std_min=least)
     ekf = dataclasses.replace(ekf, config=config, noise=noise)
-    return _without_bias(ekf, scale=0.0, heading=0.0)
+    return without_considered_bias(ekf, scale=0.0, heading=0.0)
 
 
 def _last_row(estimate: SequenceEstimate) -> int:

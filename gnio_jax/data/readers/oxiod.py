@@ -390,8 +390,8 @@ def field_readings(
     """The field (µT) of each row as readings of the magnetometer, without rows that repeat the one
     before, zeros (CoreMotion's are those before its calibration) and gaps.
 
-    There are none if the strength is not the earth's: on a trolley CoreMotion has taken the vertical
-    part of the earth's field for the phone's own.
+    There are none if the strength is not the earth's: on a trolley CoreMotion has taken the
+    vertical part of the earth's field for the phone's own.
     """
     present = np.isfinite(field).all(axis=1) & (field != 0).any(axis=1) & _is_fresh(field)
     present &= np.concatenate([[True], np.diff(time) > 0])
