@@ -116,7 +116,9 @@ class Corrected(nn.Module):
     samples, or only their first six channels.
 
     The parameters of the network keep their names. The diagnostics have the corrected samples and
-    their variances, from which `preintegration_loss` learns.
+    their variances, from which the corrector learns by `preintegration_loss` alone, as published:
+    no gradient of the network's losses reaches it. They would make it another encoder, whose
+    samples are no longer those of an IMU (docs/results/networks.md has figures).
     """
 
     network: nn.Module
@@ -135,7 +137,8 @@ class Corrected(nn.Module):
         body = jnp.einsum("bnij,bnki->bnkj", rotation, vectors).reshape(*shape[:2], 6)
         corrections = self.corrector(body, train)
         body = body + corrections.imu
-        imu = jnp.einsum("bnij,bnkj->bnki", rotation, body.reshape(*shape[:2], 2, 3))
+        seen = jax.lax.stop_gradient(body).reshape(*shape[:2], 2, 3)
+        imu = jnp.einsum("bnij,bnkj->bnki", rotation, seen)
         imu = imu.reshape(*shape[:2], 6)
         if getattr(self.network, "channels", 6) == 12:
             imu = jnp.concatenate([imu, windows[..., 6:]], axis=-1)

@@ -41,21 +41,32 @@ OTHER_BLOCKS = ("rep", "fourier", "wavelet")
 
 class System(NamedTuple):
     """A network of this package with other options than its own row: a published system with the
-    main options of its recipe, or a block of the trunk. Its other losses and its regularisation are
-    those of the network's own row."""
+    main options of its recipe, or a block of the trunk. Everything else is as in the network's own
+    row."""
 
     network: str
     options: dict[str, Any] = {}
     """Fields of the model."""
     loss: dict[str, Any] = {}
     """Fields of the loss that differ from the network's."""
+    regularisation: dict[str, float] = {}
+    """Fields of the optimizer that differ from the network's."""
 
 
 SYSTEMS = {
     "eqnio_tlio": System("tlio", {"equivariance": "o2_frame"}),
     "eqnio_ronin": System("ronin_resnet", {"equivariance": "o2_frame"}),
     "airimu": System(
-        "tlio", {"equivariance": "none", "corrector": "airimu"}, {"preintegration_weight": 1e-3}
+        "tlio",
+        {"equivariance": "none", "corrector": "airimu"},
+        {
+            "mse_weight": 1.0,
+            "nll_weight": 1e-2,
+            "preintegration_weight": 1.0,
+            "log_std_from_epoch": 0.0,
+            "log_std_floor": None,
+        },
+        {"clip_norm": 1.0, "weight_decay": 1e-4},
     ),
     "rio": System("ronin_resnet", loss={"rotation_weight": 1.0}),
     "bins": System("gnio", {"bank_size": 0, "head": "bins"}, {"name": "bins"}),
@@ -122,7 +133,7 @@ def method(name: str, base: TrainConfig) -> TrainConfig:
     the segments of `base`, if there are any, in batches with as many seconds of walks. Losses
     differ, so every row's checkpoint is the one with the smallest squared error on the
     validation split."""
-    network, options, other_loss = SYSTEMS.get(name, System(name))
+    network, options, other_loss, other_regularisation = SYSTEMS.get(name, System(name))
     equivariance = {
         option: getattr(base.model, option)
         for option in ("equivariance", *models.frame_options(base.model.equivariance))
@@ -133,7 +144,7 @@ def method(name: str, base: TrainConfig) -> TrainConfig:
         )
     size = scaled_size(("width", "particles"), base, name=network)
     model = ModelConfig(name=network, **equivariance, **size, **options)
-    regularisation = REGULARISATION.get(network, {})
+    regularisation = {**REGULARISATION.get(network, {}), **other_regularisation}
     optim = dataclasses.replace(base.optim, best_by="squared_error", **regularisation)
     network_loss = dataclasses.replace(loss(network, base), **other_loss)
     config = dataclasses.replace(base, model=model, loss=network_loss, optim=optim)

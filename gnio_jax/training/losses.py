@@ -86,7 +86,7 @@ def losses(
 
     Raises:
         InputError: The loss needs more than the network predicts (e.g. a velocity for every
-            sample).
+            sample), or the network has a corrector, which learns from nothing in this loss.
     """
     vectors = (prediction.displacement, prediction.log_std, windows.displacement)
     chex.assert_equal_shape(vectors)
@@ -111,8 +111,12 @@ def losses(
     if "router" in prediction.diagnostics:
         balance = network_losses.balance(prediction.diagnostics["router"])
         total = total + config.balance_weight * balance
+    has_corrector = "corrected" in prediction.diagnostics
+    if has_corrector and not config.preintegration_weight:
+        problem = "is 0, and a corrector learns from the preintegration alone"
+        raise InputError("loss.preintegration_weight", problem, "set it to 1")
     if config.preintegration_weight:
-        if "corrected" not in prediction.diagnostics:
+        if not has_corrector:
             problem = "needs a network with a corrector, e.g. model.corrector: airimu"
             raise InputError("loss.preintegration_weight", problem, "or set it to 0")
         corrected = preintegration_loss(prediction, windows.imu, windows.steps, dt)

@@ -127,6 +127,34 @@ def test_the_loss_is_small_for_true_samples_and_has_a_gradient_for_every_paramet
         assert np.isfinite(leaf).all() and np.abs(leaf).max() > 1e-9, path
 
 
+def test_a_corrector_learns_from_the_preintegration_alone():
+    """The network's losses have a gradient for every parameter of the network and for none of the
+    corrector, and without the preintegration the corrector would never learn."""
+    dt, samples = 0.01, 40
+    windows = windows_of(np.cumsum(RNG.normal(0, 0.05, (samples, 6)), axis=0), dt)
+    model = models.create("ionet", width=3, corrector="airimu")
+    variables = drawn(models.variable_shapes(model, samples))
+
+    def gradient(config):
+        stage = loss_stage(config, 0, 1)
+
+        def loss(params):
+            said = model.apply({**variables, "params": params}, windows.imu)
+            return losses(said, windows, config, stage, 2, dt).total
+
+        return quick(jax.grad(loss))(variables["params"])
+
+    alone, both = (
+        gradient(LossConfig(mse_weight=weight, nll_weight=0.0, preintegration_weight=1.0))
+        for weight in (0.0, 1.0)
+    )
+    jax.tree.map(np.testing.assert_array_equal, alone["corrector"], both["corrector"])
+    of_network = {name: leaf for name, leaf in both.items() if name != "corrector"}
+    assert any(np.abs(leaf).max() > 1e-6 for leaf in jax.tree.leaves(of_network))
+    with pytest.raises(InputError, match="is 0, and a corrector learns from the preintegration"):
+        gradient(LossConfig(mse_weight=1.0))
+
+
 def test_the_loss_needs_a_target():
     config = LossConfig(preintegration_weight=1.0)
     stage = loss_stage(config, 0, 1)

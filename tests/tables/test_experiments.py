@@ -116,6 +116,8 @@ def test_a_system_is_its_network_with_the_main_options_of_its_recipe():
             assert getattr(config.model, field) == getattr(recipe.model, field)
         for field in system.loss:
             assert getattr(config.loss, field) == getattr(recipe.loss, field)
+        for field in system.regularisation:
+            assert getattr(config.optim, field) == getattr(recipe.optim, field)
         sees_body = config.data.window_rotation == "body_axes"
         assert sees_body == (config.model.corrector == "airimu")
         of_heading = experiments.method(name, configuration.load("pedestrian_windows"))
