@@ -391,7 +391,7 @@ class LossConfig:
     balance_weight: Annotated[NonNegative, FILE_ONLY] = 0.01
     """Weight of the balance between experts, for networks with a router (ours)."""
     preintegration_weight: Annotated[NonNegative, FILE_ONLY] = 0.0
-    """Weight of the preintegration loss of a corrector (AirIMU: 1, and 0 for the other weights)."""
+    """Weight of the preintegration loss, from which a corrector learns (AirIMU: 1)."""
     outlier_sigmas: Annotated[Positive | None, FILE_ONLY] = None
     """Standard deviations beyond which the likelihood of an error grows only with its logarithm
     (ours, e.g. 10); none by default, as in the paper."""
@@ -771,6 +771,9 @@ class TrainConfig:
         if self.filter.corrector is not None:
             problem = "is not for training through the filter, which has no variances of samples"
             location.child("filter.corrector").refuse(problem, "train first, and set it after that")
+        if self.model.corrector != "none":
+            problem = "learns from its preintegration, and not through the filter"
+            location.child("model.corrector").refuse(problem, "set it to none")
         input_seconds = self.data.context_seconds + self.data.window_seconds
         if through.piece_seconds < input_seconds + 2 * self.data.stride_seconds:
             problem = f"must be longer than the {input_seconds:g} s that the network sees"

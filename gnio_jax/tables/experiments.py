@@ -39,6 +39,11 @@ OTHER_BLOCKS = ("rep", "fourier", "wavelet")
 """Blocks of the trunk besides the one that it has by default."""
 
 
+UNMOVED: dict[str, Any] = {"tilt_degrees": 0.0, "rocking_share": 0.0, "vertical_gain": (1.0, 1.0)}
+"""Random changes that alter the samples and not the motion that they measure. A corrector, which
+learns from this motion, would learn to undo them."""
+
+
 class System(NamedTuple):
     """A network of this package with other options than its own row: a published system with the
     main options of its recipe, or a block of the trunk. Everything else is as in the network's own
@@ -127,12 +132,12 @@ class Experiment(NamedTuple):
 
 def method(name: str, base: TrainConfig) -> TrainConfig:
     """`base` with another network or one of `SYSTEMS`, its loss and regularisation: the same
-    recordings, augmentation, equivariance unless the system has its own, batches, epochs and
-    learning rate. A network that sees the body has its axes in its windows, and no other has them.
-    The filter measures the velocity of a network that predicts it. A network with memory learns on
-    the segments of `base`, if there are any, in batches with as many seconds of walks. Losses
-    differ, so every row's checkpoint is the one with the smallest squared error on the
-    validation split."""
+    recordings, augmentation (but for `UNMOVED` with a corrector), equivariance unless the system
+    has its own, batches, epochs and learning rate. A network that sees the body has its axes in its
+    windows, and no other has them. The filter measures the velocity of a network that predicts it.
+    A network with memory learns on the segments of `base`, if there are any, in batches with as
+    many seconds of walks. Losses differ, so every row's checkpoint is the one with the smallest
+    squared error on the validation split."""
     network, options, other_loss, other_regularisation = SYSTEMS.get(name, System(name))
     equivariance = {
         option: getattr(base.model, option)
@@ -160,6 +165,9 @@ def method(name: str, base: TrainConfig) -> TrainConfig:
             optim, batch_size=max(round(seconds / base.segments.seconds), 1)
         )
         config = dataclasses.replace(config, optim=optim)
+    if model.corrector != "none":
+        changes = dataclasses.replace(config.augment, **UNMOVED)
+        config = dataclasses.replace(config, augment=changes)
     sees_body = models.channels(built) == 12
     if sees_body != (base.data.window_rotation == "body_axes"):
         rotation = "body_axes" if sees_body else DataConfig().window_rotation

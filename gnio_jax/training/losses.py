@@ -114,7 +114,11 @@ def losses(
     has_corrector = "corrected" in prediction.diagnostics
     if has_corrector and not config.preintegration_weight:
         problem = "is 0, and a corrector learns from the preintegration alone"
-        raise InputError("loss.preintegration_weight", problem, "set it to 1")
+        raise InputError(
+            "loss.preintegration_weight",
+            problem,
+            "set it to 1, or name a trained one in filter.corrector",
+        )
     if config.preintegration_weight:
         if not has_corrector:
             problem = "needs a network with a corrector, e.g. model.corrector: airimu"

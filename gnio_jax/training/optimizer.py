@@ -130,11 +130,12 @@ def schedule(config: OptimConfig, steps_per_epoch: int, scale: float = 1.0) -> o
 
 
 def adam(
-    config: OptimConfig, loss: LossConfig, steps_per_epoch: int
+    config: OptimConfig, loss: LossConfig, steps_per_epoch: int, corrector: bool = False
 ) -> optax.GradientTransformationExtraArgs:
     """Adam's direction, β = (0.9, 0.999): an update is −(learning rate) times it. Before that, if
-    the settings ask for it, the gradient's global norm is clipped and weight decay is added.
-    `update` takes `log_std_learns` (see `losses.Stage`).
+    the settings ask for it, the gradient's global norm is clipped and weight decay is added. A
+    corrector has a loss and a norm of its own. `update` takes `log_std_learns` (see
+    `losses.Stage`).
 
     If the uncertainty is held fixed at first, it has a state of its own that does not count those
     steps, as PyTorch's Adam does not count steps without a gradient. A common state would count the
@@ -153,7 +154,11 @@ def adam(
     if config.weight_decay:
         parts.insert(0, optax.add_decayed_weights(config.weight_decay))
     if config.clip_norm is not None:
-        parts.insert(0, optax.clip_by_global_norm(config.clip_norm))
+        clip = optax.clip_by_global_norm(config.clip_norm)
+        if corrector:
+            labels = _by_path(lambda path: path[1].key == "corrector")
+            clip = optax.partition({True: clip, False: clip}, labels)
+        parts.insert(0, clip)
     return optax.with_extra_args_support(optax.chain(*parts))
 
 
@@ -162,7 +167,8 @@ def create(config: TrainConfig, steps_per_epoch: int) -> optax.GradientTransform
     training through the filter another one for the filter's numbers, without weight decay. Each
     gradient is clipped separately."""
     if not config.through_filter.learn:
-        return adam(config.optim, config.loss, steps_per_epoch)
+        corrector = config.model.corrector != "none"
+        return adam(config.optim, config.loss, steps_per_epoch, corrector)
     optimizers = {
         "params": adam(config.optim, LossConfig(), 1),
         "filter": adam(dataclasses.replace(config.optim, weight_decay=0.0), LossConfig(), 1),

@@ -65,6 +65,13 @@ class WindowTask(Task):
             f"{parallel.describe()}, {steps} steps of {optim.batch_size} windows an epoch, "
             f"{optim.epochs} epochs → {workdir}"
         )
+        changes = self.config.augment
+        moved = changes.tilt_degrees or changes.rocking_share or changes.vertical_gain != (1, 1)
+        if self.config.model.corrector != "none" and moved:
+            yield (
+                "warning: augment.tilt_degrees, rocking_share and vertical_gain change samples and "
+                "not their motion, from which a corrector learns; set them to 0, 0 and [1, 1]"
+            )
         total = optim.epochs * steps
         parts = ("the likelihood counts", "nll"), ("the uncertainty learns", "log_std")
         for (what, field), step in zip(parts, self.changes, strict=True):

@@ -116,8 +116,6 @@ def test_a_system_is_its_network_with_the_main_options_of_its_recipe():
             assert getattr(config.model, field) == getattr(recipe.model, field)
         for field in system.loss:
             assert getattr(config.loss, field) == getattr(recipe.loss, field)
-        for field in system.regularisation:
-            assert getattr(config.optim, field) == getattr(recipe.optim, field)
         sees_body = config.data.window_rotation == "body_axes"
         assert sees_body == (config.model.corrector == "airimu")
         of_heading = experiments.method(name, configuration.load("pedestrian_windows"))
@@ -125,6 +123,23 @@ def test_a_system_is_its_network_with_the_main_options_of_its_recipe():
         data = dataclasses.replace(BASE.data, window_rotation="single")
         turned_whole = experiments.method(name, dataclasses.replace(BASE, data=data))
         assert turned_whole.data.window_rotation == ("body_axes" if sees_body else "single")
+
+
+def test_a_corrector_has_all_losses_of_its_recipe_and_true_motions_to_learn_from():
+    recipe = configuration.load("baselines/airimu")
+    for name in ("tables/networks_walks", "tables/networks_oxiod"):
+        base = configuration.load(name)
+        config = experiments.method("airimu", base)
+        bound = dataclasses.replace(recipe.loss, outlier_sigmas=base.loss.outlier_sigmas)
+        assert config.loss == bound
+        assert config.optim.clip_norm == recipe.optim.clip_norm
+        assert config.optim.weight_decay == recipe.optim.weight_decay
+        changes = config.augment
+        assert changes.tilt_degrees == 0 and changes.rocking_share == 0
+        assert changes.vertical_gain == (1, 1)
+        assert changes.mirror_share == base.augment.mirror_share
+        assert base.augment.tilt_degrees > 0
+        configuration.validate(config, name)
 
 
 def test_every_block_of_the_trunk_has_a_row_with_the_same_loss_and_size():

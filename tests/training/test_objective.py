@@ -214,6 +214,24 @@ def test_no_decay_after_the_warm_up_and_no_rise_below_the_end_of_the_cosine():
     assert (np.diff(rates) > -1e-12).all()
 
 
+def test_the_gradient_of_a_corrector_is_clipped_by_its_own_norm():
+    """Adam's first moment after one step is a tenth of the clipped gradient."""
+    gradient = {"encoder": [0.3, 0.4], "head": [0.0, 1.2], "corrector": [30.0, 40.0]}
+    tree = {"params": {name: {"w": jnp.float32(g)} for name, g in gradient.items()}}
+    for corrector in (True, False):
+        config = OptimConfig(clip_norm=1.0, weight_decay=0.0)
+        adam = optimizer.adam(config, LossConfig(), 3, corrector)
+        learns = jnp.bool_(True)
+        _, state = adam.update(tree, adam.init(tree), tree, log_std_learns=learns)
+        moments = optax.tree.get(state, "mu")["params"]
+        norm = np.hypot(0.5, 1.2)  # 1.3
+        whole = np.hypot(norm, 50.0)
+        for name, value in gradient.items():
+            own = 50.0 if name == "corrector" else norm
+            expected = 0.1 * np.array(value) / (own if corrector else whole)
+            np.testing.assert_allclose(moments[name]["w"], expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     "clip, decay, loss",
     [

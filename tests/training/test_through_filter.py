@@ -522,6 +522,10 @@ def test_mistakes(recording, tmp_path):
             {"filter": dataclasses.replace(OPTIONS, mahalanobis_fail_scale=10.0)},
             r"'filter.mahalanobis_fail_scale' makes no sense beside the soft gate",
         ),
+        (
+            {"model": ModelConfig(name="ionet", width=3, corrector="airimu")},
+            r"'model.corrector' learns from its preintegration, and not through the filter",
+        ),
         ({"optim": OptimConfig(batch_size=64)}, "is 64, but there are only 10 segments"),
     ):
         with pytest.raises(InputError, match=expected):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import models, parallel
-from gnio_jax.config import TrainConfig
+from gnio_jax.config import AugmentConfig, ModelConfig, TrainConfig
 from gnio_jax.models.heads import CalibratedUncertainty
 from gnio_jax.reporting import Silence
 from gnio_jax.training import task, window_task, windows
@@ -30,6 +31,25 @@ def training(recording):
         given = config(recording, "")
         found, recordings = set_up(WindowTask, given, Silence())
         return found, recordings, drawn_state(found.model, given, found.steps_per_epoch)
+
+
+@pytest.mark.parametrize(
+    "change, warned",
+    [
+        ({}, True),
+        ({"tilt_degrees": 0.0}, False),
+        ({"rocking_share": 0.1, "tilt_degrees": 0.0}, True),
+    ],
+)
+@pytest.mark.parametrize("corrector", ["airimu", "none"])
+def test_changes_that_are_no_motion_are_not_for_a_corrector(change, warned, corrector):
+    """Tilted by default."""
+    model = ModelConfig(name="ionet", width=3, corrector=corrector)
+    given = TrainConfig(model=model, augment=AugmentConfig(**change))
+    state = TrainState(jnp.int32(0), {"params": {"head": np.zeros(3)}}, None)
+    lines = list(WindowTask(Tiny(), given, 7).description(state, Path("run")))
+    says = any("from which a corrector learns" in line for line in lines)
+    assert says == (warned and corrector == "airimu")
 
 
 def test_steps_and_validation_are_compiled_once(training):
