@@ -137,8 +137,8 @@ class Corrected(nn.Module):
         body = jnp.einsum("bnij,bnki->bnkj", rotation, vectors).reshape(*shape[:2], 6)
         corrections = self.corrector(body, train)
         body = body + corrections.imu
-        seen = jax.lax.stop_gradient(body).reshape(*shape[:2], 2, 3)
-        imu = jnp.einsum("bnij,bnkj->bnki", rotation, seen)
+        vectors = jax.lax.stop_gradient(body).reshape(*shape[:2], 2, 3)
+        imu = jnp.einsum("bnij,bnkj->bnki", rotation, vectors)
         imu = imu.reshape(*shape[:2], 6)
         if getattr(self.network, "channels", 6) == 12:
             imu = jnp.concatenate([imu, windows[..., 6:]], axis=-1)
