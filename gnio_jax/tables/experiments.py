@@ -18,6 +18,7 @@ from gnio_jax.config import (
 from gnio_jax.errors import InputError
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.memory import NetworkWithMemory
+from gnio_jax.training.windows import NO_MOTION
 
 METHODS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "gnio")
 """The networks of table II, and RoNIN's, which it leaves out."""
@@ -37,11 +38,6 @@ displacements have learnt."""
 
 OTHER_BLOCKS = ("rep", "fourier", "wavelet")
 """Blocks of the trunk besides the one that it has by default."""
-
-
-UNMOVED: dict[str, Any] = {"tilt_degrees": 0.0, "rocking_share": 0.0, "vertical_gain": (1.0, 1.0)}
-"""Random changes that alter the samples and not the motion that they measure. A corrector, which
-learns from this motion, would learn to undo them."""
 
 
 class System(NamedTuple):
@@ -132,7 +128,7 @@ class Experiment(NamedTuple):
 
 def method(name: str, base: TrainConfig) -> TrainConfig:
     """`base` with another network or one of `SYSTEMS`, its loss and regularisation: the same
-    recordings, augmentation (but for `UNMOVED` with a corrector), equivariance unless the system
+    recordings, augmentation (but `NO_MOTION` with a corrector), equivariance unless the system
     has its own, batches, epochs and learning rate. A network that sees the body has its axes in its
     windows, and no other has them. The filter measures the velocity of a network that predicts it.
     A network with memory learns on the segments of `base`, if there are any, in batches with as
@@ -166,7 +162,7 @@ def method(name: str, base: TrainConfig) -> TrainConfig:
         )
         config = dataclasses.replace(config, optim=optim)
     if model.corrector != "none":
-        changes = dataclasses.replace(config.augment, **UNMOVED)
+        changes = dataclasses.replace(config.augment, **NO_MOTION)
         config = dataclasses.replace(config, augment=changes)
     sees_body = models.channels(built) == 12
     if sees_body != (base.data.window_rotation == "body_axes"):

@@ -26,6 +26,7 @@ from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
 from gnio_jax.training.network_losses import rotation_consistency
 from gnio_jax.training.task import BatchLosses, Row, Task, TrainState
 from gnio_jax.training.windows import (
+    NO_MOTION,
     WindowSource,
     augment,
     gather,
@@ -66,8 +67,9 @@ class WindowTask(Task):
             f"{optim.epochs} epochs → {workdir}"
         )
         changes = self.config.augment
-        moved = changes.tilt_degrees or changes.rocking_share or changes.vertical_gain != (1, 1)
-        if self.config.model.corrector != "none" and moved:
+        if self.config.model.corrector != "none" and any(
+            getattr(changes, name) != without for name, without in NO_MOTION.items()
+        ):
             yield (
                 "warning: augment.tilt_degrees, rocking_share and vertical_gain change samples and "
                 "not their motion, from which a corrector learns; set them to 0, 0 and [1, 1]"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -34,6 +35,11 @@ from gnio_jax.windows import (
 
 STRONGEST_ROCKING = 1.25
 """Largest factor of `random_rocking`."""
+NO_MOTION = MappingProxyType(
+    {"tilt_degrees": 0.0, "rocking_share": 0.0, "vertical_gain": (1.0, 1.0)}
+)
+"""The random changes that alter the samples and not the motion that they measure, switched off. A
+corrector, which learns from this motion, would learn to undo them."""
 
 
 class WindowSource(NamedTuple):
