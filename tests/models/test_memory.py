@@ -16,6 +16,7 @@ from gnio_jax.models import Network
 from gnio_jax.models.memory import turned_heading
 from gnio_jax.models.state_space import decimate, linear_recurrence
 from gnio_jax.types import Memory
+from tests.support.comparing import assert_close
 from tests.support.compiling import quick
 from tests.support.networks import SMALL, drawn
 
@@ -106,8 +107,7 @@ def test_windows_begin_with_an_empty_memory(name):
     windows = in_frame(*signals, 0.4).reshape(5, -1, 6)
     rows = jax.device_get(quick(net.apply)(net.variables, jnp.asarray(windows, jnp.float32)))
     for row, window in zip(rows.displacement, windows, strict=True):
-        expected = whole(net, window).displacement[0, -1]
-        np.testing.assert_allclose(row, expected, atol=1e-5, rtol=1e-5)
+        assert_close(row, whole(net, window).displacement[0, -1], 1e-5)
 
 
 def test_the_frame_turns_with_the_attitude_that_the_filter_corrects():
@@ -128,7 +128,7 @@ def test_the_frame_turns_with_the_attitude_that_the_filter_corrects():
     _, turned = stepwise(net, gyro, accel, turn @ attitude)
     for k, (plain, corrected, other) in enumerate(zip(rows, after, turned, strict=True)):
         for x in (corrected, other):
-            np.testing.assert_allclose(x[0].displacement, plain[0].displacement, atol=1e-5)
+            assert_close(x[0].displacement, plain[0].displacement, 1e-5)
         before = np.append(plain[1], 0)
         np.testing.assert_allclose(np.append(other[1], 0), turn @ before, atol=1e-12)
         expected = turn @ before if k >= 12 else before
@@ -205,7 +205,7 @@ def test_four_memories_are_the_mean_over_four_headings(name, options):
         return model.apply(ready.variables, start, signals, N, method="advance")[1]
 
     prediction = jax.device_get(quick(run)(jnp.asarray(np.stack(walks))))
-    np.testing.assert_allclose(prediction.displacement, means, atol=2e-6)
+    assert_close(prediction.displacement, means, 2e-6)
     np.testing.assert_allclose(np.exp(2 * prediction.log_std), variances, rtol=1e-4)
     for row, diagnostics in enumerate(at_zero):
         for name, value in diagnostics.items():
@@ -269,12 +269,11 @@ def test_the_heading_of_the_device_is_seen_beside_the_samples(name):
     _, without = stepwise(net, gyro, accel, attitude, np.zeros((2, 3)))
     for k in range(INTERVALS):
         for prediction, whole_prediction in ((rows, expected), (without, hidden)):
-            row = whole_prediction.displacement[0, k]
-            np.testing.assert_allclose(prediction[k][0].displacement, row, atol=1e-5, rtol=1e-5)
+            assert_close(prediction[k][0].displacement, whole_prediction.displacement[0, k], 1e-5)
     assert np.abs(expected.displacement - hidden.displacement).max() > 1e-3
     turned = stepwise(net, gyro, accel, about_z(115) @ attitude, np.eye(2, 3))[1]
     for plain, other in zip(rows, turned, strict=True):
-        np.testing.assert_allclose(other[0].displacement, plain[0].displacement, atol=1e-5)
+        assert_close(other[0].displacement, plain[0].displacement, 1e-5)
 
 
 def test_a_device_on_its_edge_has_finite_gradients():
