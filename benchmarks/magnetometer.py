@@ -55,8 +55,8 @@ def estimate_both(
         else:
             rows.append(recording._replace(start=field.start, measurements=(field.rows,)))
     runs = estimate(rows, network, windows, sensors.without_considered_bias(ekf), 8)
-    kept = {run.name: run for run in runs if share_used(run) >= sensors.LEAST_ACCEPTED}
-    return without, [kept.get(path.name, path) for path in without]
+    accepted_runs = {run.name: run for run in runs if share_used(run) >= sensors.LEAST_ACCEPTED}
+    return without, [accepted_runs.get(path.name, path) for path in without]
 
 
 def share_used(path: SequenceEstimate) -> float:

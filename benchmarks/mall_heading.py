@@ -58,7 +58,7 @@ def field_legs(split: str, root: str | None, name: str) -> list[tuple[np.ndarray
     walks = {walk.name: walk for walk in data.load("indoor_location", root, split)}
     ready, _ = prepare(walks.values(), windows, ekf, init="static", gyro_bias="rest")
     paths = estimate(ready, network, windows, ekf, 8)
-    rows, kept = [], []
+    rows, oriented_paths = [], []
     for recording, path in zip(ready, paths, strict=True):
         walk = walks[recording.name]
         if "magnetometer" not in walk.readings:
@@ -73,10 +73,10 @@ def field_legs(split: str, root: str | None, name: str) -> list[tuple[np.ndarray
             print(f"left out: {error}")
             continue
         rows.append(recording._replace(measurements=(fit.rows,)))
-        kept.append((path, fit.rows.direction[0]))
+        oriented_paths.append((path, fit.rows.direction[0]))
     results = []
     for (without, azimuth), with_field in zip(
-        kept, estimate(rows, network, windows, ekf, 8), strict=True
+        oriented_paths, estimate(rows, network, windows, ekf, 8), strict=True
     ):
         taps = without.waypoints
         legs = [

@@ -89,7 +89,7 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     tests = Path(__file__).parent
-    places = {tests / name: place for place, name in enumerate(LONGEST)}
+    places = {tests / name: position for position, name in enumerate(LONGEST)}
     gone = [str(path) for path in places if not path.exists()]
     assert not gone, f"tests/conftest.py: LONGEST names what is not there: {gone}"
     items.sort(key=lambda item: places.get(item.path, len(LONGEST)))
@@ -118,11 +118,11 @@ def programs_that_fit():
 
 def used_too_much():
     """Whether this worker holds more than it should; never, where there is no /proc to ask."""
-    here = Path("/proc/self")
-    if not here.exists():
+    process = Path("/proc/self")
+    if not process.exists():
         return False
-    resident = int((here / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return resident > MOST_MEMORY or (here / "maps").read_bytes().count(b"\n") > MOST_MAPS
+    resident = int((process / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return resident > MOST_MEMORY or (process / "maps").read_bytes().count(b"\n") > MOST_MAPS
 
 
 @pytest.fixture(scope="session")

@@ -68,7 +68,7 @@ class Import(NamedTuple):
     """The module without the package's name."""
     name: str
     """What it imports, with the package's name."""
-    late: bool
+    function_import: bool
     """Whether a function imports it."""
 
 
@@ -82,25 +82,25 @@ def read_imports():
         module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
         tree = ast.parse(path.read_text(encoding="utf-8"))
         functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-        late = {node for function in functions for node in ast.walk(function)}
+        bodies = {node for function in functions for node in ast.walk(function)}
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
-                yield from (Import(module, alias.name, node in late) for alias in node.names)
+                yield from (Import(module, alias.name, node in bodies) for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
                 assert node.level == 0, f"{module}: relative import"
                 for alias in node.names:
-                    yield Import(module, f"{node.module}.{alias.name}", node in late)
+                    yield Import(module, f"{node.module}.{alias.name}", node in bodies)
 
 
 def imports_of_modules():
     """The imports of modules of the package, whose names then are those of the modules."""
-    modules = {place.module.removesuffix(".__init__") for place in imports()}
-    for place in imports():
-        name = place.name.removeprefix("gnio_jax.")
+    modules = {entry.module.removesuffix(".__init__") for entry in imports()}
+    for entry in imports():
+        name = entry.name.removeprefix("gnio_jax.")
         while name not in modules and "." in name:
             name = name.rpartition(".")[0]
-        if place.name.startswith("gnio_jax.") and name in modules:
-            yield place._replace(module=place.module.removesuffix(".__init__"), name=name)
+        if entry.name.startswith("gnio_jax.") and name in modules:
+            yield entry._replace(module=entry.module.removesuffix(".__init__"), name=name)
 
 
 @pytest.mark.parametrize("room", sorted(ROOMS))
@@ -122,7 +122,7 @@ def test_a_library_stays_in_its_rooms(library):
 
 
 def test_every_module_has_a_room():
-    rooms = {place.module.split(".")[0] for place in imports()}
+    rooms = {entry.module.split(".")[0] for entry in imports()}
     assert rooms - {"__init__", "__main__"} <= ROOMS.keys()
 
 
@@ -139,20 +139,22 @@ SLOW = {"bokeh", "matplotlib"}
 
 def test_a_late_import_inside_a_room_waits_for_a_slow_library_and_nothing_else():
     """Any other one hides what the room is made of."""
-    drawing = {place.module for place in imports() if place.name.split(".")[0] in SLOW}
-    for module, name, late in imports_of_modules():
-        if late and module.split(".")[0] == name.split(".")[0]:
+    drawing = {entry.module for entry in imports() if entry.name.split(".")[0] in SLOW}
+    for module, name, function_import in imports_of_modules():
+        if function_import and module.split(".")[0] == name.split(".")[0]:
             assert name in drawing, f"gnio_jax/{module} imports {name} in a function"
 
 
 def test_a_variable_is_a_noun():
-    for path in sorted(PACKAGE.rglob("*.py")):
-        module = path.relative_to(PACKAGE).as_posix()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            name = node.arg if isinstance(node, ast.arg) else ""
-            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-                name = node.id
-            assert name not in REFUSED, f"gnio_jax/{module}: a variable is called '{name}'"
+    root = PACKAGE.parent
+    for folder in (PACKAGE, root / "tests", root / "benchmarks"):
+        for path in sorted(folder.rglob("*.py")):
+            module = path.relative_to(root).as_posix()
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                name = node.arg if isinstance(node, ast.arg) else ""
+                if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                    name = node.id
+                assert name not in REFUSED, f"{module}: a variable is called '{name}'"
 
 
 NOUNS = {"speed", "feed"}

@@ -61,9 +61,9 @@ def one_walk(walks, monkeypatch):
 def run(page, code, names=None):
     """Execute the code of a page, made smaller; returns its names."""
     names = {} if names is None else names
-    for there, smaller in SMALLER.get(page, {}).items():
-        assert there in code, f"{page} has no '{there}' any more"
-        code = re.sub(rf"(?<!\d){re.escape(there)}(?!\d)", smaller, code)
+    for passage, smaller in SMALLER.get(page, {}).items():
+        assert passage in code, f"{page} has no '{passage}' any more"
+        code = re.sub(rf"(?<!\d){re.escape(passage)}(?!\d)", smaller, code)
     with jax.numpy_rank_promotion("allow"):  # as a reader's JAX has it
         exec(compile(code, page, "exec"), names)
     return names
@@ -78,7 +78,7 @@ def test_the_examples_of_the_readme(one_walk, tmp_path, capsys, monkeypatch):
     """With weights that NumPy has drawn: those of each shape would be a program."""
     monkeypatch.setattr(models, "initialise", lambda model, _: drawn(models.variable_shapes(model)))
     monkeypatch.chdir(pages.ROOT)
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
         network = networks.read_network(tiny_run.save(tmp_path / "run", config))
         monkeypatch.setattr(networks, "load", lambda _: network)
@@ -140,7 +140,7 @@ def test_weights_that_are_loaded(tmp_path, monkeypatch):
     config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
     monkeypatch.setenv("GNIO_WEIGHTS", str(tmp_path))
     names = {"gnio_jax": gnio_jax, "windows": np.zeros((2, 50, 6), np.float32)}
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         folder = tiny_run.save(tmp_path / "run", config)
         publish(folder, tmp_path / "mine", "mine", "nobody's walks", "CC0")
         run("docs/weights.md", code_of("docs/weights.md"), names)
@@ -161,8 +161,8 @@ def test_a_head_of_ones_own(monkeypatch):
     shapes = models.variable_shapes(model, 64)
     assert shapes["params"]["head"].keys() == {"hidden", "displacement"}
     assert shapes["params"]["bank"] and shapes["params"]["uncertainty"]
-    found = jax.eval_shape(model.apply, shapes, jax.ShapeDtypeStruct((2, 64, 6), np.float32))
-    assert found.displacement.shape == (2, 3)
+    prediction = jax.eval_shape(model.apply, shapes, jax.ShapeDtypeStruct((2, 64, 6), np.float32))
+    assert prediction.displacement.shape == (2, 3)
 
 
 def test_a_dataset_of_two_csv_files(walks, tmp_path):
@@ -179,11 +179,11 @@ def test_a_dataset_of_two_csv_files(walks, tmp_path):
         np.savetxt(path, rows, delimiter=",", header=header, comments="")
     names = run("CONTRIBUTING.md", code_of("CONTRIBUTING.md"))
     (recording,) = names["DATASET"].recordings(tmp_path, "test")
-    (found,) = recording.read()
-    assert (found.name, data.group(found)) == ("anna_1", "anna")
-    np.testing.assert_allclose(found.position, walk.position, atol=1e-6)
-    np.testing.assert_allclose(found.gyro, walk.gyro, atol=1e-9)
-    assert found.valid.all() and not data.self_check(found).failures
+    (sequence,) = recording.read()
+    assert (sequence.name, data.group(sequence)) == ("anna_1", "anna")
+    np.testing.assert_allclose(sequence.position, walk.position, atol=1e-6)
+    np.testing.assert_allclose(sequence.gyro, walk.gyro, atol=1e-9)
+    assert sequence.valid.all() and not data.self_check(sequence).failures
 
 
 def test_the_block_of_networks_with_memory():
@@ -201,10 +201,10 @@ def test_every_block_that_runs_has_a_test():
     assert {block.page for block in RUN} == tested
 
 
-@pytest.mark.parametrize("place", CODE)
-def test_code_names_what_there_is(place):
+@pytest.mark.parametrize("location", CODE)
+def test_code_names_what_there_is(location):
     """It compiles, and what it takes from gnio_jax is there."""
-    tree = ast.parse(CODE[place], place)
+    tree = ast.parse(CODE[location], location)
     modules = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "gnio_jax":
@@ -217,7 +217,7 @@ def test_code_names_what_there_is(place):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             owner = modules.get(node.value.id)
             if owner is not None:
-                assert hasattr(owner, node.attr), f"{place}: {node.value.id}.{node.attr}"
+                assert hasattr(owner, node.attr), f"{location}: {node.value.id}.{node.attr}"
 
 
 def member(module, name):
@@ -345,12 +345,12 @@ def test_a_link_within_the_repository_leads_somewhere(page):
         if re.match(r"https?:", target):
             continue
         name, _, heading = target.partition("#")
-        place = page.parent / name if name else page
-        assert place.exists(), target
+        destination = page.parent / name if name else page
+        assert destination.exists(), target
         if heading:
-            assert heading in headings(place), target
+            assert heading in headings(destination), target
 
 
 def headings(page):
-    found = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", title).lower().replace(" ", "-") for title in found}
+    titles = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title).lower().replace(" ", "-") for title in titles}

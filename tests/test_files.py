@@ -59,13 +59,13 @@ def test_of_the_working_folder_and_of_a_mounted_one_the_contents_are_replaced(
         monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == folder)
     else:
         monkeypatch.chdir(folder)
-    place = folder if mounted else Path(".")
-    check_writable_folder(place)
-    with pytest.raises(RuntimeError), replacing_folder(place) as new:
+    destination = folder if mounted else Path(".")
+    check_writable_folder(destination)
+    with pytest.raises(RuntimeError), replacing_folder(destination) as new:
         (new / "a").write_text("2")
         raise RuntimeError
     assert (folder / "a").read_text() == "1"
-    with replacing_folder(place) as new:
+    with replacing_folder(destination) as new:
         (new / "b").write_text("3")
     assert [path.name for path in folder.iterdir()] == ["b"]
     assert folder.stat().st_ino == number and list(tmp_path.iterdir()) == [folder]
@@ -77,7 +77,7 @@ def test_of_the_working_folder_and_of_a_mounted_one_the_contents_are_replaced(
         return rename(path, target)
 
     monkeypatch.setattr(Path, "rename", fail)
-    with pytest.raises(OSError, match="no rename"), replacing_folder(place) as new:
+    with pytest.raises(OSError, match="no rename"), replacing_folder(destination) as new:
         (new / "c").write_text("4")
     assert [path.name for path in folder.iterdir()] == ["b"]
 
@@ -165,22 +165,22 @@ def test_what_a_killed_writer_left_is_removed_and_what_is_being_written_stays(tm
 
 def test_a_file_that_is_taken_for_a_leftover_is_made_again(tmp_path):
     """Another process may find it before it is locked."""
-    made = []
+    paths = []
 
     def create():
-        path = tmp_path / f"part{len(made)}"
+        path = tmp_path / f"part{len(paths)}"
         handle = os.open(path, os.O_CREAT | os.O_WRONLY)
-        made.append(path)
-        if len(made) == 1:
+        paths.append(path)
+        if len(paths) == 1:
             path.unlink()
-        if len(made) == 2:  # and a third process has the name
+        if len(paths) == 2:  # and a third process has the name
             path.unlink()
             path.touch()
         return str(path), handle
 
     path, handle = files._create_locked(create)
     os.close(handle)
-    assert path == made[2] and len(made) == 3
+    assert path == paths[2] and len(paths) == 3
 
 
 def test_a_folder_that_a_killed_writer_moved_away_returns(tmp_path):

@@ -39,8 +39,8 @@ def yaws(matrix, angle):
         return jnp.arctan2(sine, cosine)
 
     further = jax.grad(lambda turn: yaw(geometry.rotation_z(turn) @ matrix))
-    found = yaw(matrix), geometry.yaw_rotation(matrix), geometry.rotation_z(angle)
-    return *found, further(jnp.asarray(0.01))
+    results = yaw(matrix), geometry.yaw_rotation(matrix), geometry.rotation_z(angle)
+    return *results, further(jnp.asarray(0.01))
 
 
 def differences(function, x, step=1e-6):
@@ -105,9 +105,9 @@ def test_cumulative_rotation():
         for step in phi:
             expected.append(expected[-1] * Rotation.from_rotvec(step))
         steps = np.moveaxis(Rotation.from_rotvec(phi).as_matrix(), 0, 2)
-        found = jax.jit(geometry.cumulative_rotation)(expected[0].as_matrix(), steps)
-        wanted = [rotation.as_matrix() for rotation in expected]
-        np.testing.assert_allclose(np.moveaxis(found, 2, 0), wanted, atol=1e-14)
+        matrices = jax.jit(geometry.cumulative_rotation)(expected[0].as_matrix(), steps)
+        expected_matrices = [rotation.as_matrix() for rotation in expected]
+        np.testing.assert_allclose(np.moveaxis(matrices, 2, 0), expected_matrices, atol=1e-14)
 
 
 @pytest.mark.parametrize("p,k,q,n", [(3, 4, 2, (5,)), (3, 9, 40, ()), (40, 3, 3, ())])
@@ -117,8 +117,8 @@ def test_matmul_is_a_stack_of_products_and_has_its_derivatives(p, k, q, n):
     a, da = map(jnp.asarray, rng.standard_normal((2, p, k, *n)))
     b, db = map(jnp.asarray, rng.standard_normal((2, k, q, *n)))
     result = rng.standard_normal((p, q, *n))
-    found, along = jax.jit(functools.partial(jax.jvp, geometry.matmul))((a, b), (da, db))
-    np.testing.assert_allclose(found, np.einsum("pk...,kq...->pq...", a, b), 1e-12, 1e-13)
+    product, along = jax.jit(functools.partial(jax.jvp, geometry.matmul))((a, b), (da, db))
+    np.testing.assert_allclose(product, np.einsum("pk...,kq...->pq...", a, b), 1e-12, 1e-13)
     expected = np.einsum("pk...,kq...->pq...", da, b) + np.einsum("pk...,kq...->pq...", a, db)
     np.testing.assert_allclose(along, expected, rtol=1e-12, atol=1e-13)
 
@@ -132,8 +132,8 @@ def test_matmul_is_a_stack_of_products_and_has_its_derivatives(p, k, q, n):
     by_first = np.einsum("pq...,kq...->pk...", result, b)
     by_second = np.einsum("pk...,pq...->kq...", a, result)
     wanted_ones = (by_first, by_second) * 2
-    for found, wanted in zip(backwards(a, b, result), wanted_ones, strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-13)
+    for gradient, expected_gradient in zip(backwards(a, b, result), wanted_ones, strict=True):
+        np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 0.7])
@@ -182,9 +182,9 @@ def test_quaternions_are_wxyz():
 def test_yaw_is_the_last_extrinsic_euler_angle(angles):
     rotation = Rotation.from_euler("xyz", angles)
     yaw = rotation.as_euler("xyz")[2]
-    found, about_z, by_yaw, slope = yaws(rotation.as_matrix(), yaw)
+    angle, about_z, by_yaw, slope = yaws(rotation.as_matrix(), yaw)
     expected = Rotation.from_euler("z", yaw).as_matrix()
-    np.testing.assert_allclose(np.exp(1j * float(found)), np.exp(1j * yaw), atol=1e-14)
+    np.testing.assert_allclose(np.exp(1j * float(angle)), np.exp(1j * yaw), atol=1e-14)
     np.testing.assert_allclose(about_z, expected, atol=1e-14)
     np.testing.assert_allclose(by_yaw, expected, atol=1e-14)
     np.testing.assert_allclose(slope, 1.0, atol=1e-12)
@@ -192,8 +192,8 @@ def test_yaw_is_the_last_extrinsic_euler_angle(angles):
 
 def test_direction_of_many_vectors_and_of_none():
     x, y = jnp.asarray([3.0, 0.0, -1e-3]), jnp.asarray([-4.0, 0.0, 0.0])
-    found = jax.jit(geometry.direction)(x, y)
-    np.testing.assert_allclose(found, [[0.6, 1, -1], [-0.8, 0, 0]], atol=1e-15)
+    directions = jax.jit(geometry.direction)(x, y)
+    np.testing.assert_allclose(directions, [[0.6, 1, -1], [-0.8, 0, 0]], atol=1e-15)
     slope = jax.jit(jax.vmap(jax.jacrev(geometry.direction, (0, 1))))(x, y)
     np.testing.assert_allclose(slope[0][0], [16 / 125, 0, 0], atol=1e-15)
     np.testing.assert_allclose(slope[1][1], [9 / 125, 0, 1e3], atol=1e-9)
@@ -201,9 +201,9 @@ def test_direction_of_many_vectors_and_of_none():
 
 def test_yaw_at_gimbal_lock_is_zero_with_zero_derivative():
     locked = jnp.asarray([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    found, about_z, _, _ = yaws(locked, 0.0)
+    yaw, about_z, _, _ = yaws(locked, 0.0)
     np.testing.assert_array_equal(about_z, np.eye(3))
-    assert float(found) == 0.0
+    assert float(yaw) == 0.0
     for function in (geometry.yaw_rotation, geometry.yaw_direction):
         for slope in jax.tree.leaves(jax.jit(jax.jacrev(function))(locked)):
             np.testing.assert_array_equal(slope, np.zeros(slope.shape))
@@ -233,9 +233,9 @@ def test_planar_alignment(collinear):
     y = turned(x, 2.5) + [30.0, -4.0] + 0.1 * rng.normal(size=x.shape)
     error = lambda p: (np.sqrt(weight)[:, None] * (y - turned(x, p[0]) - p[1:])).ravel()  # noqa: E731
     angle, *shift = least_squares(error, [2.0, 0.0, 0.0], xtol=1e-15, gtol=1e-15).x
-    found, derivatives = alignment(x, y, weight)
-    wanted = [*turned(np.eye(2), angle).T.ravel(), *shift]
-    np.testing.assert_allclose(found, wanted, atol=1e-6)
+    transform, derivatives = alignment(x, y, weight)
+    expected = [*turned(np.eye(2), angle).T.ravel(), *shift]
+    np.testing.assert_allclose(transform, expected, atol=1e-6)
     slopes = differences(lambda x: alignment(x.reshape(6, 2), y, weight)[0], x.ravel())
     np.testing.assert_allclose(derivatives, slopes, atol=1e-7)
 
@@ -247,8 +247,10 @@ def test_planar_alignment_without_a_direction():
     x, same = rng.normal(size=(3, 2)), np.tile([1.0, 2.0], (3, 1))
     alone, alike = np.array([0, 1.0, 0]), np.ones(3)
     for source, target, weight in [(x, x + 5, alone), (same, x, alike), (x, same, alike)]:
-        found, derivatives = alignment(source, target, weight)
-        np.testing.assert_array_equal(found[:4], np.eye(2).ravel())
-        np.testing.assert_allclose(found[4:], np.average(target - source, 0, weight), atol=1e-12)
-        wanted = -np.kron(weight / weight.sum(), np.eye(2))
-        np.testing.assert_allclose(derivatives, np.vstack([np.zeros((4, 6)), wanted]), atol=1e-12)
+        transform, derivatives = alignment(source, target, weight)
+        np.testing.assert_array_equal(transform[:4], np.eye(2).ravel())
+        np.testing.assert_allclose(
+            transform[4:], np.average(target - source, 0, weight), atol=1e-12
+        )
+        slopes = -np.kron(weight / weight.sum(), np.eye(2))
+        np.testing.assert_allclose(derivatives, np.vstack([np.zeros((4, 6)), slopes]), atol=1e-12)

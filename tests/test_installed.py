@@ -117,6 +117,6 @@ def test_help_and_version_need_no_jax(gnio):
         "heavy = {'jax', 'flax', 'orbax', 'matplotlib', 'pandas', 'scipy'} & set(sys.modules)\n"
         "print(gnio_jax.__version__, gnio_jax.__file__, heavy or 'light')"
     )
-    version, place, weight = gnio("-c", check, program="python").stdout.split()
+    version, path, weight = gnio("-c", check, program="python").stdout.split()
     assert version[0].isdigit() and weight == "light"
-    assert not place.startswith(str(ROOT))
+    assert not path.startswith(str(ROOT))

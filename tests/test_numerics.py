@@ -27,17 +27,17 @@ def test_the_scalar_comes_first():
 
 def test_product_and_conjugate_are_those_of_rotations():
     first, second = some(20), some(20, 1)
-    left, right = numerics.quaternions(first), numerics.quaternions(second)
+    left_factor, right = numerics.quaternions(first), numerics.quaternions(second)
     expected = (first * second).as_matrix()
-    product = numerics.quaternion_product(left, right)
+    product = numerics.quaternion_product(left_factor, right)
     np.testing.assert_allclose(numerics.matrix_from_quaternion(product), expected, atol=1e-14)
     np.testing.assert_array_equal(
-        numerics.quaternion_product(left.T, right.T, axis=0), product.T
+        numerics.quaternion_product(left_factor.T, right.T, axis=0), product.T
     )  # the other layout
     np.testing.assert_array_equal(
-        numerics.quaternion_product(left[0], right)[0], product[0]
+        numerics.quaternion_product(left_factor[0], right)[0], product[0]
     )  # one on many
-    nothing = numerics.quaternion_product(left * [1, -1, -1, -1], left)
+    nothing = numerics.quaternion_product(left_factor * [1, -1, -1, -1], left_factor)
     np.testing.assert_allclose(nothing, np.tile([1.0, 0.0, 0.0, 0.0], (20, 1)), atol=1e-15)
 
 
@@ -47,14 +47,14 @@ def test_matrices_of_quaternions_and_back_keep_what_is_not_finite():
     wxyz[1, 0, 2] = np.nan
     matrices = numerics.matrix_from_quaternion(wxyz)
     assert matrices.shape == (2, 3, 3, 3)
-    known = np.isfinite(wxyz).all(axis=-1)
+    mask = np.isfinite(wxyz).all(axis=-1)
     np.testing.assert_allclose(
-        matrices[known], rotation[known.ravel()].as_matrix(), atol=1e-15, rtol=0
+        matrices[mask], rotation[mask.ravel()].as_matrix(), atol=1e-15, rtol=0
     )
     assert np.isnan(matrices[1, 0]).all()
     again = numerics.quaternion_from_matrix(matrices)
     sign = np.sign((again * wxyz).sum(axis=-1, keepdims=True))
-    np.testing.assert_allclose((again * sign)[known], wxyz[known], atol=1e-15)
+    np.testing.assert_allclose((again * sign)[mask], wxyz[mask], atol=1e-15)
     assert np.isnan(again[1, 0]).all()
     assert np.isnan(numerics.matrix_from_quaternion(np.full((2, 4), np.nan))).all()
     np.testing.assert_allclose(
@@ -85,8 +85,8 @@ def test_rotations_about_z():
     angles = np.array([0.0, 1e-9, 0.3, np.pi / 2, np.pi, -2.0, 7.0])
     expected = Rotation.from_euler("z", angles[:, None]).as_matrix()
     np.testing.assert_allclose(numerics.about_z(angles).as_matrix(), expected, atol=1e-15)
-    for angle, wanted in zip(angles, expected, strict=True):
-        np.testing.assert_allclose(numerics.rotation_z(angle), wanted, atol=1e-15)
+    for angle, matrix in zip(angles, expected, strict=True):
+        np.testing.assert_allclose(numerics.rotation_z(angle), matrix, atol=1e-15)
 
 
 def test_levelling_turns_up_onto_z_about_a_horizontal_axis_by_the_angle_between():
@@ -105,9 +105,9 @@ def test_cumulative_rotation_is_the_running_product_from_the_identity(count):
     expected = [np.eye(3)]
     for turn in turns.as_matrix():
         expected.append(expected[-1] @ turn)
-    found = numerics.cumulative_rotation(turns)
-    assert len(found) == count + 1
-    np.testing.assert_allclose(found.as_matrix(), np.stack(expected), atol=1e-13)
+    rotations = numerics.cumulative_rotation(turns)
+    assert len(rotations) == count + 1
+    np.testing.assert_allclose(rotations.as_matrix(), np.stack(expected), atol=1e-13)
 
 
 def test_a_turn_that_is_not_finite_is_refused():
@@ -121,9 +121,9 @@ def test_integrate_gyro_returns_the_attitude_of_a_steady_turn_on_any_clock():
     time = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.02, 40))
     expected = Rotation.from_rotvec((time - time[0])[:, None] * rate).as_matrix()
     gyro = np.tile(rate, (40, 1))
-    found = numerics.integrate_gyro(gyro, np.diff(time))
-    np.testing.assert_allclose(found.as_matrix(), expected, atol=1e-13)
-    np.testing.assert_allclose(numerics.turns_between(found) / np.diff(time)[:, None], gyro[1:])
+    attitude = numerics.integrate_gyro(gyro, np.diff(time))
+    np.testing.assert_allclose(attitude.as_matrix(), expected, atol=1e-13)
+    np.testing.assert_allclose(numerics.turns_between(attitude) / np.diff(time)[:, None], gyro[1:])
     steady = numerics.integrate_gyro(gyro, 0.01)
     np.testing.assert_allclose(steady[-1].as_rotvec(), 0.39 * rate, atol=1e-13)
 
@@ -131,9 +131,9 @@ def test_integrate_gyro_returns_the_attitude_of_a_steady_turn_on_any_clock():
 def test_interpolation_is_linear_per_column_and_holds_its_ends():
     stamps = np.array([0.0, 1.0, 3.0])
     values = np.array([[0.0, 10.0], [2.0, 20.0], [4.0, 0.0]])
-    found = numerics.interpolate(np.array([-1.0, 0.5, 1.0, 2.0, 9.0]), stamps, values)
+    rows = numerics.interpolate(np.array([-1.0, 0.5, 1.0, 2.0, 9.0]), stamps, values)
     np.testing.assert_array_equal(
-        found, [[0.0, 10.0], [1.0, 15.0], [2.0, 20.0], [3.0, 10.0], [4.0, 0.0]]
+        rows, [[0.0, 10.0], [1.0, 15.0], [2.0, 20.0], [3.0, 10.0], [4.0, 0.0]]
     )
     by_row = numerics.interpolate(np.arange(3), np.array([0, 2]), values[:2])
     np.testing.assert_array_equal(by_row, [[0.0, 10.0], [1.0, 15.0], [2.0, 20.0]])
@@ -143,16 +143,18 @@ def test_interpolation_is_linear_per_column_and_holds_its_ends():
 def test_slerp_turns_evenly_on_the_shorter_arc_and_holds_its_ends():
     stamps = np.array([0.0, 1.0, 2.0])
     attitude = Rotation.from_rotvec([[0, 0, 0.0], [0, 0, 1.0], [0, 0, 1.0 + 1.5 * np.pi]])
-    found = numerics.slerp(np.array([-3.0, 0.25, 1.5, 2.5]), stamps, attitude)
+    rotations = numerics.slerp(np.array([-3.0, 0.25, 1.5, 2.5]), stamps, attitude)
     expected = [0.0, 0.25, 1.0 - 0.25 * np.pi, 1.0 - 0.5 * np.pi]
-    np.testing.assert_allclose(found.as_rotvec()[:, 2], expected, atol=1e-14)
+    np.testing.assert_allclose(rotations.as_rotvec()[:, 2], expected, atol=1e-14)
 
 
 def test_neighbours_bracket_every_time():
     stamps = np.array([0.0, 1.0, 2.0, 5.0])
-    left, right = numerics.neighbours(stamps, np.array([-1.0, 0.0, 0.5, 1.0, 4.0, 5.0, 9.0]))
+    left_neighbours, right = numerics.neighbours(
+        stamps, np.array([-1.0, 0.0, 0.5, 1.0, 4.0, 5.0, 9.0])
+    )
     np.testing.assert_array_equal(right, [1, 1, 1, 1, 3, 3, 3])
-    np.testing.assert_array_equal(left, right - 1)
+    np.testing.assert_array_equal(left_neighbours, right - 1)
 
 
 def test_robust_std_is_that_of_normal_noise_and_ignores_a_few_flips():
@@ -164,9 +166,9 @@ def test_robust_std_is_that_of_normal_noise_and_ignores_a_few_flips():
 def test_spans_are_the_runs_of_true():
     for mask in ([], [0], [1], [0, 1, 1, 0, 1], [1, 1, 0, 0, 0, 1, 0], [0, 0, 0]):
         mask = np.array(mask, dtype=bool)
-        found, again = numerics.spans(mask), np.zeros_like(mask)
-        assert found.shape[1:] == (2,)
-        for start, stop in found:
+        spans, again = numerics.spans(mask), np.zeros_like(mask)
+        assert spans.shape[1:] == (2,)
+        for start, stop in spans:
             assert stop > start and mask[start:stop].all()
             assert (start == 0 or not mask[start - 1]) and (stop == len(mask) or not mask[stop])
             again[start:stop] = True
@@ -198,7 +200,7 @@ def test_last_true_holds_and_reaches_back_to_the_first():
 def test_columns_are_convolved_where_they_overlap_the_kernel_wholly(rows, taps):
     random = np.random.default_rng(taps)
     values, kernel = random.standard_normal((rows, 3)), random.standard_normal(taps)
-    wanted = [np.convolve(column, kernel, mode="valid") for column in values.T]
-    np.testing.assert_allclose(numerics.convolve(values, kernel), np.transpose(wanted), atol=1e-12)
-    found = numerics.convolve(values[:, 0], kernel)
-    np.testing.assert_allclose(found, wanted[0], atol=1e-12)
+    columns = [np.convolve(column, kernel, mode="valid") for column in values.T]
+    np.testing.assert_allclose(numerics.convolve(values, kernel), np.transpose(columns), atol=1e-12)
+    convolution = numerics.convolve(values[:, 0], kernel)
+    np.testing.assert_allclose(convolution, columns[0], atol=1e-12)

@@ -62,11 +62,11 @@ def free_address():
 def ends_of(processes):
     """(status, lines on stderr) of each, once it has ended."""
     try:
-        said = [process.communicate(timeout=LIMIT)[1] for process in processes]
+        outputs = [process.communicate(timeout=LIMIT)[1] for process in processes]
     finally:
         for process in processes:
             process.kill()
-    pairs = zip(processes, said, strict=True)
+    pairs = zip(processes, outputs, strict=True)
     return [(process.returncode, lines.splitlines()) for process, lines in pairs]
 
 
@@ -102,7 +102,7 @@ def assert_same_run(workdir, other):
     ours, theirs = tiny_run.rows(workdir), tiny_run.rows(other)
     assert [row["step"] for row in ours] == [row["step"] for row in theirs]
     for name in ("loss", "val_loss", "val_mse", "val_nll"):
-        pair = ([row[name] for row in each] for each in (ours, theirs))
+        pair = ([row[name] for row in table] for table in (ours, theirs))
         np.testing.assert_allclose(*pair, rtol=1e-4)
 
 
@@ -121,8 +121,8 @@ def test_processes_and_devices_change_nothing_but_rounding(
 ):
     ends = run(tmp_path / "run", processes, devices)
     assert [status for status, _ in ends] == [0] * processes, ends
-    said = [line for _, lines in ends[1:] for line in lines if "[Gloo]" not in line]
-    assert not said, "the first process alone writes lines"
+    printed_lines = [line for _, lines in ends[1:] for line in lines if "[Gloo]" not in line]
+    assert not printed_lines, "the first process alone writes lines"
     assert_same_run(tmp_path / "run", alone)
 
 
@@ -165,7 +165,7 @@ def latest(workdir):
 
 @pytest.fixture(scope="module")
 def small(recording):
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         yield tiny_run.config(recording, "")
 
 
@@ -174,14 +174,14 @@ def trained(config):
     """Losses and gradient norms of each of five steps, figures of validation, parameters."""
     task, (source, held_out, _) = set_up(WindowTask, config, Silence())
     key, drawn = jax.random.key(0), drawn_state(task.model, config, task.steps_per_epoch)
-    state, order, found = parallel.copy_to_devices(drawn), task.order(key, 0, source), []
+    state, order, sums = parallel.copy_to_devices(drawn), task.order(key, 0, source), []
     for first in range(5):
         numbers = jnp.int32(first), jnp.int32(1), jnp.float32(1)
         state, progress = task.take_steps(state, source, order, *numbers, key)
-        found.append(progress.sums)
+        sums.append(progress.sums)
     state = task.with_statistics(state, source, key)
     state, row = task.validate(state, held_out, key)
-    return jax.device_get((found, row, state.variables["batch_stats"])), state
+    return jax.device_get((sums, row, state.variables["batch_stats"])), state
 
 
 @pytest.fixture(scope="module")
@@ -235,7 +235,7 @@ def test_processes_with_other_samples_or_weights_are_refused(monkeypatch):
         recordings = TrainingData({"imu": samples, "start": np.arange(3)}, {}, {"train": ["a"]})
         run_folder.compare_processes(TrainConfig(), recordings, {"scale": jnp.float32(weight)})
 
-    compare(samples, 1, lambda *given: sent.append(given) or given)
+    compare(samples, 1, lambda *values: sent.append(values) or values)
     assert len(sent) == 3
     for other, weight, what in (
         (samples, 1, None),
@@ -245,7 +245,7 @@ def test_processes_with_other_samples_or_weights_are_refused(monkeypatch):
     ):
         first, words = iter(sent), f"the processes have different {what}; (give|start) all"
         with pytest.raises(InputError, match=words) if what else contextlib.nullcontext():
-            compare(other, weight, lambda *given, first=first: (*map(max, given, next(first)),))
+            compare(other, weight, lambda *values, first=first: (*map(max, values, next(first)),))
 
 
 def test_a_wrong_text_is_one_line():
@@ -260,9 +260,9 @@ def test_a_wrong_text_is_one_line():
         ("localhost:4321,1234567890123456789012,0", form),
         ("localhost:٤٣٢١,2,0", form),
     ):
-        with pytest.raises(InputError, match=f"--distributed: {expected}") as told:
+        with pytest.raises(InputError, match=f"--distributed: {expected}") as refusal:
             parallel.initialise(text)
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(refusal.value)
 
 
 def test_one_process_meets_nobody(monkeypatch):
@@ -272,12 +272,12 @@ def test_one_process_meets_nobody(monkeypatch):
         parallel.initialise()
     parallel.initialise("localhost:4321,1,0")
     monkeypatch.setattr(jax.config, "update", lambda *_: None)
-    found = []
-    monkeypatch.setattr(jax.distributed, "initialize", lambda *given, **_: found.append(given))
+    calls = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *args, **_: calls.append(args))
     monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
     parallel.initialise()
     parallel.initialise("localhost:4321,2,1")
-    assert found == [(), ("localhost:4321", 2, 1)]
+    assert calls == [(), ("localhost:4321", 2, 1)]
 
 
 def test_with_one_device_nothing_is_placed_nor_constrained():

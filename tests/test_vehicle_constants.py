@@ -169,10 +169,10 @@ def test_approximate_leave_one_out_is_near_the_fits_without_each_drive(drives):
         for drive, training in zip(drives, without, strict=True)
     ]
     exact = 0.5 * (np.concatenate(errors).mean() + np.mean([x.mean() for x in errors]))
-    seen = objective(drives, 0.0, point)
+    training_error = objective(drives, 0.0, point)
     approximate = leave_one_out(drives, 0.06, 0.3, point)
-    assert seen < exact
-    assert abs(approximate - exact) < 0.3 * (exact - seen)
+    assert training_error < exact
+    assert abs(approximate - exact) < 0.3 * (exact - training_error)
 
 
 def test_the_low_pass_and_the_penalty_are_those_of_the_smallest_error_of_leave_one_out(monkeypatch):

@@ -18,9 +18,9 @@ def gnio(monkeypatch, capsys):
         monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
         monkeypatch.setattr(sys, "argv", ["gnio", *map(str, words)])
         console.run(app.main)
-        told = capsys.readouterr()
-        assert "\x1b" not in told.out + told.err  # no terminal: no control characters
-        return told.out
+        output = capsys.readouterr()
+        assert "\x1b" not in output.out + output.err  # no terminal: no control characters
+        return output.out
 
     return call
 
@@ -32,9 +32,9 @@ def mistake(gnio, capsys):
     def call(*words, lines=()):
         with pytest.raises(SystemExit, match="2"):
             gnio(*words, lines=lines)
-        told = capsys.readouterr()
-        assert told.err.count("\n") == 1, told.err
-        return told.err
+        output = capsys.readouterr()
+        assert output.err.count("\n") == 1, output.err
+        return output.err
 
     return call
 

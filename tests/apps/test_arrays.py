@@ -24,7 +24,7 @@ TIME = EPOCH + ROWS / 100
 def runs(tmp_path_factory):
     """`walker` predicts something for each window, `mute` zero, give or take a metre."""
     folder = tmp_path_factory.mktemp("runs")
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         tiny_run.save(folder / "walker", CONFIG)
         tiny_run.save(folder / "mute", CONFIG, size=0.0)
         yield folder

@@ -29,9 +29,9 @@ def compare(*words, metrics=("ate",), **options):
     return comparison.compare(CompareConfig(tuple(map(str, words)), metrics=metrics, **options))
 
 
-def second(found, metric="ate"):
+def second(table, metric="ate"):
     """The difference of the second row."""
-    difference = found.cells[metric][1].difference
+    difference = table.cells[metric][1].difference
     assert difference is not None
     return difference
 
@@ -48,23 +48,23 @@ def runs(tmp_path):
 def test_by_hand(runs, monkeypatch):
     """Means over seeds 2, 2, 6 against 1, 3, 3: differences −1 and +1 of ann and −3 of bob. The
     means without ann and without bob are −3 and 0, so the standard error is √(1/2 (4 + 1))."""
-    found = compare(runs / "plain", runs / "new")
-    plain, new = found.cells["ate"]
-    assert [row.label for row in found.rows] == ["plain", "new"] and plain.difference is None
+    table = compare(runs / "plain", runs / "new")
+    plain, new = table.cells["ate"]
+    assert [row.label for row in table.rows] == ["plain", "new"] and plain.difference is None
     assert plain.summary.seeds == pytest.approx([8 / 3, 4.0])
     assert new.summary.seeds == pytest.approx([7 / 3])
-    difference = second(found)
+    difference = second(table)
     assert difference.mean == pytest.approx(-1.0) and difference.gain == pytest.approx(30.0)
     reach = 12.7062 * 2.5**0.5  # t of one degree of freedom
     assert difference.interval == pytest.approx((-1 - reach, -1 + reach), rel=1e-5)
     assert (difference.better, difference.compared, difference.groups) == (2, 3, 2)
-    assert comparison.lines(found) == [
+    assert comparison.lines(table) == [
         ["ATE (m)", "plain", "3.33 ± 0.94", "", ""],
         ["", "new", "2.33", "-1.00 (-21.09 to +19.09)", "2 of 3"],
     ]
-    said = comparison.explanations(found)
-    assert said[0].startswith("Seeds of plain: plain_s0, plain_s1; new: one.")
-    assert comparison.title(found).startswith("synthetic test, ekf; differences to plain")
+    explanations = comparison.explanations(table)
+    assert explanations[0].startswith("Seeds of plain: plain_s0, plain_s1; new: one.")
+    assert comparison.title(table).startswith("synthetic test, ekf; differences to plain")
     assert list(compare(runs / "plain", runs / "new", metrics=None).cells) == ["ate", "rpe_1s"]
     # What diverged is in no difference, and more often it is not better: the walks that are left
     # may be the easy ones.
@@ -73,13 +73,13 @@ def test_by_hand(runs, monkeypatch):
         (0.5, ["", "lost", "1.75 † 1/3", "– ‡", ""]),
     ):
         write(runs / "lost", {"a": first, "b": LOST, "c": 3.0})
-        found = compare(runs / "new_s0", runs / "lost")
-        assert comparison.lines(found)[1] == cells
-    assert any(said.startswith("‡ ") for said in comparison.explanations(found))
+        table = compare(runs / "new_s0", runs / "lost")
+        assert comparison.lines(table)[1] == cells
+    assert any(explanation.startswith("‡ ") for explanation in comparison.explanations(table))
     # Of some metrics another value than zero is best.
     monkeypatch.setitem(tabulate.COLUMNS, "ate", tabulate.COLUMNS["ate"]._replace(best=4.0))
-    found = compare(runs / "plain_s0", runs / "new")  # |1, 2, 5 − 4| against |1, 3, 3 − 4|
-    assert comparison.lines(found)[0][0] == "ATE (m, best 4)" and second(found).better == 1
+    table = compare(runs / "plain_s0", runs / "new")  # |1, 2, 5 − 4| against |1, 3, 3 − 4|
+    assert comparison.lines(table)[0][0] == "ATE (m, best 4)" and second(table).better == 1
 
 
 def test_means_over_other_recordings_say_so(runs):
@@ -88,15 +88,15 @@ def test_means_over_other_recordings_say_so(runs):
     write(runs / "more", {"b": 5.0, "c": 3.0}, groups=GROUPS)
     for row, ates in (("few", {"a": 1.0, "c": 5.0}), ("others", {"d": 1.0, "e": 2.0})):
         write(runs / row, ates, groups=groups | GROUPS)
-    found = compare(runs / "few", runs / "more")
-    assert comparison.lines(found) == [
+    table = compare(runs / "few", runs / "more")
+    assert comparison.lines(table) == [
         ["ATE (m)", "few", "3.00 over 2", "", ""],
         ["", "more", "4.00 over 2", "-2.00 over 1", "1 of 1"],
     ]
-    said = comparison.explanations(found)
-    assert "few has 2; more has 1 of them and 1 others" in said[1]
-    found = comparison.lines(compare(runs / "plain_s0", runs / "new"))
-    assert not any("over" in cell for line in found for cell in line)
+    explanations = comparison.explanations(table)
+    assert "few has 2; more has 1 of them and 1 others" in explanations[1]
+    lines = comparison.lines(compare(runs / "plain_s0", runs / "new"))
+    assert not any("over" in cell for line in lines for cell in line)
     with pytest.raises(InputError, match=r"^others: shares no recording with few"):
         compare(runs / "few", runs / "others")
     # Nor have the seeds of one row a mean, if they have no recording in common.
@@ -114,63 +114,66 @@ def test_names_without_a_seed_stand_for_all_seeds(tmp_path):
     (tmp_path / "net_s4").mkdir()  # no run
     (tmp_path / "net_s5").touch()
 
-    def found(word):
+    def run_names(word):
         return [str(path.relative_to(tmp_path)) for path in comparison.find(str(tmp_path / word))]
 
-    assert found("net") == ["net_s0", "net_s2", "net_s10"]
-    assert found("net_calibrated") == ["net_s0_calibrated", "net_s2_calibrated"]
-    assert found("net_s2") == ["net_s2"]
-    assert found("net/eval/x") == [f"net_s{k}/eval/x" for k in (0, 2, 10)]
-    assert found("galaxy_s8_w8") == ["galaxy_s8_w8_s0", "galaxy_s8_w8_s1"]
+    assert run_names("net") == ["net_s0", "net_s2", "net_s10"]
+    assert run_names("net_calibrated") == ["net_s0_calibrated", "net_s2_calibrated"]
+    assert run_names("net_s2") == ["net_s2"]
+    assert run_names("net/eval/x") == [f"net_s{k}/eval/x" for k in (0, 2, 10)]
+    assert run_names("galaxy_s8_w8") == ["galaxy_s8_w8_s0", "galaxy_s8_w8_s1"]
     for word in ("net/eval/y", "nothing", "galaxy_w9"):
         with pytest.raises(InputError, match="is not there"):
-            found(word)
+            run_names(word)
     write_run(tmp_path / "galaxy_s8_w8_s01")
     with pytest.raises(InputError, match="has a seed twice"):
-        found("galaxy_s8_w8")
+        run_names("galaxy_s8_w8")
 
 
 def test_runs_are_evaluated_where_they_are_not_yet_and_read_once(runs, monkeypatch):
-    made, looked, look = [], [], reuse.find_existing
+    evaluations, looked, look = [], [], reuse.find_existing
 
     def evaluate(config, progress, workers, **_):
-        made.append((config.network, config.split, config.estimator, workers))
+        evaluations.append((config.network, config.split, config.estimator, workers))
         name = config.network.removeprefix(f"{runs}/")
         write(runs / name, {"a": 4.0}, "synthetic_val_ekf", split="val")
 
     monkeypatch.setattr(reuse, "evaluate", evaluate)
     monkeypatch.setattr(
-        reuse, "find_existing", lambda asked: looked.append(asked.network) or look(asked)
+        reuse, "find_existing", lambda settings: looked.append(settings.network) or look(settings)
     )
     config = CompareConfig((f"{runs}/plain", f"{runs}/new"), split="val", metrics=("ate",))
-    found = comparison.compare(config, workers=3)
+    table = comparison.compare(config, workers=3)
     names = [f"{runs}/{name}" for name in ("plain_s0", "plain_s1", "new_s0")]
-    assert made == [(name, "val", "ekf", 3) for name in names] and looked == names
-    assert second(found).mean == 0
+    assert evaluations == [(name, "val", "ekf", 3) for name in names] and looked == names
+    assert second(table).mean == 0
     comparison.compare(config)
-    assert len(made) == 3
+    assert len(evaluations) == 3
 
 
 def test_evaluations_by_their_folders(runs, monkeypatch):
     """Two estimators of one run, side by side, also named from inside. Options of the filter that
     differ are told, where one runs."""
-    made = {"estimator": "integrate", "coupling": None, "orientation_source": "reference"}
-    other = write(runs / "new_s0", {"a": 2.0, "b": 4.0, "c": 4.0}, "summed", **made)
-    found = compare(runs / "new", other)
-    assert second(found).mean == pytest.approx(1.0)
-    assert [row.label for row in found.rows] == ["new", "new_s0/eval/summed"]
-    said = comparison.explanations(found)
-    assert said[0].startswith("There is one seed") and "integrate, reference orientation" in said[1]
+    settings = {"estimator": "integrate", "coupling": None, "orientation_source": "reference"}
+    other = write(runs / "new_s0", {"a": 2.0, "b": 4.0, "c": 4.0}, "summed", **settings)
+    table = compare(runs / "new", other)
+    assert second(table).mean == pytest.approx(1.0)
+    assert [row.label for row in table.rows] == ["new", "new_s0/eval/summed"]
+    explanations = comparison.explanations(table)
+    assert (
+        explanations[0].startswith("There is one seed")
+        and "integrate, reference orientation" in explanations[1]
+    )
     monkeypatch.chdir(runs / "new_s0" / "eval")
-    found = compare("synthetic_test_ekf", "summed")
-    assert [row.runs for row in found.rows] == [["new_s0"], ["new_s0"]]
+    table = compare("synthetic_test_ekf", "summed")
+    assert [row.runs for row in table.rows] == [["new_s0"], ["new_s0"]]
     for name, gravity, density in (("here", 9.8, 1), ("there", 9.7, 1.0)):
         options = {"gravity": gravity, "accel_density": density}
         write(runs / name, {"a": 1.0}, "own", filter=options)
         write(runs / name, {"a": 1.0}, "summed", filter=options, estimator="integrate")
     for way, differ in (("own", ["gravity"]), ("summed", [])):
-        found = compare(runs / f"here/eval/{way}", runs / f"there/eval/{way}")
-        assert comparison.filter_options(found) == differ
+        table = compare(runs / f"here/eval/{way}", runs / f"there/eval/{way}")
+        assert comparison.filter_options(table) == differ
 
 
 def test_refusals(runs):
@@ -179,7 +182,7 @@ def test_refusals(runs):
             compare(*(runs / word for word in words), metrics=metrics, **options)
         return str(error.value)
 
-    own = "eval/synthetic_test_ekf"
+    folder = "eval/synthetic_test_ekf"
     write(runs / "seen", {"a": 1.0}, split="seen")
     write(runs / "B", {"a": 1.0}, data_root="/B")  # though the recordings have the same names
     write(runs / "groups", {"a": 1.0, "b": 1.0}, groups={**GROUPS, "b": "eve"})
@@ -196,23 +199,23 @@ def test_refusals(runs):
         (("plain",), "needs two or more"),
         (("plain", "gone"), "is not there"),
         (("new", "new"), "new_s0: is named twice"),
-        (("plain", f"seen/{own}"), "is of split seen, the first row of test; give --split seen"),
-        (("plain", f"B/{own}"), "the first row of None; give --data-root /B for the runs"),
+        (("plain", f"seen/{folder}"), "is of split seen, the first row of test; give --split seen"),
+        (("plain", f"B/{folder}"), "the first row of None; give --data-root /B for the runs"),
         (("plain", "groups"), f"sequence b is of eve here, of ann in {runs}/plain_s0/"),
         (("short", "long"), f"sequence a takes 60.1 s here, 60 s in {runs}/short/"),
-        (("mix", "new"), f"mix_s1/{own}: sequence a takes 600 s here"),
+        (("mix", "new"), f"mix_s1/{folder}: sequence a takes 600 s here"),
         (("linked", "plain"), "linked_s1: is the same evaluation as"),
         (("plain", "new_s0/eval/aligned"), "is of alignment se3, the first row of origin"),
         (("untrained", "plain"), "untrained: holds no weights"),
-        (("plain", f"old/{own}"), "another version"),
-        (("plain", f"left/{own}"), "of weights that the network has no more"),
+        (("plain", f"old/{folder}"), "another version"),
+        (("plain", f"left/{folder}"), "of weights that the network has no more"),
         (("plain", "new_s0/eval"), "neither a run nor an evaluation"),
     ):
         assert problem in refused(*words)
     assert "no row has 'nis'; there are: ate, rpe_1s" in refused("plain", "new", metrics=("nis",))
     assert "no metric 'new'; write the runs before" in refused("plain", metrics=("ate", "new"))
-    (runs / "plain_s1" / own).rename(runs / "elsewhere")
-    assert "exists for 1 of 2 seeds only; missing: " in refused(f"seen/{own}", f"plain/{own}")
+    (runs / "plain_s1" / folder).rename(runs / "elsewhere")
+    assert "exists for 1 of 2 seeds only; missing: " in refused(f"seen/{folder}", f"plain/{folder}")
 
 
 def test_figures_of_recordings_that_have_changed_are_refused(runs, tmp_path):
@@ -220,10 +223,10 @@ def test_figures_of_recordings_that_have_changed_are_refused(runs, tmp_path):
     root = tmp_path / "own"
     root.mkdir()
     (root / "a.csv").write_text("walk")
-    place = {"dataset": "csv", "data_root": str(root)}
+    source = {"dataset": "csv", "data_root": str(root)}
     for name in ("first", "second"):
         contents = data.describe_contents("csv", root, "test")
-        write(runs / name, {"a": 1.0}, "csv_test_ekf", contents=contents, **place)
+        write(runs / name, {"a": 1.0}, "csv_test_ekf", contents=contents, **source)
         if name == "first":
             (root / "a.csv").write_text("other walk")
     folders = [runs / name / "eval" / "csv_test_ekf" for name in ("first", "second")]
@@ -243,10 +246,10 @@ def test_recordings_that_were_left_out_are_told(runs):
     content = json.loads((folder / "metrics.json").read_text())
     content["left_out"] = {name: f"{name}.csv: is damaged" for name in "defgh"}
     (folder / "metrics.json").write_text(json.dumps(content))
-    said = comparison.explanations(compare(runs / "plain_s0", runs / "new"))
-    assert not any("left out" in line for line in said)
-    said = comparison.explanations(compare(runs / "plain_s0", runs / "holes"))
-    assert "holes: 5 of 8 recordings were left out: d, e, f, ..." in said
+    explanations = comparison.explanations(compare(runs / "plain_s0", runs / "new"))
+    assert not any("left out" in line for line in explanations)
+    explanations = comparison.explanations(compare(runs / "plain_s0", runs / "holes"))
+    assert "holes: 5 of 8 recordings were left out: d, e, f, ..." in explanations
 
 
 def test_the_command_shows_and_writes(runs, gnio, mistake, monkeypatch):

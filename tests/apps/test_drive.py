@@ -268,17 +268,21 @@ def test_the_command_takes_a_car_or_recognises_it(tmp_path, gnio, mistake):
     file, settings = tmp_path / "drive.hdf5", tmp_path / "van.yaml"
     write_hdf5(file, recording(fixes=lambda stamp: True))
     out = tmp_path / "out"
-    told = gnio("track", file, "--out", out, "--format", "geojson")
-    assert "tracked as a car" in told and "by no network" in told
-    assert "expected error at the end" in told and "start: " not in told and "warning" not in told
+    output = gnio("track", file, "--out", out, "--format", "geojson")
+    assert "tracked as a car" in output and "by no network" in output
+    assert (
+        "expected error at the end" in output
+        and "start: " not in output
+        and "warning" not in output
+    )
     assert (out / "trajectory.geojson").exists() and len(read_tum(out / "trajectory.txt").time)
     settings.write_text("data: {rate: 100.0, window_seconds: 0.2}\nfilter: {rest_gyro: -1}\n")
     assert "rest_gyro" in mistake("track", file, "--carrier", settings, "--out", tmp_path / "b")
     assert "no" in mistake("track", file, "--carrier", "boat", "--out", tmp_path / "b")
-    told = mistake("track", file, "--carrier", "pedestrian", "--out", tmp_path / "b")
-    assert "no filter of a car; write it as configs/drive.yaml" in told
-    told = mistake("track", file, "--carrier", "car", "--network", "pedestrian")
-    assert "leave it out with --carrier car" in told
+    message = mistake("track", file, "--carrier", "pedestrian", "--out", tmp_path / "b")
+    assert "no filter of a car; write it as configs/drive.yaml" in message
+    message = mistake("track", file, "--carrier", "car", "--network", "pedestrian")
+    assert "leave it out with --carrier car" in message
     assert not (tmp_path / "b").exists()
 
 

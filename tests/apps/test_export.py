@@ -39,11 +39,11 @@ def test_csv_and_tum_have_the_poses(tmp_path, monkeypatch, gnio):
     np.testing.assert_allclose(rows, expected, atol=1e-9)
     monkeypatch.chdir(tmp_path)
     export(tmp_path / "walk.txt", poses)
-    told = gnio("data", "export", "walk.txt", "walk.tum")
-    assert told == "walk.tum: 60 poses, 3.0 s\n"
+    output = gnio("data", "export", "walk.txt", "walk.tum")
+    assert output == "walk.tum: 60 poses, 3.0 s\n"
     again = read_tum(tmp_path / "walk.tum")
-    for field, own in zip(again, poses, strict=True):
-        np.testing.assert_allclose(field, own, atol=1e-9)
+    for field, original in zip(again, poses, strict=True):
+        np.testing.assert_allclose(field, original, atol=1e-9)
 
 
 def test_the_mcap_is_read_by_rosbags(tmp_path):
@@ -62,21 +62,21 @@ def test_the_mcap_is_read_by_rosbags(tmp_path):
     with Reader(tmp_path / "walk.mcap") as reader:
         for one in reader.connections:
             store.register(get_types_from_msg(one.msgdef.data, one.msgtype))
-        found = [
+        messages = [
             (one.topic, time, store.deserialize_cdr(data, one.msgtype))
             for one, time, data in reader.messages()
         ]
-    odometry = [message for topic, _, message in found if topic == "/odometry"]
-    (path,) = [message for topic, _, message in found if topic == "/path"]
-    times = [time for topic, time, _ in found if topic == "/odometry"]
+    odometry = [message for topic, _, message in messages if topic == "/odometry"]
+    (path,) = [message for topic, _, message in messages if topic == "/path"]
+    times = [time for topic, time, _ in messages if topic == "/odometry"]
     np.testing.assert_allclose(np.array(times) * 1e-9, TIME, atol=1e-6)
-    for message, stamped, place in zip(odometry, path.poses, poses.position, strict=True):
+    for message, stamped, position in zip(odometry, path.poses, poses.position, strict=True):
         assert (message.header.frame_id, message.child_frame_id) == ("odom", "imu")
         point, other = message.pose.pose.position, stamped.pose.position
-        assert (point.x, point.y, point.z) == (other.x, other.y, other.z) == tuple(place)
+        assert (point.x, point.y, point.z) == (other.x, other.y, other.z) == tuple(position)
         assert message.header.stamp == stamped.header.stamp
-    moved = [message.transforms for topic, _, message in found if topic == "/tf"]
-    assert len(moved) == 60 and all(len(each) == 1 for each in moved)
+    moved = [message.transforms for topic, _, message in messages if topic == "/tf"]
+    assert len(moved) == 60 and all(len(transforms) == 1 for transforms in moved)
     one, turn = moved[41][0], moved[41][0].transform.rotation
     assert (one.header.frame_id, one.child_frame_id) == ("odom", "imu")
     assert one.header.stamp == odometry[41].header.stamp

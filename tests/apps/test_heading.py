@@ -137,7 +137,7 @@ def held(tmp_path_factory):
     folder = tmp_path_factory.mktemp("held")
     model = ModelConfig(name="tiny", equivariance="device_heading")
     windows = dataclasses.replace(CONFIG.data, rate=50.0)
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         tiny_run.save(folder / "run", TrainConfig(data=windows, model=model))
         lines = (ROOT / "examples" / "walk.csv").read_text().splitlines()[:802]
         (folder / "walk.csv").write_text("\n".join(lines) + "\n")
@@ -162,8 +162,8 @@ def test_every_command_hides_the_axes(gnio, mistake, undrawn, held, tmp_path):
         odometry = gnio_jax.track(*samples, network=run, heading=source)
         np.testing.assert_allclose(odometry.position, paths[source], atol=1e-6)
     assert np.abs(paths["device"] - paths["gait"]).max() > 1e-2
-    told = mistake("track", walk, "--heading", "gait", "--carrier", "car")
-    assert "--heading gait: is for people" in told
+    message = mistake("track", walk, "--heading", "gait", "--carrier", "car")
+    assert "--heading gait: is for people" in message
     with pytest.raises(InputError, match=r"^heading: must be 'device' or 'gait', found 'Gait'"):
         gnio_jax.track(*samples, network=run, heading="Gait")
 
@@ -175,9 +175,9 @@ def test_no_error_is_stated_beside_the_warning(gnio, undrawn, held, tmp_path, mo
     monkeypatch.setattr(heading, "misalignment", lambda *_: heading.MISALIGNED - 1.0)
     assert shown in gnio(*words, tmp_path / "ahead")
     monkeypatch.setattr(heading, "misalignment", lambda *_: heading.MISALIGNED + 1.0)
-    told = gnio(*words, tmp_path / "across")
-    assert told.startswith("warning: heading: by the gait, the carrier walks 61° to the left")
-    assert shown not in told
+    output = gnio(*words, tmp_path / "across")
+    assert output.startswith("warning: heading: by the gait, the carrier walks 61° to the left")
+    assert shown not in output
     summary = json.loads((tmp_path / "across" / "summary.json").read_text())
     assert "expected_error" not in summary and summary["warnings"][0].startswith("heading: ")
     assert shown in gnio(*words, tmp_path / "gait", "--heading", "gait")

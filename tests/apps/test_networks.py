@@ -34,7 +34,7 @@ class Found(Exception):
 def parent(tmp_path_factory):
     """A run `walk` of a tiny network, and `package.zip` and `named`, which are published."""
     parent = tmp_path_factory.mktemp("networks")
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig("tiny"))
         network = read_network(tiny_run.save(parent / "walk", config))
         card = Card("named", "tiny", "simulated walks", "CC0", 1, 0, "", "a test", {})
@@ -60,9 +60,9 @@ def test_every_command_takes_every_form(command, parent, gnio, undrawn, monkeypa
     forms = {parent / "package.zip": parent / "package.zip", "named": parent / "names" / "named"}
     forms |= {run: run} if command != "out of fold" else {}
     for network, path in forms.items():
-        with pytest.raises(Found) as found:
+        with pytest.raises(Found) as error:
             gnio(*COMMANDS[command].format(network=network, run=run).split())
-        assert found.value.args == (path,)
+        assert error.value.args == (path,)
 
 
 def test_a_name_is_evaluated_at_once(parent, gnio, monkeypatch, tmp_path):
@@ -73,11 +73,11 @@ def test_a_name_is_evaluated_at_once(parent, gnio, monkeypatch, tmp_path):
     words = ("--dataset", "synthetic", "--split", "val", "--estimator", "integrate", "--no-plots")
     figures = []
     for network in ("named", parent / "package.zip", parent / "walk"):
-        told = gnio("evaluate", "--network", network, *words)
-        place = parent / "walk" / "eval" if network == parent / "walk" else Path("evaluations")
-        place = place if network == parent / "walk" else place / Path(network).stem
-        report = place / "synthetic_val_integrate" / "metrics.json"
-        assert f"results: {report.parent}" in told
+        output = gnio("evaluate", "--network", network, *words)
+        results = parent / "walk" / "eval" if network == parent / "walk" else Path("evaluations")
+        results = results if network == parent / "walk" else results / Path(network).stem
+        report = results / "synthetic_val_integrate" / "metrics.json"
+        assert f"results: {report.parent}" in output
         figures.append(json.loads(report.read_text())["mean"])
     assert sorted((parent / "names").rglob("*")) == before
     for other in figures[1:]:

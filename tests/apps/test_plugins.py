@@ -93,11 +93,11 @@ def registries(monkeypatch):
 def package(registries, tmp_path, monkeypatch):
     """An installed package with an entry point, and a folder of its dataset."""
     site, root = tmp_path / "site", tmp_path / "npz"
-    about = site / "stranger-1.0.dist-info"
-    about.mkdir(parents=True)
+    dist_info = site / "stranger-1.0.dist-info"
+    dist_info.mkdir(parents=True)
     (site / "stranger.py").write_text(PLUGIN, encoding="utf-8")
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[gnio_jax.plugins]\nwalks = stranger\n")
+    (dist_info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+    (dist_info / "entry_points.txt").write_text("[gnio_jax.plugins]\nwalks = stranger\n")
     monkeypatch.syspath_prepend(str(site))
     for number, split in enumerate(("train", "train", "val", "test")):
         walk = simulated.pedestrian(number, number, "handheld", 15.0, 50.0)
@@ -126,8 +126,8 @@ def test_the_commands_use_what_an_installed_package_registers(gnio, package, tmp
     rows = np.column_stack([walk.time, walk.gyro, walk.accel])
     np.savetxt(tmp_path / "walk.csv", rows, delimiter=",", header=header, comments="")
     file, units = tmp_path / "walk.csv", ("--gyro-unit", "rad/s", "--accel-unit", "m/s2")
-    told = gnio("track", file, *units, "--network", run, "--out", tmp_path / "track")
-    assert "results: " in told
+    output = gnio("track", file, *units, "--network", run, "--out", tmp_path / "track")
+    assert "results: " in output
 
 
 def test_a_file_is_a_plugin_too_and_a_broken_one_is_named(registries, tmp_path, monkeypatch):

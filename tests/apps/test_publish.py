@@ -36,7 +36,7 @@ SAID = ("simulated walks", "CC0", ("Running | jumping.",))
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run of the smallest network, with the figures of one evaluation."""
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         folder = tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", tiny_run.CONFIGURED)
         evaluation = folder / "eval" / "synthetic_test_ekf"
         evaluation.mkdir(parents=True)
@@ -71,22 +71,22 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run,
         assert words in card
     assert "calibrate" not in card and "fitted" not in card
     assert publishing._shorten("/home/some body/first run") == "'runs/first run'"
-    own = shutil.copytree(run, tmp_path / "walk_calibrated")
+    copy = shutil.copytree(run, tmp_path / "walk_calibrated")
     legs = [{"leg_ratio": ratio, "waypoint_rms": 2.0} for ratio in (0.75, 0.85, 0.75, 0.85)]
-    scores = {name: Measures(each, {}, False) for name, each in zip("abcd", legs, strict=True)}
+    scores = {name: Measures(leg, {}, False) for name, leg in zip("abcd", legs, strict=True)}
     figures = report.Report(SETTINGS, scores, {}, {name: name for name in scores}, {}, {})
-    write_report(own / "eval" / "mall_test_ekf", figures)
+    write_report(copy / "eval" / "mall_test_ekf", figures)
     for calibrated, shown in (("runs/half", "half"), ("walk", "walk"), ("other/run", "run")):
-        (own / "calibration.json").write_text(json.dumps({"run": calibrated, "split": "val"}))
-        publish(own, tmp_path / "package", "walk", *SAID)
+        (copy / "calibration.json").write_text(json.dumps({"run": calibrated, "split": "val"}))
+        publish(copy, tmp_path / "package", "walk", *SAID)
         card = read_text(tmp_path / "package")
         assert f"gnio calibrate --network runs/{shown}\n" in card
         assert f"The filter is fitted to split `val` of run `{shown}`." in card
-    (line,) = (each for each in card.splitlines() if each.startswith("| mall_test_ekf"))
+    (line,) = (row for row in card.splitlines() if row.startswith("| mall_test_ekf"))
     for fitted, options in (("measurement noise window", ""), ("noise", " --fit noise")):
         calibration = {"run": "walk", "split": "val", "fitted": fitted.split()}
-        (own / "calibration.json").write_text(json.dumps(calibration))
-        publish(own, tmp_path / "package", "walk", *SAID)
+        (copy / "calibration.json").write_text(json.dumps(calibration))
+        publish(copy, tmp_path / "package", "walk", *SAID)
         assert f"--network runs/walk{options}\n" in read_text(tmp_path / "package")
     assert line.endswith("| – | – | 0.80 (0.71 to 0.89) | 2.00 (2.00 to 2.00) |")
 
@@ -134,12 +134,12 @@ def test_a_published_network_is_published_again(published, monkeypatch, tmp_path
 
 def test_the_command(run, tmp_path, gnio, mistake):
     out = tmp_path / "mine.zip"
-    given = ["publish", run, "--out", out, "--data", "walks \x1b[2J", "--license", "CC0"]
-    told = gnio(*given, "--fails", "Running.", "Cars.")
-    assert f"{out}: mine, network tiny" in told and "gnio track RECORDING --network" in told
+    arguments = ["publish", run, "--out", out, "--data", "walks \x1b[2J", "--license", "CC0"]
+    output = gnio(*arguments, "--fails", "Running.", "Cars.")
+    assert f"{out}: mine, network tiny" in output and "gnio track RECORDING --network" in output
     assert read_card(out).license == "CC0"
     assert "\x1b" not in gnio("weights", out)  # of a stranger's card nothing reaches the terminal
-    gnio(*given)  # in the place of the first
+    gnio(*arguments)  # in the place of the first
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").write_text("mine")
     (tmp_path / "other" / "README.md").write_text("---\ntitle: mine\n---\n")
@@ -148,5 +148,5 @@ def test_the_command(run, tmp_path, gnio, mistake):
         (["--name", "a/b"], "not the name of a folder"),
         (["--license", " "], "--license: is empty"),
     ):
-        assert words in mistake(*given, *wrong)
+        assert words in mistake(*arguments, *wrong)
     assert (tmp_path / "other" / "thesis.txt").read_text() == "mine"

@@ -25,7 +25,7 @@ def recording_of(walk, rate=50.0):
 
 
 def seconds(column):
-    return np.array([each.total_seconds() for each in column])
+    return np.array([stamp.total_seconds() for stamp in column])
 
 
 def test_the_file_is_read_back(tmp_path):
@@ -35,22 +35,22 @@ def test_the_file_is_read_back(tmp_path):
     walk = with_covariance(walk, np.tile(covariance, (400, 1, 1)))
     path = tmp_path / "walks.rrd"
     rerun.write(path, [walk, blind], [recording_of(walk), recording_of(blind)], "none")
-    assert [each.name for each in tmp_path.iterdir()] == ["walks.rrd"]
-    found = columns_of(path)
-    assert "/blind/estimate" in found and "/blind/reference" not in found
+    assert [file.name for file in tmp_path.iterdir()] == ["walks.rrd"]
+    columns = columns_of(path)
+    assert "/blind/estimate" in columns and "/blind/reference" not in columns
     for kind, of in (("estimate", walk.trajectory), ("reference", walk.reference)):
-        ((line,),) = found[f"/room_1_walk/{kind}"]["LineStrips3D:strips"]
+        ((line,),) = columns[f"/room_1_walk/{kind}"]["LineStrips3D:strips"]
         np.testing.assert_allclose(line, of.position, atol=1e-5)
-    ellipsoid = found["/room_1_walk/ellipsoid"]
+    ellipsoid = columns["/room_1_walk/ellipsoid"]
     (size,), (turn,) = (ellipsoid[f"Ellipsoids3D:{x}"][7] for x in ("half_sizes", "quaternions"))
     axes = Rotation.from_quat(turn).as_matrix()
     np.testing.assert_allclose(axes @ np.diag(np.square(size) / 9) @ axes.T, covariance, atol=1e-5)
-    gate = found["/room_1_walk/gate"]
+    gate = columns["/room_1_walk/gate"]
     rows = ~np.isnan(walk.displacements.value[:, 0])
     np.testing.assert_allclose(seconds(gate["time"]), 0.1 * np.flatnonzero(rows), atol=1e-6)
-    own = walk.displacements.diagnostics["gate"][rows]
-    np.testing.assert_allclose(gate["Scalars:scalars"], own)
-    gyro = found["/room_1_walk/imu/gyro"]
+    expected = walk.displacements.diagnostics["gate"][rows]
+    np.testing.assert_allclose(gate["Scalars:scalars"], expected)
+    gyro = columns["/room_1_walk/imu/gyro"]
     np.testing.assert_allclose(seconds(gyro["time"])[[0, -1]], [0.0, 39.88], atol=1e-6)
     np.testing.assert_allclose(gyro["Scalars:scalars"], recording_of(walk).gyro)
 

@@ -38,8 +38,8 @@ class Recorder:
         if len(self.samples) % 2:
             return None
         moved = np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
-        known = BIAS, np.zeros(3), COVARIANCE, 1.0, 1.0, True
-        return Pose(time, TURN.as_matrix(), *moved, *known)
+        remaining_fields = BIAS, np.zeros(3), COVARIANCE, 1.0, 1.0, True
+        return Pose(time, TURN.as_matrix(), *moved, *remaining_fields)
 
 
 def message(sec, nanosec, gyro=(0.1, 0.2, 0.3), accel=(0.0, 1.0, 9.8)):
@@ -50,10 +50,10 @@ def message(sec, nanosec, gyro=(0.1, 0.2, 0.3), accel=(0.0, 1.0, 9.8)):
 
 def test_messages_become_odometry(bridge):
     tracker = Recorder()
-    found = bridge.Bridge(tracker)
+    relay = bridge.Bridge(tracker)
     # Unix time in float64 would keep 0.24 µs.
-    assert found.take(message(1_700_000_000, 999_999_999)) is None
-    odometry = found.take(message(1_700_000_001, 4_999_999))
+    assert relay.take(message(1_700_000_000, 999_999_999)) is None
+    odometry = relay.take(message(1_700_000_001, 4_999_999))
     first = (0.0, (0.1, 0.2, 0.3), (0.0, 1.0, 9.8))
     assert tracker.samples[0] == first and tracker.samples[1][0] == 5e-3
     assert odometry.stamp == (1_700_000_001, 4_999_999)
@@ -73,14 +73,14 @@ def test_messages_become_odometry(bridge):
 
 
 def test_what_is_refused_and_what_diverged_is_not_published(bridge):
-    found = bridge.Bridge(Recorder())
-    found.take(message(5, 0))
-    assert found.take(message(5, 0)) is None
-    assert found.refused == 1 and found.reason.startswith("time: must increase")
-    assert found.take(message(5, 10_000_000)) is not None
+    relay = bridge.Bridge(Recorder())
+    relay.take(message(5, 0))
+    assert relay.take(message(5, 0)) is None
+    assert relay.refused == 1 and relay.reason.startswith("time: must increase")
+    assert relay.take(message(5, 10_000_000)) is not None
     tracker = Recorder()
     sound = tracker.push
     tracker.push = lambda *sample: (pose := sound(*sample)) and pose._replace(healthy=False)
-    found = bridge.Bridge(tracker)
-    assert [found.take(message(5, k)) for k in range(4)] == [None] * 4
-    assert found.refused == 2 and "diverged" in found.reason
+    relay = bridge.Bridge(tracker)
+    assert [relay.take(message(5, k)) for k in range(4)] == [None] * 4
+    assert relay.refused == 2 and "diverged" in relay.reason

@@ -41,7 +41,7 @@ CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
 def runs(tmp_path_factory):
     """`walker` says something of each window, `mute` nothing: zero, give or take a metre."""
     folder = tmp_path_factory.mktemp("home") / "runs"
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         settings = changed(considered={"raw_gyro_bias": 0.02})
         settings = dataclasses.replace(settings, measurements={"zero_velocity": {"std": 0.02}})
         tiny_run.save(folder / "mute", dataclasses.replace(CONFIG, filter=settings), size=0.0)
@@ -76,12 +76,12 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     entries = imu + bag_files.poses(make, "Odometry", one, child="imu_link")
     walk = bag_files.write(tmp_path, "mcap", entries)
     out = tmp_path / "track"
-    given = ["track", walk, "--network", runs / "walker", "--out", out, "--format", "csv"]
+    arguments = ["track", walk, "--network", runs / "walker", "--out", out, "--format", "csv"]
     rerun = tmp_path / "walk.rrd"
     if importlib.util.find_spec("rerun"):
-        given += ["--rerun", rerun]
-    told = gnio(*given)
-    assert rerun.exists() == ("--rerun" in given)
+        arguments += ["--rerun", rerun]
+    output = gnio(*arguments)
+    assert rerun.exists() == ("--rerun" in arguments)
     names = "reference.txt report.html summary.json track.png trajectory.csv trajectory.txt"
     assert sorted(path.name for path in out.iterdir()) == names.split()
     page = (out / "report.html").read_text(encoding="utf-8")
@@ -98,27 +98,29 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     np.testing.assert_allclose(summary["path_length"], length, atol=1e-6)
     np.testing.assert_allclose(summary["from_start"], np.hypot(*path.position[-1, :2]), atol=1e-6)
     assert summary["climb"] == pytest.approx(np.ptp(path.position[:, 2]), abs=1e-6)
-    assert summary["running"] == 0.0 and "gyro: raw" not in told
+    assert summary["running"] == 0.0 and "gyro: raw" not in output
     reference = read_tum(out / "reference.txt")
-    place = known_walk.position(reference.time - bag_files.EPOCH * 1e-9)
-    np.testing.assert_allclose(reference.position, place, atol=5e-3)
+    expected = known_walk.position(reference.time - bag_files.EPOCH * 1e-9)
+    np.testing.assert_allclose(reference.position, expected, atol=5e-3)
     # The error with the starts aligned, by hand.
     rows = np.isin(np.round(path.time, 3), np.round(reference.time, 3))
     moved = path.position[rows] - path.position[rows][0]
     firsts = [reference.orientation[0], path.orientation[np.flatnonzero(rows)[0]]]
-    true, own = Rotation.from_quat(firsts, scalar_first=True).as_matrix()
-    turn = true @ own.T
+    true, estimate = Rotation.from_quat(firsts, scalar_first=True).as_matrix()
+    turn = true @ estimate.T
     angle = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
     moved = Rotation.from_euler("z", angle).apply(moved)
     error = (moved - (reference.position - reference.position[0]))[:, :2]
     ate = np.sqrt((error**2).sum(axis=1).mean())
     np.testing.assert_allclose(summary["errors"]["ate_2d"], ate, rtol=1e-3)
-    assert f"{ate:.2f} m" in told and "against the reference" in told
-    assert "warning: calibration: the filter's covariances were not calibrated" in told
-    assert "network walker: its error was not measured (gnio evaluate)" in told
-    assert f"expected error at the end {summary['expected_error']:.1f} m" in " ".join(told.split())
-    assert summary["steps"] == 1.0 and "time with steps" in told
-    assert "IMU /imu/data" in told and f"results: {out}" in told
+    assert f"{ate:.2f} m" in output and "against the reference" in output
+    assert "warning: calibration: the filter's covariances were not calibrated" in output
+    assert "network walker: its error was not measured (gnio evaluate)" in output
+    assert f"expected error at the end {summary['expected_error']:.1f} m" in " ".join(
+        output.split()
+    )
+    assert summary["steps"] == 1.0 and "time with steps" in output
+    assert "IMU /imu/data" in output and f"results: {out}" in output
 
 
 def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
@@ -131,16 +133,16 @@ def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
     rows = np.delete(np.arange(600), np.s_[560:580])
     table = csv(tmp_path / "table.csv", time[rows], gyro[rows], accel[rows])
     out = tmp_path / "track"
-    told = gnio("track", table, "--network", runs / "mute", "--out", out, "--gyro-unit", "rad/s")
+    output = gnio("track", table, "--network", runs / "mute", "--out", out, "--gyro-unit", "rad/s")
     path = read_tum(out / "trajectory.txt")
     assert np.linalg.norm(path.position, axis=1).max() < 0.05
     turned = Rotation.from_quat(path.orientation[-1], scalar_first=True).magnitude()
     assert turned < np.radians(0.5)  # the bias, 1.5° in this time, is that of the rest
-    assert "warning: rest: it lies still" in told and "it moves" not in told
-    assert "gyro bias: mean of 5 s of rest" in told
-    assert "warning: calibration: " in told  # its gyro does not count as raw
-    assert told.startswith("warning: no walk: there are no steps")
-    assert "expected error" not in told + (out / "report.html").read_text(encoding="utf-8")
+    assert "warning: rest: it lies still" in output and "it moves" not in output
+    assert "gyro bias: mean of 5 s of rest" in output
+    assert "warning: calibration: " in output  # its gyro does not count as raw
+    assert output.startswith("warning: no walk: there are no steps")
+    assert "expected error" not in output + (out / "report.html").read_text(encoding="utf-8")
     assert "expected_error" not in summary_of(out)
 
 
@@ -148,17 +150,17 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_
     time = np.delete(np.arange(120), np.s_[60:70]) / 20
     slow = csv(tmp_path / "slow.csv", time)
     monkeypatch.setattr("gnio_jax.networks.find.SHIPPED", tmp_path)
-    told = gnio("track", slow)
+    output = gnio("track", slow)
     folder = runs.parent / "tracks" / "slow"
     assert summary_of(folder)["network"] == "walker"
-    assert "lacks samples 1 times, for up to 0.55 s" in told and "warning: gaps:" in told
+    assert "lacks samples 1 times, for up to 0.55 s" in output and "warning: gaps:" in output
     rate = "rate: recorded at 20 Hz, the network was trained at 50 Hz: the content above 10 Hz"
-    assert f"warning: {rate}" in told
-    assert "warning: start: it moves in its first second" in told
-    assert "gyro bias: no rest at the start (quieter than a hand)" in told
+    assert f"warning: {rate}" in output
+    assert "warning: start: it moves in its first second" in output
+    assert "gyro bias: no rest at the start (quieter than a hand)" in output
     gnio("data", "import", slow, "--out", tmp_path / "slow.h5")
     again = gnio("track", tmp_path / "slow.h5", "--out", tmp_path / "again")
-    of_gaps = [line for line in told.splitlines() if "lacks samples" in line or "gaps" in line]
+    of_gaps = [line for line in output.splitlines() if "lacks samples" in line or "gaps" in line]
     assert len(of_gaps) == 3 and set(of_gaps) <= set(again.splitlines())
     assert summary_of(tmp_path / "again")["notes"] == summary_of(folder)["notes"]
     ours, theirs = (read_tum(x / "trajectory.txt").position for x in (tmp_path / "again", folder))
@@ -180,15 +182,15 @@ def test_what_is_refused(mistake, runs, tmp_path, monkeypatch):
     assert "were recorded for 0.49 s" in mistake("track", short, *weights)
     members = logger_files.sensor_logger()
     walk = logger_files.zipped(tmp_path / "walk.zip", members)
-    given = ("track", walk, *weights)
+    arguments = ("track", walk, *weights)
     thesis = tmp_path / "mine" / "thesis.txt"
     thesis.parent.mkdir()
     thesis.write_text("mine")
     (thesis.parent / "summary.json").write_text("{}")
-    assert "is not an earlier track" in mistake(*given, "--out", thesis.parent)
-    assert "is not an earlier track" in mistake(*given, "--out", thesis)
+    assert "is not an earlier track" in mistake(*arguments, "--out", thesis.parent)
+    assert "is not an earlier track" in mistake(*arguments, "--out", thesis)
     assert thesis.read_text() == "mine"
-    assert f"{walk}: " in mistake(*given, "--out", walk / "track")
+    assert f"{walk}: " in mistake(*arguments, "--out", walk / "track")
     assert "no such network" in mistake("track", walk, "--network", "walkr2")
     del members["TotalAcceleration.csv"], members["Accelerometer.csv"]
     del members["AccelerometerUncalibrated.csv"], members["Gravity.csv"]
@@ -206,39 +208,45 @@ def without_poses(name, time):
 
 def test_our_own_file_with_holes(gnio, undrawn, mistake, runs, tmp_path):
     """It comes to the tracker as it is: nobody has looked for holes yet."""
-    given = ("track", tmp_path / "walk.h5", "--network", runs / "walker")
+    arguments = ("track", tmp_path / "walk.h5", "--network", runs / "walker")
     for lost, name in ((70, "../../walk"), (320, "walk")):
         time = np.delete(np.arange(900), np.s_[200 : 200 + lost])[:530] / 100
         sequence = without_poses(name, time)
         write_hdf5(tmp_path / "walk.h5", sequence)
         if lost == 70:
             # Whatever the file says of itself, the folder lies in tracks/.
-            told = gnio(*given)
-            assert "warning: gaps: samples are missing, and nothing shows the turn" in told
+            output = gnio(*arguments)
+            assert "warning: gaps: samples are missing, and nothing shows the turn" in output
             assert (runs.parent / "tracks" / "_.._walk" / "summary.json").is_file()
         else:
-            told = mistake(*given)
-            assert "walk: field 'time' has a gap of 3.210 s after row 200, longer than 1 s" in told
+            message = mistake(*arguments)
+            assert (
+                "walk: field 'time' has a gap of 3.210 s after row 200, longer than 1 s" in message
+            )
             # The same on a clock that runs through the hole.
             write_hdf5(tmp_path / "walk.h5", resample(sequence, 100.0))
-            assert "walk: field 'time' has a gap of 3.210 s" in mistake(*given)
+            assert "walk: field 'time' has a gap of 3.210 s" in mistake(*arguments)
 
 
 def test_a_recording_with_waypoints_is_compared_with_them(gnio, runs, tmp_path):
     time = np.delete(np.arange(620), np.s_[560:580]) / 100
     taps = Waypoints(time[[0, 200, 400, 599]], known_walk.position(time[[0, 200, 400, 599]])[:, :2])
     write_hdf5(tmp_path / "mall.h5", without_poses("mall", time)._replace(waypoints=taps))
-    given = ("--network", runs / "walker", "--out", tmp_path / "t")
-    told = gnio("track", tmp_path / "mall.h5", *given)
+    options = ("--network", runs / "walker", "--out", tmp_path / "t")
+    output = gnio("track", tmp_path / "mall.h5", *options)
     errors = summary_of(tmp_path / "t")["errors"]
     # By hand: the lengths of the legs do not depend on the alignment.
     path = read_tum(tmp_path / "t" / "trajectory.txt")
-    there = [np.interp(taps.time, path.time - path.time[0], path.position[:, k]) for k in (0, 1)]
-    ours, true = (np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (np.array(there).T, taps[1]))
+    coordinates = [
+        np.interp(taps.time, path.time - path.time[0], path.position[:, k]) for k in (0, 1)
+    ]
+    ours, true = (
+        np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (np.array(coordinates).T, taps[1])
+    )
     assert errors["leg_path_ratio"] == pytest.approx(ours.sum() / true.sum(), rel=1e-3)
     shown = f"waypoint rms (against the reference) {errors['waypoint_rms']:.2f} m"
-    assert shown in " ".join(told.split())
-    assert "ate" not in errors and "ATE" not in told
+    assert shown in " ".join(output.split())
+    assert "ate" not in errors and "ATE" not in output
     page = (tmp_path / "t" / "report.html").read_text(encoding="utf-8")
     assert "at waypoints" in page and "one turn and one shift" in page
 
@@ -249,20 +257,22 @@ def test_a_reference_of_a_part_is_no_figure_of_the_whole(gnio, runs, tmp_path, m
     The recording has a raw gyro and shakes as a runner's after its first second.
     """
     shown = []
-    monkeypatch.setattr("gnio_jax.evaluation.page.write", lambda *given: shown.extend(given[2]))
+    monkeypatch.setattr(
+        "gnio_jax.evaluation.page.write", lambda *arguments: shown.extend(arguments[2])
+    )
     time = np.delete(np.arange(620), np.s_[560:580]) / 100
-    known = (time >= 2.0) & (time < 3.5)
-    place, level = known_walk.position(time), np.tile([1.0, 0, 0, 0], (len(time), 1))
-    poses = {"position": place, "velocity": known_walk.velocity(time), "orientation": level}
-    poses = {name: np.where(known[:, None], values, np.nan) for name, values in poses.items()}
-    walk = without_poses("part", time)._replace(valid=known, **poses)
+    coverage = (time >= 2.0) & (time < 3.5)
+    position, level = known_walk.position(time), np.tile([1.0, 0, 0, 0], (len(time), 1))
+    poses = {"position": position, "velocity": known_walk.velocity(time), "orientation": level}
+    poses = {name: np.where(coverage[:, None], values, np.nan) for name, values in poses.items()}
+    walk = without_poses("part", time)._replace(valid=coverage, **poses)
     shaken = walk.accel * (1 + 0.9 * np.sin(18.0 * time) * (time > 1.0))[:, None]
     walk = walk._replace(accel=shaken, attributes={"imu_compensated": "no"})
     write_hdf5(tmp_path / "part.h5", walk)
-    given = ("--network", runs / "walker", "--out", tmp_path / "t")
-    told = gnio("track", tmp_path / "part.h5", *given)
-    assert "warning: gyro: raw, and without a rest that shows its bias" in told
-    assert "warning: running: in 83% of the seconds it is shaken as in a run" in told
+    options = ("--network", runs / "walker", "--out", tmp_path / "t")
+    output = gnio("track", tmp_path / "part.h5", *options)
+    assert "warning: gyro: raw, and without a rest that shows its bias" in output
+    assert "warning: running: in 83% of the seconds it is shaken as in a run" in output
     summary = summary_of(tmp_path / "t")
     assert summary["running"] == pytest.approx(5 / 6)
     figures = shown[0].figures["part"]
@@ -280,8 +290,8 @@ def test_the_start_is_as_sure_as_the_filter_of_the_run_says(runs, tmp_path, monk
 
     monkeypatch.setattr("gnio_jax.apps.track.prepare", prepare)
     network = read_network(runs / "walker")
-    own = dataclasses.replace(changed(start={"velocity": 0.7}), raw_gyro_bias=0.02)
-    network = network._replace(config=dataclasses.replace(network.config, filter=own))
+    settings = dataclasses.replace(changed(start={"velocity": 0.7}), raw_gyro_bias=0.02)
+    network = network._replace(config=dataclasses.replace(network.config, filter=settings))
     walk = Imported(without_poses("walk", np.arange(620) / 100), (), ())
     with pytest.raises(InterruptedError):
         track(walk, network, tmp_path / "t")
@@ -311,9 +321,9 @@ FILTER = make_filter(DataConfig(), FilterSettings(measurements={"zero_velocity":
 )
 def test_what_is_worth_a_warning(changes, words):
     summary = SUMMARY._replace(**changes)
-    found = _warnings_of_walk(summary, 1.0 / FILTER.config.dt, FILTER)
-    found += _warnings_of_errors(summary)
-    assert [line[: len(words)] for line in found] == [words] if words else found == []
+    warnings = _warnings_of_walk(summary, 1.0 / FILTER.config.dt, FILTER)
+    warnings += _warnings_of_errors(summary)
+    assert [line[: len(words)] for line in warnings] == [words] if words else warnings == []
 
 
 def test_a_filter_that_does_not_measure_rest_is_not_said_to_hold_the_position():
@@ -341,13 +351,13 @@ def test_a_track_that_diverged_has_no_expected_error(runs):
     walk = without_poses("walk", np.arange(620) / 100)
     network = read_network(runs / "walker")
     estimate, ready, ekf, *_ = estimate_recording(walk, {}, network)
-    given = ({}, ready, Imported(walk, (), ()), network, ekf)
-    assert summarise(estimate, *given).expected_error > 0
+    arguments = ({}, ready, Imported(walk, (), ()), network, ekf)
+    assert summarise(estimate, *arguments).expected_error > 0
     path = estimate.trajectory
     early = np.arange(len(path.time))[:, None] < 2
     lost = path._replace(position=np.where(early, path.position, np.nan))
     note = "filter: diverged at 0.1 s (a cause)"
-    summary = summarise(estimate._replace(trajectory=lost, notes=(note,)), *given)
+    summary = summarise(estimate._replace(trajectory=lost, notes=(note,)), *arguments)
     assert np.isnan(summary.expected_error) and summary.warnings[0] == note
 
 

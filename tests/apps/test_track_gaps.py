@@ -32,18 +32,18 @@ DRAWS = 24
 def recordings():
     """Parts of one walk, each with a hole and with the truth before it alone."""
     stamps = np.arange(0, SECONDS + 0.5 / RATE, 1 / RATE)
-    kept = stamps[(stamps < HOLE[0] + 1e-9) | (stamps > HOLE[1] - 1e-9)]
+    recorded_stamps = stamps[(stamps < HOLE[0] + 1e-9) | (stamps > HOLE[1] - 1e-9)]
     for begin in np.linspace(0.0, 170.0, DRAWS):
-        time = begin + kept
+        time = begin + recorded_stamps
         sequence = Sequence(
             name=f"{begin:.2f}",
-            time=kept,
+            time=recorded_stamps,
             gyro=known_walk.rate(time),
             accel=known_walk.force(time),
             orientation=known_walk.attitude(time).as_quat(scalar_first=True),
             position=known_walk.position(time),
             velocity=known_walk.velocity(time),
-            valid=np.ones(len(kept), bool),
+            valid=np.ones(len(recorded_stamps), bool),
         )
         yield resample(sequence, RATE)
 
@@ -52,20 +52,22 @@ def nees(prepared):
     """Horizontal, of the position where the hole ends."""
     n = FILTER.config.samples_per_clone
     row = round(HOLE[1] * RATE) // n
-    mute = [no_displacements(each) for each in prepared]
+    mute = [no_displacements(recording) for recording in prepared]
     estimates = estimate(prepared, mute, WINDOWS, FILTER, DRAWS)
-    time = np.array([float(each.name) + HOLE[1] for each in estimates])
-    error = np.array([each.trajectory.position[row] for each in estimates])
+    time = np.array([float(part.name) + HOLE[1] for part in estimates])
+    error = np.array([part.trajectory.position[row] for part in estimates])
     error = (error - known_walk.position(time))[:, :2]
-    covariance = np.array([each.filtered.covariance[row, :2, :2] for each in estimates])
+    covariance = np.array([part.filtered.covariance[row, :2, :2] for part in estimates])
     return np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error) / 2
 
 
 @pytest.mark.slow
 def test_the_true_end_of_a_hole_lies_within_what_the_filter_says():
     prepared, _ = prepare(recordings(), WINDOWS, FILTER)
-    found = nees(prepared)
-    assert 0.4 < found.mean() < 1.6 and (2 * found < 11.8).mean() > 0.97  # 99.7 % of χ² with 2
+    errors = nees(prepared)
+    assert 0.4 < errors.mean() < 1.6 and (2 * errors < 11.8).mean() > 0.97  # 99.7 % of χ² with 2
     # The lines across the hole taken for measurements:
-    believed = [each._replace(imu_valid=np.ones_like(each.imu_valid)) for each in prepared]
+    believed = [
+        recording._replace(imu_valid=np.ones_like(recording.imu_valid)) for recording in prepared
+    ]
     assert nees(believed).mean() > 100.0

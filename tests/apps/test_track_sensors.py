@@ -33,7 +33,7 @@ CONFIG = TrainConfig(
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("home") / "runs"
-    with tiny_run.known(phone_walk.Pace):
+    with tiny_run.registry_entry(phone_walk.Pace):
         drawn_run.save(folder / "pace", CONFIG, lambda random, kind, shape: np.ones(shape))
         yield folder
 
@@ -55,7 +55,7 @@ def tracked(runs, folder, sequence, *without, formats=()):
 def error_of(result):
     """Horizontal and vertical error at every row, m; without fixes in the world of the walk."""
     path = result.estimate.trajectory
-    truth = phone_walk.place(path.time)
+    truth = phone_walk.true_position(path.time)
     if result.summary.origin is not None:
         truth = phone_walk.on_map(path.time)
         # The place of the start by the radii of curvature, as the fixes were made.
@@ -181,7 +181,7 @@ def test_every_set_of_sensors_is_run_once_and_the_field_is_fitted_once(monkeypat
     angle = phone_walk.TURN * ready.time
     zero = np.zeros_like(angle)
     turned = np.stack([np.cos(angle / 2), zero, zero, np.sin(angle / 2)], axis=1)
-    path = Trajectory(ready.time, phone_walk.place(ready.time), turned)
+    path = Trajectory(ready.time, phone_walk.true_position(ready.time), turned)
     first, runs_of_the_filter, fits = SequenceEstimate("walk", path, path), [], []
 
     def run(ready, _):
@@ -225,9 +225,9 @@ def test_the_screen_says_what_each_sensor_did(gnio, mistake, runs, tmp_path, mon
     walk = phone_walk.walk(seconds=60.0)
     write_hdf5(tmp_path / "walk.h5", walk)
     words = ("track", tmp_path / "walk.h5", "--network", runs / "pace", "--out", tmp_path / "t")
-    told = gnio(*words, "--without", "gnss", "--without", "magnetometer")
-    assert "barometer, 60 rows" in told and "% used" in told
-    assert "barometer: the end is" in told and "gnss" not in told
+    output = gnio(*words, "--without", "gnss", "--without", "magnetometer")
+    assert "barometer, 60 rows" in output and "% used" in output
+    assert "barometer: the end is" in output and "gnss" not in output
     summary = json.loads((tmp_path / "t" / "summary.json").read_text())
     assert [use["sensor"] for use in summary["sensors"]] == ["barometer"]
     assert len(read_tum(tmp_path / "t" / "trajectory.txt").time) > 500
@@ -297,7 +297,7 @@ def test_arrays_of_a_barometer_alone_in_any_order_give_the_height(runs, arrays):
     time, pressure = (part[::-1] for part in readings["barometer"])
     alone = {"barometer": (time, pressure[:, 0])}
     odometry = gnio_jax.track(*samples, network=runs / "pace", sensors=alone)
-    truth = phone_walk.place(odometry.time - START)[:, 2]
+    truth = phone_walk.true_position(odometry.time - START)[:, 2]
     assert odometry.origin is None and np.abs(odometry.position[:, 2] - truth).max() < 2.0
 
 

@@ -56,7 +56,7 @@ TRAINED = TrainConfig(
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", TRAINED)
 
 
@@ -123,7 +123,7 @@ def test_the_displacements_of_a_fit_have_the_networks_own_uncertainty(monkeypatc
         raise Finished(settings)
 
     monkeypatch.setattr(calibrating, "predict", predict)
-    with tiny_run.known(), pytest.raises(Finished) as caught:
+    with tiny_run.registry_entry(), pytest.raises(Finished) as caught:
         folder = tiny_run.save(tmp_path / "run", fitted)
         calibration.calibrate(CalibrateConfig(str(folder), out=str(tmp_path / "out")))
     (settings,) = caught.value.args
@@ -491,13 +491,13 @@ def test_the_consider_fit_has_the_arc_of_the_whole_yaw():
     """Positions far from the start, whose yaw is uncertain by 0.3 rad of which the filter knows a
     third: without the arc the radial errors of ½ ψ² l would be taken for other errors."""
     rng, rows, lever = np.random.default_rng(2), 4000, 40.0
-    known, unknown = 0.1, 0.28
-    psi = known * rng.standard_normal(rows) + unknown * rng.standard_normal(rows)
+    known_std, unknown = 0.1, 0.28
+    psi = known_std * rng.standard_normal(rows) + unknown * rng.standard_normal(rows)
     error = np.stack([lever * (np.cos(psi) - 1), lever * np.sin(psi), 0 * psi], axis=1)
     error += 0.1 * rng.standard_normal((rows, 3))
     along = np.array([0.0, lever, 0.0])
-    arc = np.diag([0.75 * known**4 * lever**2, 0.0, 0.0])
-    covariance = 0.01 * np.eye(3) + known**2 * np.outer(along, along) + arc
+    arc = np.diag([0.75 * known_std**4 * lever**2, 0.0, 0.0])
+    covariance = 0.01 * np.eye(3) + known_std**2 * np.outer(along, along) + arc
     yaw_sensitivity = np.zeros((rows, 6))
     yaw_sensitivity[:, 4] = 1.0  # the heading
     sensitivity = yaw_sensitivity[:, None] * along[None, :, None]
@@ -505,7 +505,7 @@ def test_the_consider_fit_has_the_arc_of_the_whole_yaw():
         error,
         np.tile(covariance, (rows, 1, 1)),
         sensitivity,
-        np.tile(known**2 * along, (rows, 1)),
+        np.tile(known_std**2 * along, (rows, 1)),
         yaw_sensitivity,
         np.zeros((rows, 3)),
         np.arange(rows),

@@ -55,9 +55,9 @@ def test_run_ends_in_one_line_and_a_status(main, status, line, capsys):
     if status is None:
         console.run(main)
     else:
-        with pytest.raises(SystemExit) as left:
+        with pytest.raises(SystemExit) as end:
             console.run(main)
-        assert left.value.code == status
+        assert end.value.code == status
     assert capsys.readouterr() == ("", line)
 
 
@@ -91,7 +91,7 @@ def test_names_of_files_are_no_controls_of_the_terminal(capsys):
     """A name may colour the terminal, retitle it or delete what it showed."""
     name = "walk\x1b]0;mine\x07\x1b[2J\x9b31m\u202e.zip"
 
-    def told():
+    def main():
         console.stdout().print(f"{name}: read", soft_wrap=True)
         grid = Table()
         grid.add_column(name, overflow="fold")
@@ -103,7 +103,7 @@ def test_names_of_files_are_no_controls_of_the_terminal(capsys):
         raise InputError(name, "no such file")
 
     with pytest.raises(SystemExit, match="2"):
-        console.run(told)
+        console.run(main)
     out, err = capsys.readouterr()
     assert not set(out + err) & set("\x1b\x07\x9b\u202e")
     assert r"walk\x1b]0;mine\x07\x1b[2J\x9b31m\u202e.zip: read" in out
@@ -157,7 +157,7 @@ def test_compiled_programs_are_kept(tmp_path, monkeypatch):
     (tmp_path / "file" / "gnio-jax").mkdir(parents=True)
     (tmp_path / "file" / "gnio-jax" / "compiled").write_text("")
     below = Path("gnio-jax") / "compiled"
-    for given, place in (
+    for variables, expected in (
         ({"HOME": str(tmp_path / "home")}, tmp_path / "home" / ".cache" / below),
         ({"XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": "own"}, "own"),
         ({"XDG_CACHE_HOME": str(tmp_path / "file")}, None),
@@ -167,11 +167,11 @@ def test_compiled_programs_are_kept(tmp_path, monkeypatch):
             for name in ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"):
                 patch.setenv(name, "")
                 patch.delenv(name)
-            for name, value in given.items():
+            for name, value in variables.items():
                 patch.setenv(name, value)
             console.keep_compiled_programs()
-            found = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-        assert found == (None if place is None else str(place)), given
+            cache_folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+        assert cache_folder == (None if expected is None else str(expected)), variables
     program = (
         "from gnio_jax.commands import console\n"
         "def main():\n    import jax\n"
@@ -179,9 +179,9 @@ def test_compiled_programs_are_kept(tmp_path, monkeypatch):
         "    print(jax.config.jax_compilation_cache_dir, jax.jit(lambda x: x + 1)(1.0))\n"
         "console.run(main)\n"
     )
-    kept = {name: value for name, value in os.environ.items() if "CACHE" not in name}
-    given = {"capture_output": True, "text": True, "timeout": 60}
-    environment = {**kept, "XDG_CACHE_HOME": str(tmp_path)}
-    shown = subprocess.run([sys.executable, "-c", program], env=environment, **given)
+    other_variables = {name: value for name, value in os.environ.items() if "CACHE" not in name}
+    options = {"capture_output": True, "text": True, "timeout": 60}
+    environment = {**other_variables, "XDG_CACHE_HOME": str(tmp_path)}
+    shown = subprocess.run([sys.executable, "-c", program], env=environment, **options)
     assert shown.stdout == f"{tmp_path / below} 2.0\n" and shown.stderr == ""
     assert any((tmp_path / below).iterdir())

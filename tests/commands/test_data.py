@@ -39,7 +39,7 @@ def mirror(parts):
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch):
     """An empty working folder, and no data anywhere else."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GNIO_DATA", raising=False)
@@ -62,9 +62,9 @@ def written(tmp_path_factory):
 
 
 @pytest.fixture
-def root(written, place):
+def root(written, folder):
     """A copy of it that a test may change."""
-    return shutil.copytree(written, place / "heads")
+    return shutil.copytree(written, folder / "heads")
 
 
 def row(out, name):
@@ -86,8 +86,8 @@ def test_list_tells_everything_and_reads_nothing(root, monkeypatch, capsys):
     text = " ".join(capsys.readouterr().out.split())
     for name in data.names():
         dataset = data.get(name)
-        about = f"{dataset.rate:g} Hz; splits {', '.join(dataset.splits)}; {dataset.licence}"
-        assert f"{name} {about} here " in text and f" source {dataset.source} " in text
+        description = f"{dataset.rate:g} Hz; splits {', '.join(dataset.splits)}; {dataset.licence}"
+        assert f"{name} {description} here " in text and f" source {dataset.source} " in text
         assert not dataset.needs_root or f" layout {dataset.layout} " in text
     for words in (
         "/tlio: 5 recordings (train 3, val 1, test 1)",
@@ -121,17 +121,17 @@ def test_check_shows_every_recording_with_its_figures_and_reasons(root, capsys):
     ):
         assert line in out
 
-    found = json.loads((root.parent / "out" / "figures.json").read_text())
-    ours, notes = found["sequences"], found.pop("notes")
+    report = json.loads((root.parent / "out" / "figures.json").read_text())
+    ours, notes = report["sequences"], report.pop("notes")
     assert len(notes) == 1 and list(ours) == ["fair", "tilted", "mirrored", "cut", "also"]
-    about = {"dataset": "tlio", "root": str(root), "split": "all", "sequences": ours}
-    assert found == about and not ours["cut"]["used"] and "cut short" in ours["cut"]["reason"]
+    expected = {"dataset": "tlio", "root": str(root), "split": "all", "sequences": ours}
+    assert report == expected and not ours["cut"]["used"] and "cut short" in ours["cut"]["reason"]
     assert ours["fair"]["used"] and ours["fair"]["failures"] == []
     assert ours["fair"]["gravity_mean"] == fair.gravity_mean.tolist()
-    with pytest.raises(SystemExit) as left:  # nothing is usable: the table is shown all the same
+    with pytest.raises(SystemExit) as end:  # nothing is usable: the table is shown all the same
         app.main(["data", "check", "tlio", "--data-root", str(root), "--split", "val"])
     out, err = capsys.readouterr()
-    assert left.value.code == 2 and "left out: cut: " in out
+    assert end.value.code == 2 and "left out: cut: " in out
     assert err == f"{root}: none of 1 sequences can be used; see the reasons above\n"
     # Also of those that are left out, if they can be drawn.
     pictures = sorted((root.parent / "pictures").iterdir())
@@ -140,20 +140,20 @@ def test_check_shows_every_recording_with_its_figures_and_reasons(root, capsys):
     assert picture[..., :3].std() > 0.05 and picture.shape[1] > picture.shape[0] > 300
 
 
-def test_check_of_recordings_without_poses_draws_them_all_the_same(place, capsys):
+def test_check_of_recordings_without_poses_draws_them_all_the_same(folder, capsys):
     """With waypoints, gravity and speed are asked for."""
     text = indoor_location_files.lines(seconds=19.0)
-    path = indoor_location_files.write(place / "mall", text)
+    path = indoor_location_files.write(folder / "mall", text)
     run("data", "check", "indoor_location", "--data-root", "mall", "--plots", "pictures")
     name = f"site1_F4_{path.stem}"
     cells = row(capsys.readouterr().out, name)
     assert cells[1] == "test" and cells[3] == "50.0" and cells[4].startswith("0.00 0.00 9.")
     assert (cells[5], *cells[7:]) == ("–", "–", "–", "used") and float(cells[2]) > 15.0
-    write_phone(place / "own" / "bare.csv", names=csv.GYRO + csv.ACCEL)
+    write_phone(folder / "own" / "bare.csv", names=csv.GYRO + csv.ACCEL)
     run("data", "check", "csv", "--data-root", "own", "--plots", "pictures")
     assert row(capsys.readouterr().out, "bare")[4:] == ["–", "–", "–", "–", "0.0%", "used"]
-    for each in (name, "bare"):
-        assert image.imread(place / "pictures" / f"{each}.png")[..., :3].std() > 0.03
+    for stem in (name, "bare"):
+        assert image.imread(folder / "pictures" / f"{stem}.png")[..., :3].std() > 0.03
 
 
 # --- convert
@@ -176,8 +176,8 @@ def test_convert_keeps_every_figure_and_the_splits(root, capsys):
         assert ours.name == name
     with pytest.raises(InputError, match=r"val\.txt: the list cannot be read"):
         data.load("csv", converted, "val")
-    given = ("--data-root", str(root), "--split", "test", "--rate", "50")
-    run("data", "convert", "tlio", "slow", *given)
+    options = ("--data-root", str(root), "--split", "test", "--rate", "50")
+    run("data", "convert", "tlio", "slow", *options)
     (ours,) = data.load("csv", root.parent / "slow", "test")
     assert_same_arrays(ours, data.resample(theirs, 50.0))
 
@@ -193,9 +193,9 @@ def test_a_conversion_is_whole_or_not_there(root, monkeypatch):
 
     command = ["data", "convert", "tlio", "converted", "--data-root", str(root)]
     monkeypatch.setattr(conversion, "write_hdf5", stopped)
-    with pytest.raises(SystemExit) as left:
+    with pytest.raises(SystemExit) as end:
         app.main(command)
-    assert left.value.code == 130 and "also" in reads
+    assert end.value.code == 130 and "also" in reads
     assert sorted(path.name for path in root.parent.iterdir()) == ["heads"]
     monkeypatch.setattr(conversion, "write_hdf5", real)
     run(*command)
@@ -237,21 +237,23 @@ def test_a_piece_never_takes_the_file_of_another_recording(tmp_path):
     def pieces(*names):
         return partial(list, [circle(seconds=30.0)._replace(name=name) for name in names])
 
-    found = [
+    walks = [
         RecordingSource("walk_piece1", pieces("walk_piece1")),
         RecordingSource("walk", pieces("walk_piece1", "walk_piece2")),
     ]
     # Nor one recording that of another.
     two = [RecordingSource(name, pieces(name)) for name in ("a b", "a_b")]
-    for given, of, file in (
-        (found, "walk", "walk_piece1"),
-        (found[::-1], "walk", "walk_piece1"),
+    for sources, of, file in (
+        (walks, "walk", "walk_piece1"),
+        (walks[::-1], "walk", "walk_piece1"),
         (two, "a", "a_b"),
     ):
-        about = dataclasses.replace(data.get("tlio"), recordings=lambda *_, given=given: given)
+        dataset = dataclasses.replace(
+            data.get("tlio"), recordings=lambda *_, sources=sources: sources
+        )
         problem = rf"'{of}.*' and '{of}.*' would be one file, {file}\.h5"
         with pytest.raises(InputError, match=problem):
-            conversion.convert(about, tmp_path, tmp_path / "out", "test")
+            conversion.convert(dataset, tmp_path, tmp_path / "out", "test")
         assert not (tmp_path / "out").exists()
 
 
@@ -262,8 +264,8 @@ def write_phone(path, names, time=None, gyro=1.0, accel=1.0, per_second=1.0, sep
     """A logger's file of the known walk: columns time, gyro and accel under other names, scaled,
     some of them."""
     time = np.arange(2000) / 100 if time is None else time
-    both = np.hstack([walk.rate(time) * gyro, walk.force(time) * accel])
-    values = dict(zip((*csv.GYRO, *csv.ACCEL), both.T, strict=True))
+    imu = np.hstack([walk.rate(time) * gyro, walk.force(time) * accel])
+    values = dict(zip((*csv.GYRO, *csv.ACCEL), imu.T, strict=True))
     names = names if isinstance(names, dict) else {name: name for name in names}
     table = np.column_stack([time * per_second, *(values[name] for name in names)])
     lines = [["time", *names.values()], *(map(repr, row) for row in table.tolist())]
@@ -272,32 +274,32 @@ def write_phone(path, names, time=None, gyro=1.0, accel=1.0, per_second=1.0, sep
     return time
 
 
-def test_import_of_a_phones_file_returns_the_walk(place, capsys):
+def test_import_of_a_phones_file_returns_the_walk(folder, capsys):
     names = dict(zip((*csv.GYRO, *csv.ACCEL), ("wx", "wy", "wz", "ax", "ay", "az"), strict=True))
     scales = {"gyro": 180 / np.pi, "accel": -1 / 9.80665, "per_second": 1e3}
-    time = write_phone(place / "ios.csv", names, separator=";", **scales)
-    given = ["--columns", *(f"{name}={column}" for name, column in names.items())]
-    given += ["--accel-sign", "ios", "--gyro-unit", "deg/s"]
-    run("data", "import", "ios.csv", "--out", "own/walk.h5", *given)
+    time = write_phone(folder / "ios.csv", names, separator=";", **scales)
+    options = ["--columns", *(f"{name}={column}" for name, column in names.items())]
+    options += ["--accel-sign", "ios", "--gyro-unit", "deg/s"]
+    run("data", "import", "ios.csv", "--out", "own/walk.h5", *options)
     out = capsys.readouterr().out
     assert "accel negated (iOS's sign)" in out and "20.0 s at 100 Hz" in out
     assert out.splitlines()[-1] == "next: gnio track own/walk.h5"  # it has no reference
-    (sequence,) = data.load("csv", place / "own", "test")
+    (sequence,) = data.load("csv", folder / "own", "test")
     assert sequence.name == "walk" and not sequence.valid.any()
-    for found, wanted in ((sequence.gyro, walk.rate(time)), (sequence.accel, walk.force(time))):
-        np.testing.assert_allclose(found, wanted, atol=1e-9)
+    for signal, expected in ((sequence.gyro, walk.rate(time)), (sequence.accel, walk.force(time))):
+        np.testing.assert_allclose(signal, expected, atol=1e-9)
 
-    (place / "own" / "test.txt").write_text("walk\n")
-    run("data", "import", "ios.csv", "--out", "own/again.h5", "--rate", "50", *given)
+    (folder / "own" / "test.txt").write_text("walk\n")
+    run("data", "import", "ios.csv", "--out", "own/again.h5", "--rate", "50", *options)
     assert "add the line again.h5 to test.txt" in capsys.readouterr().out
-    assert data.read_hdf5(place / "own" / "again.h5").time.shape == (1000,)
+    assert data.read_hdf5(folder / "own" / "again.h5").time.shape == (1000,)
 
 
 @pytest.mark.parametrize("beside", ["WALK.CSV", "walk.hdf5"])
-def test_what_follows_an_import_beside_its_own_csv_can_be_followed(place, capsys, beside):
+def test_what_follows_an_import_beside_its_own_csv_can_be_followed(folder, capsys, beside):
     """As recordings of the folder, walk.csv and walk.h5 would have one name."""
-    (place / "other").mkdir()
-    source = place / ("other/a.csv" if beside == "walk.hdf5" else beside)
+    (folder / "other").mkdir()
+    source = folder / ("other/a.csv" if beside == "walk.hdf5" else beside)
     write_phone(source, (*csv.GYRO, *csv.ACCEL), accel=-1.0)
     if beside == "walk.hdf5":
         run("data", "import", str(source), "--out", beside)
@@ -307,8 +309,8 @@ def test_what_follows_an_import_beside_its_own_csv_can_be_followed(place, capsys
     assert f". holds {beside} too, which gnio evaluate would read as a recording" in note
     assert following == f"next: gnio track {beside[:4]}.h5"
     with pytest.raises(InputError, match="has the name of"):
-        data.load("csv", place, "test")
-    assert read_imported(place / f"{beside[:4]}.h5").sequence.name == beside[:4]
+        data.load("csv", folder, "test")
+    assert read_imported(folder / f"{beside[:4]}.h5").sequence.name == beside[:4]
 
 
 # --- mistakes
@@ -334,16 +336,16 @@ HEADS = ["--data-root", "heads"]
         (["import", "walk.csv", "--out", "folder.h5"], "--out: must not be a folder, found"),
     ],
 )
-def test_a_mistake_is_one_line_and_status_2(root, place, capsys, arguments, expected):
-    write_phone(place / "walk.csv", csv.GYRO + csv.ACCEL)
-    (place / "taken").mkdir()
-    (place / "taken" / "train.txt").write_text("a\n")
-    (place / "folder.h5").mkdir()
-    (place / "ours").mkdir()
-    (place / "ours" / conversion.CONVERSION).write_text('{"dataset": "tlio", "rate": 50.0}')
-    before = sorted(place.rglob("*"))
-    with pytest.raises(SystemExit) as left, warnings.catch_warnings():
+def test_a_mistake_is_one_line_and_status_2(root, folder, capsys, arguments, expected):
+    write_phone(folder / "walk.csv", csv.GYRO + csv.ACCEL)
+    (folder / "taken").mkdir()
+    (folder / "taken" / "train.txt").write_text("a\n")
+    (folder / "folder.h5").mkdir()
+    (folder / "ours").mkdir()
+    (folder / "ours" / conversion.CONVERSION).write_text('{"dataset": "tlio", "rate": 50.0}')
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(SystemExit) as end, warnings.catch_warnings():
         app.main(["data", *arguments])
     out, err = capsys.readouterr()
-    assert (left.value.code, out) == (2, "") and err.count("\n") == 1 and expected in err, err
-    assert sorted(place.rglob("*")) == before
+    assert (end.value.code, out) == (2, "") and err.count("\n") == 1 and expected in err, err
+    assert sorted(folder.rglob("*")) == before

@@ -31,19 +31,19 @@ def home(tmp_path, monkeypatch):
 
 def test_what_is_found_fits_a_screen_and_says_what_is_wrong(home, capsys, monkeypatch):
     run("doctor", "--json")
-    found = json.loads(capsys.readouterr().out)
-    assert f"jax {jax.__version__}, " in found["packages"]
-    assert "optax is not installed" in found["packages"]
-    assert found["devices"] == f"{len(jax.devices())} × cpu" and found["float64"] == "works"
-    assert found["extra bags"].startswith("rosbags ") and ", mcap " in found["extra bags"]
-    assert found["extra rerun"] == "lacks rerun-sdk: pip install 'gnio-jax[rerun]'"
-    places = {name: place for name, place in found.items() if name.startswith("dataset")}
+    report = json.loads(capsys.readouterr().out)
+    assert f"jax {jax.__version__}, " in report["packages"]
+    assert "optax is not installed" in report["packages"]
+    assert report["devices"] == f"{len(jax.devices())} × cpu" and report["float64"] == "works"
+    assert report["extra bags"].startswith("rosbags ") and ", mcap " in report["extra bags"]
+    assert report["extra rerun"] == "lacks rerun-sdk: pip install 'gnio-jax[rerun]'"
+    places = {name: value for name, value in report.items() if name.startswith("dataset")}
     computed = {"dataset synthetic": "computed"}
-    there = {"dataset oxiod": "oxiod", "dataset tlio": "tlio_layout"}
-    there = {name: str(home / "recordings" / place) for name, place in there.items()}
-    assert places == computed | there
-    assert found["recordings read"] == str(home / "kept") and "pedestrian" in found["networks"]
-    assert found["newest run"].startswith("none: runs: holds no run; train one with gnio train")
+    folders = {"dataset oxiod": "oxiod", "dataset tlio": "tlio_layout"}
+    folders = {name: str(home / "recordings" / folder) for name, folder in folders.items()}
+    assert places == computed | folders
+    assert report["recordings read"] == str(home / "kept") and "pedestrian" in report["networks"]
+    assert report["newest run"].startswith("none: runs: holds no run; train one with gnio train")
     monkeypatch.setenv("GNIO_WEIGHTS", str(home / "nowhere"))
     (home / "runs" / "mine").mkdir(parents=True)
     (home / "runs" / "mine" / "config.yaml").write_text("")

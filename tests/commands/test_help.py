@@ -37,8 +37,8 @@ def test_help_ends_with_examples_that_are_understood(words, capsys):
     text = shown(capsys, *words)
     assert all(sign == "\n" or sign.isprintable() for sign in text)  # no terminal is controlled
     assert max(map(len, text.splitlines())) <= 100
-    about, _, examples = text.partition("\nexamples:\n")
-    assert f"usage: {' '.join(['gnio', *words])}" in about
+    description, _, examples = text.partition("\nexamples:\n")
+    assert f"usage: {' '.join(['gnio', *words])}" in description
     lines = re.sub(r"\\\n +", "", examples).splitlines()
     lines = [line for line in lines if "gnio" in line and line.startswith("  ")]
     assert lines and any(" ".join(["gnio", *words]) in line for line in lines)
@@ -56,12 +56,14 @@ def test_help_explains_every_option(words, command, capsys):
     assert "None" not in text  # what is not given is told in words
     if words == ("train",):
         assert all(name in text for name in config.experiment_names())
-        known = "--optim.epochs INT Passes over the training windows. (default: 200)"
-        assert known in joined(text)
-    found = list(options.options_of(options.options_type(command)))
+        entry = "--optim.epochs INT Passes over the training windows. (default: 200)"
+        assert entry in joined(text)
+    command_options = list(options.options_of(options.options_type(command)))
     # Nobody is asked for too many: all other settings have `--set`.
-    assert sum(option.name.startswith("--") for option in found) <= (70 if "train" in words else 25)
-    for option in found:
+    assert sum(option.name.startswith("--") for option in command_options) <= (
+        70 if "train" in words else 25
+    )
+    for option in command_options:
         for name in filter(None, (option.name, option.negation)):
             assert re.search(rf"[ \[]{re.escape(name)}[ ,\]\n]", text), name
         assert options.comment(option) in joined(text), option.name

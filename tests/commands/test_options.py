@@ -33,8 +33,8 @@ def test_spellings_and_values_of_options():
     parsed = parse("--augment.no-yaw", "--optim.clip-norm", "1", "--data-root", "null")
     assert (parsed.augment.yaw, parsed.optim.clip_norm, parsed.data_root) == (False, 1.0, None)
     assert parse("--loss.log-std-floor", "-6.9").loss.log_std_floor == -6.9
-    given = ["--through-filter.learn", "noise", "head", "--through-filter.piece-seconds", "30"]
-    parsed = parse(*given).through_filter
+    options = ["--through-filter.learn", "noise", "head", "--through-filter.piece-seconds", "30"]
+    parsed = parse(*options).through_filter
     assert parsed.learn == ("noise", "head") and parsed.piece_seconds == 30
 
 
@@ -112,13 +112,13 @@ def test_options_win_over_the_file_and_the_file_over_the_default(tmp_path):
     """And settings by name over all; `null` takes away what a file sets."""
     path = tmp_path / "experiment.yaml"
     path.write_text("dataset: tlio\noptim: {epochs: 7, batch_size: 5, clip_norm: 1.0}\n")
-    given = ["--optim.epochs", "3", "--optim.clip-norm", "null"]
-    for arguments in (["--config", str(path), *given], [*given, f"--config={path}"]):
+    options = ["--optim.epochs", "3", "--optim.clip-norm", "null"]
+    for arguments in (["--config", str(path), *options], [*options, f"--config={path}"]):
         parsed = parse(*arguments)
         assert (parsed.dataset, parsed.optim.epochs, parsed.optim.batch_size) == ("tlio", 3, 5)
         assert parsed.data == config.DataConfig() and parsed.optim.clip_norm is None
     by_name = ["--set", "optim.epochs=2", "--set", "filter.noise.gyro_density=1e-3"]
-    parsed = parse("--config", str(path), *given, *by_name)
+    parsed = parse("--config", str(path), *options, *by_name)
     assert parsed.optim.epochs == 2 and parsed.filter.noise.gyro_density == 1e-3
     assert "is not a setting" in mistake("train", "--set", "filter")
 
@@ -128,8 +128,8 @@ def test_a_config_is_found_by_its_name_from_anywhere(tmp_path, monkeypatch):
     assert parse("--config", "quickstart").model.width == 16
     assert parse("--config", "baselines/tlio").model.name == "tlio"
     for wrong, hint in (("quickstrat", "quickstart"), ("configs/tlio.yaml", "baselines/tlio")):
-        told = mistake("train", "--config", wrong)
-        assert f"{wrong}: no such config file; did you mean '{hint}'?" in told
+        refusal = mistake("train", "--config", wrong)
+        assert f"{wrong}: no such config file; did you mean '{hint}'?" in refusal
     (tmp_path / "quickstart").mkdir()
     assert parse("--config", "quickstart").model.width == 16
     assert set(config.experiment_names()) >= {

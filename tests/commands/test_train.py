@@ -27,9 +27,9 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
     monkeypatch.delenv("GNIO_DATA", raising=False)
     monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(SystemExit) as left:
+    with pytest.raises(SystemExit) as end:
         console.run(train.main)
-    assert left.value.code == 2
+    assert end.value.code == 2
     out, err = capsys.readouterr()
     lines = [line for line in err.splitlines() if not line.startswith("reading ")]
     assert out == "" and len(lines) == 1, (out, err)
@@ -104,7 +104,7 @@ def test_the_papers_configs_are_the_papers(name):
     assert config.data.stride * 10 == config.data.window == config.data.rate
 
 
-def asked(*words):
+def experiment_of(*words):
     """The experiment that these words come to."""
     call = Call("gnio train", words)
     return experiment(read(command, call), call)
@@ -114,32 +114,32 @@ def test_training_through_the_filter_begins_with_the_filter_of_the_run(tmp_path)
     calibrated = changed(noise={"gyro_density": 0.02}, start={"velocity": 0.7, "accel_bias": 0.3})
     considered = changed(calibrated, considered={"scale": 0.1})
     tiny = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         run = tiny_run.save(tmp_path / "run", dataclasses.replace(tiny, filter=considered))
         file = tmp_path / "own.yaml"
         file.write_text("through_filter: {learn: [noise]}\nfilter: {start: {velocity: 1.0}}\n")
         workdir = tmp_path / "new"
-        given = ["--config", str(file), "--init-from", str(run), "--workdir", str(workdir)]
+        options = ["--config", str(file), "--init-from", str(run), "--workdir", str(workdir)]
         # What the file says wins, also where it is the default of the package.
-        wanted = changed(calibrated, start={"velocity": 1.0})
-        assert asked(*given).filter == wanted
-        louder = asked(*given, "--set", "filter.noise.gyro_density=0.5").filter
-        assert louder == changed(wanted, noise={"gyro_density": 0.5})
-        bare = asked("--init-from", str(run), "--through-filter.learn", "noise")
+        settings = changed(calibrated, start={"velocity": 1.0})
+        assert experiment_of(*options).filter == settings
+        louder = experiment_of(*options, "--set", "filter.noise.gyro_density=0.5").filter
+        assert louder == changed(settings, noise={"gyro_density": 0.5})
+        bare = experiment_of("--init-from", str(run), "--through-filter.learn", "noise")
         assert bare.filter == calibrated
-        by_name = asked("--init-from", str(run), "--set", "through_filter.learn=[noise]")
+        by_name = experiment_of("--init-from", str(run), "--set", "through_filter.learn=[noise]")
         assert by_name.filter == calibrated
         # Training on windows has no use for it.
-        assert asked("--init-from", str(run)).filter == FilterSettings()
+        assert experiment_of("--init-from", str(run)).filter == FilterSettings()
     # A run that is resumed goes on with its own, whether --config is given again or not.
-    configuration.save(workdir / "config.yaml", TrainConfig(filter=wanted))
+    configuration.save(workdir / "config.yaml", TrainConfig(filter=settings))
     shutil.rmtree(run)
-    assert asked(*given, "--resume").filter == wanted
-    assert asked(*given[2:], "--resume").filter == wanted
+    assert experiment_of(*options, "--resume").filter == settings
+    assert experiment_of(*options[2:], "--resume").filter == settings
     # Also where the file says that the run is, and for seeds in folders beside it.
     file.write_text(f"workdir: {workdir}\noptim: {{epochs: 3}}\n")
-    found = asked("--config", str(file), "--resume")
-    assert (found.workdir, found.filter, found.optim.epochs) == (str(workdir), wanted, 3)
-    assert asked("--config", str(file), "--seeds", "1", "2").workdir == str(workdir)
-    by_name = asked("--set", f"workdir={workdir}", "--resume")
-    assert (by_name.workdir, by_name.filter) == (str(workdir), wanted)
+    config = experiment_of("--config", str(file), "--resume")
+    assert (config.workdir, config.filter, config.optim.epochs) == (str(workdir), settings, 3)
+    assert experiment_of("--config", str(file), "--seeds", "1", "2").workdir == str(workdir)
+    by_name = experiment_of("--set", f"workdir={workdir}", "--resume")
+    assert (by_name.workdir, by_name.filter) == (str(workdir), settings)

@@ -129,8 +129,12 @@ def test_a_mistake_is_named_with_a_remedy(text, words):
 
 
 def test_numbers_are_those_of_yaml_1_2():
-    found = read("optim: {learning_rate: 1e-3}\nloss: {mse_weight: 3}\ndata: {rate: 2.e+2}")
-    assert (found.optim.learning_rate, found.loss.mse_weight, found.data.rate) == (1e-3, 3.0, 200.0)
+    config = read("optim: {learning_rate: 1e-3}\nloss: {mse_weight: 3}\ndata: {rate: 2.e+2}")
+    assert (config.optim.learning_rate, config.loss.mse_weight, config.data.rate) == (
+        1e-3,
+        3.0,
+        200.0,
+    )
 
 
 def test_text_that_looks_like_something_else_survives_its_file():
@@ -220,8 +224,8 @@ def test_words_of_a_command_line_are_values():
         (str | tuple[str, ...], ["one", "two"], ("one", "two")),
         (Path, ["010"], Path("010")),
     ):
-        found = configuration.parse_words(hint, words, "--x")
-        assert found == value and type(found) is type(value)
+        parsed_value = configuration.parse_words(hint, words, "--x")
+        assert parsed_value == value and type(parsed_value) is type(value)
     for hint, words, problem in (
         (int, ["3.5"], "--x: must be a whole number, found 3.5"),
         (str | tuple[int, ...], ["1", "x"], "--x: must be a whole number, found 'x'"),

@@ -33,7 +33,7 @@ def test_a_layout_is_plausible_and_survives_its_conversion(name, tmp_path, monke
 
     run("data", "convert", *at, str(out))
     assert "1 sequences" in capsys.readouterr().out
-    (found,) = data.load("csv", out, layout.split)
-    assert found.name == expected.name
-    assert expected.attributes.items() <= found.attributes.items()
-    assert_same_arrays(found, expected)
+    (sequence,) = data.load("csv", out, layout.split)
+    assert sequence.name == expected.name
+    assert expected.attributes.items() <= sequence.attributes.items()
+    assert_same_arrays(sequence, expected)

@@ -68,7 +68,7 @@ def test_hdf5_that_is_cut_short_or_foreign_is_named(tmp_path):
 def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path, monkeypatch):
     path = tmp_path / "walk.h5"
     write_hdf5(path, circle())
-    for place, error, told, words in (
+    for name, error, expected, words in (
         ("Sequence", TypeError("ours"), TypeError, "ours"),
         ("hdf5_field", NameError("ours"), NameError, "ours"),
         ("hdf5_field", MemoryError(), InputError, "does not fit into memory"),
@@ -77,8 +77,8 @@ def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path, monkeypa
         def fails(*_, error=error, **__):
             raise error
 
-        with monkeypatch.context() as patch, pytest.raises(told, match=words):
-            patch.setattr(hdf5, place, fails)
+        with monkeypatch.context() as patch, pytest.raises(expected, match=words):
+            patch.setattr(hdf5, name, fails)
             read_hdf5(path)
 
 

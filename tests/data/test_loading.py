@@ -71,13 +71,13 @@ def dataset(*recordings):
     return dataclasses.replace(data.get("tlio"), recordings=lambda root, split: list(recordings))
 
 
-def outcome(about, workers, progress=lambda share: None, left_out=None, strict=False):
+def outcome(corpus, workers, progress=lambda share: None, left_out=None, strict=False):
     """(names, warnings, error) of a split."""
     names, error = [], ""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            read = read_split(about, Path("root"), "test", workers, progress, left_out, strict)
+            read = read_split(corpus, Path("root"), "test", workers, progress, left_out, strict)
             names = [sequence.name for sequence in read]
         except InputError as mistake:
             error = str(mistake)
@@ -98,7 +98,7 @@ def six(tmp_path):
 
 @pytest.mark.parametrize("damage", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, damage):
-    found, shares = [], []
+    outcomes, shares = [], []
     for workers in (1, 2):
         folder = tmp_path / f"by {workers}"
         folder.mkdir()
@@ -106,19 +106,19 @@ def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, da
         if damage:
             recordings.insert(4, slow(folder, "g", damage="field 'gyro' is NaN"))
         times = 1 if damage else 2  # cold and cached
-        about = dataset(*recordings)
-        found += [outcome(about, workers, shares.append) for _ in range(times)]
-    names, notes, error = found[0]
-    assert found == [found[0]] * len(found)
-    told = ["b.csv: a gap was cut off", "d.csv: is short"]
+        corpus = dataset(*recordings)
+        outcomes += [outcome(corpus, workers, shares.append) for _ in range(times)]
+    names, notes, error = outcomes[0]
+    assert outcomes == [outcomes[0]] * len(outcomes)
+    expected = ["b.csv: a gap was cut off", "d.csv: is short"]
     refused = "c: left out: c.csv: its clock is ruined; leave it out"
     assert names == ["a", "b", "d", "e2"] and error == ""
     if damage:
-        told.append("g: left out: g.csv: field 'gyro' is NaN; copy it again")
-    told.append("e: syn is used: e.csv: field 'time' is ruined; leave it out")
+        expected.append("g: left out: g.csv: field 'gyro' is NaN; copy it again")
+    expected.append("e: syn is used: e.csv: field 'time' is ruined; leave it out")
     checked = notes.pop(-2)
     assert checked.startswith("f: left out by the self-check: mean of R·accel")
-    assert notes == [*told, refused]
+    assert notes == [*expected, refused]
     if not damage:
         np.testing.assert_allclose(shares, [0.2, 0.4, 0.6, 0.8, 1.0])  # what processes read
 
@@ -127,13 +127,13 @@ def test_a_damaged_recording_is_left_out_by_name_and_reason(tmp_path):
     """The reasons of all that are left out are told. Where nothing else is there, or all are
     needed, the damage is an error; so it is where its warning is one."""
     damaged = slow(tmp_path, "g", damage="field 'gyro' is NaN")
-    about, left_out = dataset(damaged, *six(tmp_path)), {}
-    names, notes, error = outcome(about, 1, left_out=left_out)
+    corpus, left_out = dataset(damaged, *six(tmp_path)), {}
+    names, notes, error = outcome(corpus, 1, left_out=left_out)
     line = "g.csv: field 'gyro' is NaN; copy it again"
     assert names == ["a", "b", "d", "e2"] and error == "" and f"g: left out: {line}" in notes
     assert left_out.pop("f").startswith("the self-check: mean of R·accel")
     assert left_out == {"g": line, "c": "c.csv: its clock is ruined; leave it out"}
-    assert outcome(about, 1, strict=True) == ([], [], line)
+    assert outcome(corpus, 1, strict=True) == ([], [], line)
     refused = slow(tmp_path, "h", refusal="its clock is ruined")
     for split in (dataset(damaged), dataset(damaged, damaged._replace(name="k"), refused)):
         names, notes, error = outcome(split, 1)
@@ -141,7 +141,7 @@ def test_a_damaged_recording_is_left_out_by_name_and_reason(tmp_path):
     with warnings.catch_warnings(), pytest.raises(InputError) as raised:
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", data.DamagedRecording)
-        list(read_split(about, Path("root"), "test"))
+        list(read_split(corpus, Path("root"), "test"))
     assert str(raised.value) == line
 
 
@@ -160,20 +160,25 @@ def test_a_sequence_says_whose_it_is_unless_it_was_converted(tmp_path):
         return [circle(seconds=4.0)._replace(name=name, attributes=attributes)]
 
     converted = partial(read, dataset="oxiod", licence="theirs")
-    about = dataset(RecordingSource("own", read), RecordingSource("other", converted))
-    recordings = about.recordings(None, "")
+    corpus = dataset(RecordingSource("own", read), RecordingSource("other", converted))
+    recordings = corpus.recordings(None, "")
     for sequences in (
-        list(read_split(about, tmp_path, "test")),
-        [check_recording(each, about)[1].sequences[0] for each in recordings],
+        list(read_split(corpus, tmp_path, "test")),
+        [check_recording(recording, corpus)[1].sequences[0] for recording in recordings],
     ):
-        told = [(each.attributes["dataset"], each.attributes["licence"]) for each in sequences]
-        assert told == [("tlio", data.get("tlio").licence), ("oxiod", "theirs")]
+        origins = [
+            (sequence.attributes["dataset"], sequence.attributes["licence"])
+            for sequence in sequences
+        ]
+        assert origins == [("tlio", data.get("tlio").licence), ("oxiod", "theirs")]
 
 
 def test_recordings_that_are_left_out_for_one_reason_are_one_line(tmp_path):
     alike = [slow(tmp_path, name, refusal="holds 2 waypoints") for name in "bcd"]
-    about = dataset(slow(tmp_path, "a"), *alike, slow(tmp_path, "e", refusal="its clock is ruined"))
-    _, notes, _ = outcome(about, 1)
+    corpus = dataset(
+        slow(tmp_path, "a"), *alike, slow(tmp_path, "e", refusal="its clock is ruined")
+    )
+    _, notes, _ = outcome(corpus, 1)
     assert notes == [
         "3 recordings are left out for the same reason, the first: b: left out: b.csv: "
         "holds 2 waypoints; leave it out",
@@ -197,14 +202,14 @@ def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):
     local = RecordingSource("local", lambda: [walk("local")])
     slowly = [slow(tmp_path, name, die_in_a_child) for name in "ab"]
     assert outcome(dataset(local, *slowly), 2) == (["local", "a", "b"], [], "")
-    kept = [each._replace(read=lambda: pytest.fail("built")) for each in slowly]
-    assert outcome(dataset(local, *kept), 2) == (["local", "a", "b"], [], "")
+    recordings = [recording._replace(read=lambda: pytest.fail("built")) for recording in slowly]
+    assert outcome(dataset(local, *recordings), 2) == (["local", "a", "b"], [], "")
 
 
 def test_a_check_tells_what_is_wrong_and_raises_nothing(tmp_path):
     recordings = [*six(tmp_path), RecordingSource("none", list)]
     recordings.append(slow(tmp_path, "g", damage="field 'gyro' is NaN"))
-    checked = {each.name: check_recording(each, dataset()) for each in recordings}
+    checked = {recording.name: check_recording(recording, dataset()) for recording in recordings}
     reason = {name: row.reason for name, ((row,), _) in checked.items()}
     assert reason["a"] == reason["b"] == reason["e"] == ""
     assert checked["a"][0][0].check.failures == () and checked["none"][0][0].check is None
@@ -217,24 +222,24 @@ def test_a_check_tells_what_is_wrong_and_raises_nothing(tmp_path):
 
 
 def test_the_recordings_of_all_splits_are_found_once(tmp_path):
-    shared, own = single("shared", walk, "shared"), single("own", walk, "own")
+    shared, solo = single("shared", walk, "shared"), single("own", walk, "own")
 
     def recordings(root, split):
         warnings.warn(f"{root}: is incomplete", stacklevel=2)
         if split == "val":
             raise InputError(root, "has no list val", "expected layout: any")
-        return [shared, own] if split == "train" else [shared]
+        return [shared, solo] if split == "train" else [shared]
 
-    about = dataclasses.replace(dataset(), recordings=recordings)
-    found = find_recordings(about, Path("root"), "all")
-    assert list(found.recordings) == ["shared", "own"]
-    assert found.splits == {"train": ("shared", "own"), "test": ("shared",)}
-    assert found.notes == ["root: is incomplete", "nothing in split val: root: has no list val"]
+    corpus = dataclasses.replace(dataset(), recordings=recordings)
+    index = find_recordings(corpus, Path("root"), "all")
+    assert list(index.recordings) == ["shared", "own"]
+    assert index.splits == {"train": ("shared", "own"), "test": ("shared",)}
+    assert index.notes == ["root: is incomplete", "nothing in split val: root: has no list val"]
     with pytest.raises(InputError, match="has no list val"):
-        find_recordings(about, Path("root"), "val")
+        find_recordings(corpus, Path("root"), "val")
     unknown = "unknown split 'dev'; known splits: train, val, test, all"
     with pytest.raises(InputError, match=unknown):
-        find_recordings(about, Path("root"), "dev")
+        find_recordings(corpus, Path("root"), "dev")
     with pytest.raises(InputError, match="split 'all' of dataset 'tlio' holds no recording"):
         find_recordings(dataset(), Path("root"), "all")
 
@@ -256,9 +261,9 @@ def test_work_by_processes_comes_back_in_order_and_few_results_are_held(monkeypa
 
     shares.clear()
     results = in_processes(pow, Items([(2, power) for power in range(12)]), 2, shares.append)
-    for taken in range(1, 13):
-        assert next(results) == 2 ** (taken - 1)
-        assert len(begun) <= taken + 3
+    for count in range(1, 13):
+        assert next(results) == 2 ** (count - 1)
+        assert len(begun) <= count + 3
     assert len(begun) == 12 and shares[-1] == 1.0
     results.close()
     results = in_processes(time.sleep, [(0.0,), (60.0,)], 2)
@@ -299,20 +304,23 @@ def test_an_error_leaves_no_file_of_another_half_written(tmp_path):
     (folder := tmp_path / "written").mkdir()
     recordings = [single("a", damaged_meanwhile, folder, "a")]
     recordings += [single(name, write_slowly, folder, name) for name in "bc"]
-    recordings = [each._replace(slow=True, files=(tmp_path / each.name,)) for each in recordings]
+    recordings = [
+        recording._replace(slow=True, files=(tmp_path / recording.name,))
+        for recording in recordings
+    ]
     with pytest.raises(RuntimeError, match="is ruined"):
         list(read_split(dataset(*recordings), tmp_path, "test", workers=2))
-    left = {path.name for path in folder.iterdir()}
-    assert "b" in left <= {"b", "c"}
+    names = {path.name for path in folder.iterdir()}
+    assert "b" in names <= {"b", "c"}
 
 
-def grow(number, kept=[]):
+def grow(number, ballast=[]):
     """Grow by more than a process may, at bounds that no memory is needed for."""
     from loky import process_executor as bounds
 
     assert bounds._MAX_MEMORY_LEAK_SIZE > 1e6 and bounds._MEMORY_LEAK_CHECK_DELAY > 0
     bounds._MAX_MEMORY_LEAK_SIZE, bounds._MEMORY_LEAK_CHECK_DELAY = 2e6, 0.01
-    kept.append(b"x" * 20_000_000)
+    ballast.append(b"x" * 20_000_000)
     time.sleep(0.05)
     return number, os.getpid()
 
@@ -410,16 +418,16 @@ def test_a_new_entry_takes_the_place_of_those_of_the_same_recording(source, cach
 
 
 def test_the_sources_that_decide_what_is_read_are_part_of_the_key(monkeypatch):
-    read, found = Path.read_bytes, []
+    read, digests = Path.read_bytes, []
     for name in ("none of them", "resampling.py", "numerics.py", "tlio.py"):
         hdf5._sources.cache_clear()
         changed = lambda path, name=name: read(path) + (b"#" if path.name == name else b"")  # noqa: E731
         monkeypatch.setattr(Path, "read_bytes", changed)
-        found.append(hdf5._sources())
-    assert len(set(found)) == 4
+        digests.append(hdf5._sources())
+    assert len(set(digests)) == 4
     monkeypatch.undo()
     hdf5._sources.cache_clear()
-    assert hdf5._sources() == found[0]
+    assert hdf5._sources() == digests[0]
 
 
 def test_an_entry_that_is_damaged_or_cannot_be_written_is_made_anew(source, cache, monkeypatch):
@@ -462,7 +470,7 @@ def test_what_the_reader_warned_of_is_kept_with_every_segment(source):
         reading = read_recording(recording)
         assert reading.notes == ("imu.csv: a gap was cut off",) and reader.calls == 1
         assert [sequence.name for sequence in reading.sequences] == ["b", "a", "c"]
-        assert all(each.attributes == {"dataset": "test"} for each in reading.sequences)
+        assert all(sequence.attributes == {"dataset": "test"} for sequence in reading.sequences)
 
 
 # --- names, roots and splits
@@ -473,15 +481,15 @@ def test_the_root_is_the_argument_then_the_environment_then_the_working_folder(
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GNIO_DATA", raising=False)
-    about, elsewhere, here = data.get("tlio"), tmp_path / "elsewhere", tmp_path / "data" / "tlio"
+    corpus, elsewhere, local = data.get("tlio"), tmp_path / "elsewhere", tmp_path / "data" / "tlio"
     with pytest.raises(InputError) as error:
         data.find_root("tlio")
-    assert all(words in str(error.value) for words in ("data/tlio", about.source, about.layout))
+    assert all(words in str(error.value) for words in ("data/tlio", corpus.source, corpus.layout))
     monkeypatch.setenv("GNIO_DATA", str(elsewhere))
-    for folder in (here, elsewhere / "tlio_layout", elsewhere / "tlio"):
+    for folder in (local, elsewhere / "tlio_layout", elsewhere / "tlio"):
         folder.mkdir(parents=True)
         assert data.find_root("tlio").resolve() == folder
-    assert data.find_root("tlio", str(here)) == here
+    assert data.find_root("tlio", str(local)) == local
     with pytest.raises(InputError, match=r"nowhere: no folder of dataset 'tlio'"):
         data.find_root("tlio", tmp_path / "nowhere")
 

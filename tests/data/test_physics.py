@@ -31,12 +31,12 @@ def test_every_other_assignment_of_axes_is_found():
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             imu = WALK._replace(gyro=GYRO[:, order] * signs)
-            found = physics.contradiction(imu)
+            contradiction = physics.contradiction(imu)
             if order == (0, 1, 2) and signs == (1.0, 1.0, 1.0):
-                assert found is None
+                assert contradiction is None
                 continue
-            assert found is not None
-            factor, _, remedy = found
+            assert contradiction is not None
+            factor, _, remedy = contradiction
             assert factor > physics.PROOF
             words = dict(word.split("=") for word in remedy.split("--columns ")[1].split())
             columns = dict(zip("xyz", imu.gyro.T, strict=True))

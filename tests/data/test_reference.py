@@ -16,8 +16,8 @@ LEVER = np.array([0.05, -0.1, 0.2])
 def tracked(stamps):
     """Poses of a point from which the IMU lies `LEVER` away."""
     attitude = walk.attitude(stamps)
-    place = walk.position(stamps) - attitude.apply(LEVER)
-    return Poses(stamps, attitude, place, lever=LEVER, noisy=True)
+    position = walk.position(stamps) - attitude.apply(LEVER)
+    return Poses(stamps, attitude, position, lever=LEVER, noisy=True)
 
 
 def test_a_loss_and_a_flip_of_a_second_do_not_reach_their_surroundings():
@@ -28,16 +28,16 @@ def test_a_loss_and_a_flip_of_a_second_do_not_reach_their_surroundings():
     poses.attitude[780:840] = poses.attitude[780:840] * flip
     lost = (CLOCK > 10.0) & (CLOCK < 12.0)
     flipped = (CLOCK > 15.05) & (CLOCK < 15.95)
-    found = reference_at(CLOCK, walk.rate(CLOCK), poses)
-    assert not found.valid[lost | flipped].any()
+    reference = reference_at(CLOCK, walk.rate(CLOCK), poses)
+    assert not reference.valid[lost | flipped].any()
     beside = ~numerics.within(lost, 3) & ~numerics.within(flipped, 25)
-    assert found.valid[beside][20:-20].all()
-    inner = found.valid & (CLOCK > 0.2) & (CLOCK < 29.8)
+    assert reference.valid[beside][20:-20].all()
+    inner = reference.valid & (CLOCK > 0.2) & (CLOCK < 29.8)
     clock = CLOCK[inner]
-    assert np.abs(found.position[inner] - walk.position(clock)).max() < 2e-3
-    error = rotations(found.orientation[inner]) * walk.attitude(clock).inv()
+    assert np.abs(reference.position[inner] - walk.position(clock)).max() < 2e-3
+    error = rotations(reference.orientation[inner]) * walk.attitude(clock).inv()
     assert np.degrees(error.magnitude()).max() < 0.5
-    off = found.velocity[inner] - walk.velocity(clock)
+    off = reference.velocity[inner] - walk.velocity(clock)
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.05
     far = np.concatenate([np.arange(-10.0, -5.0, 1 / 60.0), np.arange(35.0, 40.0, 1 / 60.0)])
     assert not reference_at(CLOCK, walk.rate(CLOCK), tracked(far)).valid.any()

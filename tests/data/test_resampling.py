@@ -48,13 +48,13 @@ def test_what_the_new_rate_cannot_carry_does_not_fold_into_the_gait_band():
         assert np.abs(off).max() < 5e-3
     # What the new rate can carry is kept, up to the ends.
     time = result.time
-    kept, tones = (
+    expected, tones = (
         np.stack([np.sin(2 * np.pi * 35.0 * t), 0.1 * t, 1.0 + 0.02 * t], axis=1)
         for t in (time, sequence.time)
     )
-    found = resample(sequence._replace(gyro=tones), 100.0).gyro
-    np.testing.assert_allclose(found[50:-50, 0], kept[50:-50, 0], atol=5e-3)
-    np.testing.assert_allclose(found[:, 1:], kept[:, 1:], atol=1e-4)
+    gyro = resample(sequence._replace(gyro=tones), 100.0).gyro
+    np.testing.assert_allclose(gyro[50:-50, 0], expected[50:-50, 0], atol=5e-3)
+    np.testing.assert_allclose(gyro[:, 1:], expected[:, 1:], atol=1e-4)
     # The spline's image of 205 Hz, at 621 Hz, would alias to 21 Hz at 600 Hz.
     sequence = circle(416.0, 4.0)
     tone = np.sin(2 * np.pi * 205.0 * sequence.time[:, None] + [0.0, 1.0, 2.0])
@@ -91,8 +91,8 @@ def test_what_is_marked_invalid_does_not_reach_its_valid_neighbours(value):
     np.testing.assert_allclose(off[result.valid], 0.0, atol=1e-5)
     if np.isnan(value):
         for field in fields:
-            there = np.isfinite(getattr(result, field)).all(axis=1)
-            np.testing.assert_array_equal(there, result.valid)
+            finite_rows = np.isfinite(getattr(result, field)).all(axis=1)
+            np.testing.assert_array_equal(finite_rows, result.valid)
     assert np.isfinite(result.accel).all()
     validate(result, "walk")
 
@@ -101,13 +101,13 @@ def test_what_lies_across_a_gap_is_no_measurement():
     """Samples strictly between two that are more than 0.1 s apart, and around one that was none."""
     stamps = np.delete(np.arange(400) / 100, np.s_[101:125])  # from 1.0 to 1.25 s
     stamps = np.delete(stamps, stamps.searchsorted(2.0))  # a single sample is no gap
-    found = resample(circle(stamps=stamps), 200.0)
-    inside = (found.time > 1.0 + 1e-6) & (found.time < 1.25 - 1e-6)
-    np.testing.assert_array_equal(found.imu_valid, ~inside)
-    np.testing.assert_array_equal(found.valid, ~inside)
-    again = resample(found, 100.0)
+    result = resample(circle(stamps=stamps), 200.0)
+    inside = (result.time > 1.0 + 1e-6) & (result.time < 1.25 - 1e-6)
+    np.testing.assert_array_equal(result.imu_valid, ~inside)
+    np.testing.assert_array_equal(result.valid, ~inside)
+    again = resample(result, 100.0)
     np.testing.assert_array_equal(again.imu_valid, ~((again.time > 1.001) & (again.time < 1.249)))
     assert resample(circle(stamps=np.arange(400) / 101), 200.0).imu_valid is None
     ends = circle(stamps=np.array([1.0, 1.25])).accel
-    line = ends[0] + (found.time[inside, None] - 1.0) / 0.25 * (ends[1] - ends[0])
-    np.testing.assert_allclose(found.accel[inside], line, atol=1e-9)
+    line = ends[0] + (result.time[inside, None] - 1.0) / 0.25 * (ends[1] - ends[0])
+    np.testing.assert_allclose(result.accel[inside], line, atol=1e-9)

@@ -17,7 +17,10 @@ from tests.support.circle import changed, circle
 
 def keep_plausible(sequences, dataset):
     """What loading keeps of a dataset that is these sequences."""
-    recordings = [RecordingSource(each.name, lambda each=each: [each]) for each in sequences]
+    recordings = [
+        RecordingSource(sequence.name, lambda sequence=sequence: [sequence])
+        for sequence in sequences
+    ]
     dataset = dataclasses.replace(dataset, recordings=lambda root, split: recordings)
     return list(read_split(dataset, Path("."), "test"))
 
@@ -32,8 +35,8 @@ def test_self_check_of_a_consistent_walk_looks_at_valid_samples_only():
     spoilt = changed(changed(sequence, "accel", lost, 90.0), "valid", lost, False)
     for field in ("position", "velocity", "orientation"):
         spoilt = changed(spoilt, field, lost, np.nan)
-    for each, share in ((sequence, 1.0), (spoilt, 0.98)):
-        check = self_check(each)
+    for walk, share in ((sequence, 1.0), (spoilt, 0.98)):
+        check = self_check(walk)
         assert check.failures == ()
         np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.05)
         assert check.duration == pytest.approx(29.99) and check.rate == pytest.approx(100.0)
@@ -47,8 +50,8 @@ def test_self_check_removes_one_constant_gyro_bias_and_judges_by_the_median_wind
     sequence = circle(seconds=100.0)
     biased = sequence._replace(gyro=sequence.gyro + np.array([0.02, -0.03, 0.05]))
     spoilt = changed(sequence, "gyro", slice(3000, 4000), [1.0, 0.5, 0.0])
-    for each in (biased, spoilt):
-        assert self_check(each).gyro_consistency_degrees < 0.1
+    for walk in (biased, spoilt):
+        assert self_check(walk).gyro_consistency_degrees < 0.1
     # Half a radian about x in the second from 40 to 41 s, which the windows that begin at 35 and 40
     # s see; one ends between two samples of which one is touched.
     starts, degrees = gyro_windows(changed(sequence, "gyro", slice(4000, 4100), [0.5, 0.0, 0.4]))
@@ -74,7 +77,7 @@ def test_self_check_removes_one_constant_gyro_bias_and_judges_by_the_median_wind
 )
 def test_self_check_says_what_is_implausible(spoil, reason):
     spoilt = spoil(circle())._replace(attributes={"accel_clipped": 0.21})
-    (failure, *_) = (each for each in self_check(spoilt).failures if reason in each)
+    (failure, *_) = (line for line in self_check(spoilt).failures if reason in line)
     assert ("clips in 21% of the samples" in failure) == (reason == "mean of R·accel")
 
 
@@ -86,8 +89,8 @@ def test_a_gyro_may_be_off_by_a_percent_of_what_it_turns(turn, passes):
     drift = np.radians(0.06) * (sequence.time - 30.0)
     check = self_check(sequence._replace(gyro=sequence.gyro + drift[:, None] * [0.0, 0.0, 1.0]))
     assert 7.0 < check.gyro_consistency_degrees < 9.0
-    said = [failure for failure in check.failures if "in which it turns 57°" in failure]
-    assert (check.failures == ()) == passes and len(said) == (not passes)
+    failures = [failure for failure in check.failures if "in which it turns 57°" in failure]
+    assert (check.failures == ()) == passes and len(failures) == (not passes)
 
 
 def test_self_check_spares_those_who_stand():
@@ -134,10 +137,10 @@ def test_who_ends_faster_than_he_began_is_not_tilted():
     # A stop and start in the middle that nobody has seen: speeds before and after say nothing of
     # each other.
     sequence = speeding(seconds=12.0, push=0.5)
-    late = sequence.time[:, None] >= 6.0
-    seen = (sequence.time < 5.0) | (sequence.time >= 7.0)
-    velocity = np.where(late, sequence.velocity - [4.0, 0, 0], sequence.velocity)
-    check = self_check(sequence._replace(velocity=velocity, valid=seen), pedestrian=False)
+    second_half = sequence.time[:, None] >= 6.0
+    valid = (sequence.time < 5.0) | (sequence.time >= 7.0)
+    velocity = np.where(second_half, sequence.velocity - [4.0, 0, 0], sequence.velocity)
+    check = self_check(sequence._replace(velocity=velocity, valid=valid), pedestrian=False)
     np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=1e-9)
 
 
@@ -152,8 +155,8 @@ def test_one_window_says_nothing_of_the_gyro_since_a_bias_explains_it(seconds, j
     assert self_check(sequence).failures == ()
     if judged:  # one valid window of a long recording says nothing either
         sequence = circle(seconds=60.0)
-        seen = (sequence.time >= 20.0) & (sequence.time < 31.0)
-        check = self_check(sequence._replace(valid=seen))
+        valid = (sequence.time >= 20.0) & (sequence.time < 31.0)
+        check = self_check(sequence._replace(valid=valid))
         assert np.isnan(check.gyro_consistency_degrees) and check.failures == ()
 
 
@@ -161,7 +164,7 @@ def test_what_is_implausible_is_left_out_and_named_unless_the_dataset_does_not_a
     good = circle()
     upside = good._replace(name="upside", accel=-good.accel)
     with pytest.warns(UserWarning, match=r"upside: left out .* mean of R·accel") as caught:
-        assert [each.name for each in keep_plausible([upside, good], asking())] == [good.name]
+        assert [walk.name for walk in keep_plausible([upside, good], asking())] == [good.name]
     assert len(caught) == 1
     nothing = pytest.raises(InputError, match="none of 1 sequences")
     mirrored = good._replace(position=good.position * [-1, 1, 1])

@@ -20,8 +20,8 @@ def recording(name, seconds, **attributes):
     nothing = np.zeros((len(time), 3))
     quaternion = np.tile([1.0, 0, 0, 0], (len(time), 1))
     valid = np.ones(len(time), bool)
-    found = Sequence(name, time, nothing, nothing, quaternion, nothing, nothing, valid)
-    return found._replace(attributes=attributes)
+    sequence = Sequence(name, time, nothing, nothing, quaternion, nothing, nothing, valid)
+    return sequence._replace(attributes=attributes)
 
 
 def test_lists_may_lack_recordings_and_their_last_newline_but_not_everything(tmp_path):
@@ -58,16 +58,16 @@ RECORDINGS = [
 
 
 def test_folds_share_the_time_and_keep_groups_whole():
-    found = data.folds(RECORDINGS, 2)
+    folds = data.folds(RECORDINGS, 2)
     lengths = {"a": 50, "b": 40, "c": 30, "lonely": 20, "other": 20}
-    assert sum(lengths[name] for name in found if found[name] == 0) in (70, 80, 90)
+    assert sum(lengths[name] for name in folds if folds[name] == 0) in (70, 80, 90)
     for order in itertools.islice(itertools.permutations(RECORDINGS), 0, 5040, 501):
-        assert data.folds(order, 2) == found
+        assert data.folds(order, 2) == folds
 
 
 def test_a_split_may_be_a_fold_or_all_but_that_in_training_too(monkeypatch):
     """Groups are those of the loaders, else people, else each is its own."""
-    groups = [data.group(each) for each in RECORDINGS]
+    groups = [data.group(sequence) for sequence in RECORDINGS]
     assert groups == ["a", "a", "b", "c", "c", "lonely", "other"]
     monkeypatch.setattr(loading, "read_split", lambda *_: iter(RECORDINGS))
     fold_of = data.folds(RECORDINGS, 3)

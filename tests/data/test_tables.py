@@ -135,12 +135,12 @@ def test_what_no_logger_writes_is_no_number(tmp_path, cell):
 
 def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path):
     path = tmp_path / "a.npz"
-    for error, told, words in (
+    for error, expected, words in (
         (AssertionError, AssertionError, "ours"),
         (NameError, NameError, "ours"),
         (ImportError, ImportError, "ours"),
         (MemoryError, InputError, "does not fit into memory as npz"),
         (EOFError, InputError, "may be cut short"),
     ):
-        with pytest.raises(told, match=words), parsing_as(path, "npz"):
+        with pytest.raises(expected, match=words), parsing_as(path, "npz"):
             raise error("ours")

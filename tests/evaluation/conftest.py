@@ -39,7 +39,7 @@ def clean():
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """The folder of a run of the smallest network."""
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", TRAINED)
 
 

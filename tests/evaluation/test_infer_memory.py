@@ -66,7 +66,7 @@ def test_each_stretch_is_one_run_with_a_memory_of_its_own(walks, rotation, equiv
     measured[203] = False
     sequence = walks[0]._replace(imu_valid=measured)
     (recording,) = ready([sequence], config, orientation="reference")
-    (found,) = infer(network, [recording], config)
+    (displacements,) = infer(network, [recording], config)
     turns = rotations(walks[0].orientation).as_matrix()
     np.testing.assert_allclose(recording.attitude[:50], turns[:50], atol=1e-9)
     hole, last = 203 // N, recording.strides
@@ -74,13 +74,21 @@ def test_each_stretch_is_one_run_with_a_memory_of_its_own(walks, rotation, equiv
         rows = stepwise(network, recording, strides, axes)
         for k, (value, covariance, gate) in zip(strides, rows, strict=True):
             if k - strides.start < W - 1:
-                assert np.isnan(found.value[k]).all() and np.isnan(found.covariance[k]).all()
+                assert (
+                    np.isnan(displacements.value[k]).all()
+                    and np.isnan(displacements.covariance[k]).all()
+                )
                 continue
-            np.testing.assert_allclose(found.value[k], value, atol=2e-3)
-            np.testing.assert_allclose(found.covariance[k], covariance, atol=2e-3, rtol=2e-3)
-            np.testing.assert_allclose(found.diagnostics["gate"][k], gate, atol=2e-3)
-    assert np.isnan(found.value[hole]).all() and set(found.diagnostics) == {"gate", "scale"}
-    assert np.isfinite(integrate(recording, found, config).trajectory.position).all()
+            np.testing.assert_allclose(displacements.value[k], value, atol=2e-3)
+            np.testing.assert_allclose(
+                displacements.covariance[k], covariance, atol=2e-3, rtol=2e-3
+            )
+            np.testing.assert_allclose(displacements.diagnostics["gate"][k], gate, atol=2e-3)
+    assert np.isnan(displacements.value[hole]).all() and set(displacements.diagnostics) == {
+        "gate",
+        "scale",
+    }
+    assert np.isfinite(integrate(recording, displacements, config).trajectory.position).all()
 
 
 def test_the_filter_runs_with_it_over_several_recordings(walks):

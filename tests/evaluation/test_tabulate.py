@@ -113,12 +113,12 @@ def test_recordings_that_are_left_out_for_one_reason_are_one_line(made_report):
 def test_groups_that_make_an_interval_unsure_are_told():
     """In the table and on the page, with the largest of the metrics' groups."""
 
-    def told(groups, **values):
+    def remarks(groups, **values):
         ates = dict(zip("abcdefgh", range(1, 9), strict=True))
         return tabulate.remarks(report_of(ates, dict(zip("abcdefgh", groups, strict=True)), values))
 
-    assert told("vvwwxxyz") == []
+    assert remarks("vvwwxxyz") == []
     uneven = "One of 4 people or sessions has 5 of 8 sequences, so the interval may be too narrow."
-    assert told("wwwwwxyz") == [uneven]
-    assert told("wwwwxxxx") == ["no interval of a mean over 2 groups: it needs 4"]
-    assert told("wwwwwwww") == ["no interval of a mean over 1 group: it needs 4"]
+    assert remarks("wwwwwxyz") == [uneven]
+    assert remarks("wwwwxxxx") == ["no interval of a mean over 2 groups: it needs 4"]
+    assert remarks("wwwwwwww") == ["no interval of a mean over 1 group: it needs 4"]

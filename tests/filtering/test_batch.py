@@ -20,9 +20,9 @@ def test_same_as_one_after_the_other_with_its_derivative(x):
     assert len(jax.devices()) == 2
     w, x = jnp.float64(0.5), jnp.array(x)
     mapped = jax.jit(filtering.over_sequences(lambda w, x: 0.5 * (w * x) ** 2, shared=1))
-    found = mapped(w, x)
-    assert len({shard.device for shard in found.addressable_shards}) == min(2, len(x))
-    np.testing.assert_allclose(found, 0.5 * (0.5 * np.array(x)) ** 2, rtol=1e-14)
+    values = mapped(w, x)
+    assert len({shard.device for shard in values.addressable_shards}) == min(2, len(x))
+    np.testing.assert_allclose(values, 0.5 * (0.5 * np.array(x)) ** 2, rtol=1e-14)
     slopes = jax.jit(jax.grad(lambda w, x: jnp.sum(mapped(w, x)), argnums=(0, 1)))
     of_shared, of_each = slopes(w, x)
     np.testing.assert_allclose(of_shared, 0.5 * float(jnp.sum(x**2)), rtol=1e-14)
@@ -34,9 +34,9 @@ def test_on_one_device_also_of_what_is_no_array(monkeypatch, count):
     device = jax.devices()[0]
     monkeypatch.setattr(jax, "devices", lambda *_: [device])
     x = jnp.arange(1.0, 1.0 + count)
-    found = filtering.over_sequences(lambda w, x: {"x": w * x, "w": 1.0}, shared=1)(2.0, x)
-    np.testing.assert_array_equal(found["x"], 2.0 * np.asarray(x))
-    np.testing.assert_array_equal(found["w"], np.ones(count))
+    outputs = filtering.over_sequences(lambda w, x: {"x": w * x, "w": 1.0}, shared=1)(2.0, x)
+    np.testing.assert_array_equal(outputs["x"], 2.0 * np.asarray(x))
+    np.testing.assert_array_equal(outputs["w"], np.ones(count))
 
 
 def test_batches_are_of_similar_lengths_and_the_last_is_filled_up():

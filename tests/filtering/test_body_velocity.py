@@ -46,8 +46,8 @@ def test_the_velocity_is_measured_in_the_body_and_the_displacement_is_not():
     np.testing.assert_array_equal(np.isfinite(history.accepted), np.arange(12) >= 3)
     np.testing.assert_allclose(state.velocity, TURN @ VELOCITY, atol=0.05)
     # The first innovation is the error of the start, in the body and in metres per window.
-    wanted = -SECONDS * TURN.T @ np.full(3, 0.2)
-    np.testing.assert_allclose(history.innovation[3], wanted, atol=1e-6)
+    start_error = -SECONDS * TURN.T @ np.full(3, 0.2)
+    np.testing.assert_allclose(history.innovation[3], start_error, atol=1e-6)
     # The covariance is that of the network times the scale, not below the smallest of the filter.
     variance = np.diagonal(history.measurement_covariance[5])
     np.testing.assert_allclose(variance, 0.1 * np.exp(-8.0), rtol=1e-6)
@@ -67,7 +67,7 @@ def test_its_jacobian_is_the_derivative_of_the_predicted_velocity():
 
     step = 1e-6
     slopes = [(predicted(step * e) - predicted(-step * e)) / (2 * step) for e in np.eye(6)]
-    wanted = np.array(slopes).T
+    differences = np.array(slopes).T
     state = state._replace(rotation=jnp.asarray(rotation), velocity=jnp.asarray(velocity))
     measurement = filtering.displacement.scaled_displacement(
         jnp.zeros(3), jnp.eye(3), ekf.noise, "body"
@@ -75,8 +75,8 @@ def test_its_jacobian_is_the_derivative_of_the_predicted_velocity():
     inputs = filtering.Step(None, 0, 1, ekf.config, ekf.noise)
     linear, defined = filtering.displacement.linearise_displacement(measurement, state, inputs)
     assert defined
-    np.testing.assert_allclose(linear.jacobian["rotation"], wanted[:, :3], atol=1e-7)
-    np.testing.assert_allclose(linear.jacobian["velocity"], wanted[:, 3:], atol=1e-7)
+    np.testing.assert_allclose(linear.jacobian["rotation"], differences[:, :3], atol=1e-7)
+    np.testing.assert_allclose(linear.jacobian["velocity"], differences[:, 3:], atol=1e-7)
     np.testing.assert_allclose(linear.residual, -predicted(np.zeros(6)), atol=1e-9)
 
 

@@ -110,8 +110,8 @@ def wrong():
 
 def arguments(**others):
     names = ("gyro", "accel", "displacement", "covariance")
-    given = dict(zip(names, WALK[1:], strict=True))
-    return {"ekf": filtering.Filter(CONFIG, NOISE), "state": start(), **given, **others}
+    signals = dict(zip(names, WALK[1:], strict=True))
+    return {"ekf": filtering.Filter(CONFIG, NOISE), "state": start(), **signals, **others}
 
 
 def test_arguments_that_cannot_be_are_refused_by_name():
@@ -169,9 +169,9 @@ def test_settings_that_make_no_sense_are_refused_by_name():
         "speed_limit": (0.0, np.inf),
     }.items():
         for value in values:
-            given = {"dt": 0.01, "samples_per_clone": 2, "clones_per_window": 3, name: value}
+            fields = {"dt": 0.01, "samples_per_clone": 2, "clones_per_window": 3, name: value}
             with pytest.raises(ValueError, match=f"^FilterConfig: field '{name}' "):
-                filtering.FilterConfig(**given)
+                filtering.FilterConfig(**fields)
 
 
 def test_the_precision_is_asked_for():
@@ -182,9 +182,9 @@ def test_the_precision_is_asked_for():
         filtering.initial_state(filtering.Filter(CONFIG), *POSE)
     config = dataclasses.replace(CONFIG, allow_float32=True)
     state = filtering.initial_state(filtering.Filter(config), *single)
-    given = arguments(state=state, ekf=filtering.Filter(config, NOISE))
-    found = jax.eval_shape(lambda given: filtering.run_filter(**given), given)
-    floating = [x for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.floating)]
+    inputs = arguments(state=state, ekf=filtering.Filter(config, NOISE))
+    shapes = jax.eval_shape(lambda inputs: filtering.run_filter(**inputs), inputs)
+    floating = [x for x in jax.tree.leaves(shapes) if jnp.issubdtype(x.dtype, jnp.floating)]
     assert all(leaf.dtype == jnp.float32 for leaf in floating)
 
 

@@ -48,13 +48,13 @@ def run_and_sensitivity(c, more, rotation, velocity, position, gyro, accel, disp
     start = filtering.initial_state(
         filtering.Filter(CONFIG, start=START), rotation, velocity, position, bias
     )
-    given = disturb(disturb(displacement, c), more), jax.vmap(jnp.diag)(std**2)
+    measurements = disturb(disturb(displacement, c), more), jax.vmap(jnp.diag)(std**2)
 
     def repeated(start, displacement, covariance, frame):
         signals = start, gyro, accel, displacement, covariance
         return filtering.run_filter(filtering.Filter(CONFIG, NOISE), *signals, frame=frame)[1]
 
-    history = repeated(start, *given, "own")
+    history = repeated(start, *measurements, "own")
     displacement, covariance = history.unscaled_displacements(NOISE)
     fixed, turning = (
         filtering.sensitivity(
@@ -73,11 +73,11 @@ def filtered():
     """All runs, each with errors drawn from `STD`: history, sensitivity and what is considered;
     and the history of the first run as a function of more errors, of as many as there are runs."""
     runs, std = walks()
-    given = runs.rotation0, runs.velocity0, runs.position0, runs.gyro, runs.accel
-    given = drawn(), np.zeros((RUNS, 6)), *given, runs.displacement, std
-    first = [np.repeat(leaf[:1], RUNS, axis=0) for leaf in given]
-    found = jax.device_get(PROGRAM(*given))
-    return found, lambda more: jax.device_get(PROGRAM(first[0], more, *first[2:])[0])
+    inputs = runs.rotation0, runs.velocity0, runs.position0, runs.gyro, runs.accel
+    arguments = drawn(), np.zeros((RUNS, 6)), *inputs, runs.displacement, std
+    first = [np.repeat(leaf[:1], RUNS, axis=0) for leaf in arguments]
+    results = jax.device_get(PROGRAM(*arguments))
+    return results, lambda more: jax.device_get(PROGRAM(first[0], more, *first[2:])[0])
 
 
 STEPS = np.repeat([1e-5, 1e-4], 3)
@@ -98,17 +98,19 @@ def central(estimates):
         )
         turn = ahead.rotation @ np.swapaxes(behind.rotation, 1, 2)
         names = ("velocity", "position", "gyro_bias", "accel_bias")
-        rest = [getattr(ahead, name) - getattr(behind, name) for name in names]
-        yield np.concatenate([Rotation.from_matrix(turn).as_rotvec(), *rest], axis=1) / (2 * step)
+        differences = [getattr(ahead, name) - getattr(behind, name) for name in names]
+        yield np.concatenate([Rotation.from_matrix(turn).as_rotvec(), *differences], axis=1) / (
+            2 * step
+        )
 
 
 def test_the_sensitivity_is_the_change_of_the_filter():
-    (_, found, _), run_with = filtered()
-    for entry, wanted in enumerate(central(run_with(steps_of_each()))):
-        size = np.abs(wanted).max(axis=0)
+    (_, sensitivity, _), run_with = filtered()
+    for entry, derivative in enumerate(central(run_with(steps_of_each()))):
+        size = np.abs(derivative).max(axis=0)
         assert size[[6, 7, 8]].max() > 1e-2, entry
         np.testing.assert_allclose(
-            found[0, :, :, entry] / (size + 1e-6), wanted / (size + 1e-6), atol=1e-5
+            sensitivity[0, :, :, entry] / (size + 1e-6), derivative / (size + 1e-6), atol=1e-5
         )
 
 
@@ -203,9 +205,9 @@ def test_displacements_are_disturbed_as_they_are_said_to_be():
     u = rng.standard_normal((5, 3))
     u[2], u[3, :2] = np.nan, 0.0
     c = np.array([9.0, 9.0, 9.0, 0.2, -0.3, 0.1])
-    wanted = np.exp(0.2) * Rotation.from_euler("z", -0.3).apply(np.nan_to_num(u))
-    wanted[:, 2] += 0.1 * np.hypot(u[:, 0], u[:, 1])
-    np.testing.assert_allclose(disturb(u, c), np.where(np.isnan(u), np.nan, wanted), atol=2e-7)
+    expected = np.exp(0.2) * Rotation.from_euler("z", -0.3).apply(np.nan_to_num(u))
+    expected[:, 2] += 0.1 * np.hypot(u[:, 0], u[:, 1])
+    np.testing.assert_allclose(disturb(u, c), np.where(np.isnan(u), np.nan, expected), atol=2e-7)
     derivative = jax.jit(jax.jacfwd(lambda c: disturb(u, c)))
     slope = derivative(c)
     assert np.isfinite(np.asarray(slope)[[0, 1, 3, 4]]).all()
@@ -214,10 +216,10 @@ def test_displacements_are_disturbed_as_they_are_said_to_be():
     nothing = np.zeros(len(u))
     across = np.stack([-u[:, 1], u[:, 0], nothing], axis=1)
     up = np.stack([nothing, nothing, lifted], axis=1)
-    known = [0, 1, 3, 4]
-    wanted = np.stack([u, across, up], axis=2)
-    np.testing.assert_allclose(slope[known][:, :, 3:], wanted[known], atol=2e-6)
-    assert not slope[known][:, :, :3].any()
+    finite_rows = [0, 1, 3, 4]
+    expected_slope = np.stack([u, across, up], axis=2)
+    np.testing.assert_allclose(slope[finite_rows][:, :, 3:], expected_slope[finite_rows], atol=2e-6)
+    assert not slope[finite_rows][:, :, :3].any()
 
 
 def test_nothing_considered_adds_nothing_and_a_negative_size_is_refused():
@@ -233,15 +235,15 @@ def test_nothing_considered_adds_nothing_and_a_negative_size_is_refused():
 def test_the_bias_of_a_raw_gyro_is_considered_along_its_axis():
     """Where the axis is zero, the gyro is not raw."""
     rng = np.random.default_rng(3)
-    found, axis = rng.standard_normal((4, 15, 6)), rng.standard_normal((4, 3))
+    sensitivity, axis = rng.standard_normal((4, 15, 6)), rng.standard_normal((4, 3))
     axis[1] = 0.0
-    plain = filtering.considered_covariance(found, STD)
-    raw = filtering.considered_covariance(found, STD._replace(raw_gyro_bias=0.3), axis)
+    plain = filtering.considered_covariance(sensitivity, STD)
+    raw = filtering.considered_covariance(sensitivity, STD._replace(raw_gyro_bias=0.3), axis)
     for row in range(4):
-        along = 0.3 * found[row, :, :3] @ axis[row]
+        along = 0.3 * sensitivity[row, :, :3] @ axis[row]
         np.testing.assert_allclose(raw[row] - plain[row], np.outer(along, along), atol=1e-12)
     np.testing.assert_array_equal(
-        filtering.considered_covariance(found, STD._replace(raw_gyro_bias=0.3)), plain
+        filtering.considered_covariance(sensitivity, STD._replace(raw_gyro_bias=0.3)), plain
     )
 
 
@@ -263,13 +265,13 @@ def with_arc(covariance, added):
 def test_the_arc_is_that_of_the_whole_yaw():
     root = np.random.default_rng(3).normal(size=(2, 5, 15, 15))
     covariance, added = root @ np.swapaxes(root, 2, 3)
-    for error, wanted in (
+    for error, expected in (
         ("invariant", with_arc(covariance, added)),
         ("additive", covariance + added),
     ):
         config = dataclasses.replace(CONFIG, error=error)
         total = filtering.with_considered(covariance, added, config)
-        np.testing.assert_allclose(total, wanted, atol=1e-9)
+        np.testing.assert_allclose(total, expected, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -327,8 +329,10 @@ class Told:
         self.log_std = np.log(SIGMA / root_scale)
 
     def __call__(self, windows):
-        told = jax.pure_callback(self._next, jax.ShapeDtypeStruct((3,), float), windows[0, 0, 0])
-        return Prediction(told[None], jnp.asarray(self.log_std)[None], {})
+        displacement = jax.pure_callback(
+            self._next, jax.ShapeDtypeStruct((3,), float), windows[0, 0, 0]
+        )
+        return Prediction(displacement[None], jnp.asarray(self.log_std)[None], {})
 
     def _next(self, _):
         self.calls += 1
@@ -357,22 +361,22 @@ def started(r):
 
 def test_the_tracker_has_the_covariance_of_the_whole_run(built):
     (history, _, added), _ = filtered()
-    (runs, _), wanted = walks(), with_arc(history.covariance, added)
+    (runs, _), expected = walks(), with_arc(history.covariance, added)
     TOLD.calls = 0
     for r in range(TRACKED):
         tracker = filtering.Tracker(
             TOLD, filtering.Filter(CONFIG, NOISE, considered=STD), started(r)
         )
-        told = np.nan_to_num(disturb(runs.displacement[r], drawn()[r]))
+        displacements = np.nan_to_num(disturb(runs.displacement[r], drawn()[r]))
         poses = []
         for k in checked_at_first(range(N * STRIDES), 30):
-            TOLD.displacement = told[k // N]
+            TOLD.displacement = displacements[k // N]
             pose = tracker.push(k * DT, runs.gyro[r, k], runs.accel[r, k])
             poses += [] if pose is None else [pose]
-        std = np.sqrt(np.diagonal(wanted[r], axis1=1, axis2=2))
+        std = np.sqrt(np.diagonal(expected[r], axis1=1, axis2=2))
         scale = std[:, :, None] * std[:, None, :]
         covariance = np.array([pose.covariance for pose in poses])
-        np.testing.assert_allclose(covariance / scale, wanted[r] / scale, atol=1e-9)
+        np.testing.assert_allclose(covariance / scale, expected[r] / scale, atol=1e-9)
         positions = [pose.position for pose in poses]
         np.testing.assert_allclose(positions, history.position[r], atol=1e-9)
     assert TOLD.calls == TRACKED * (STRIDES - CLONES)  # of the derivatives none calls it again
@@ -380,7 +384,7 @@ def test_the_tracker_has_the_covariance_of_the_whole_run(built):
 
 def test_a_start_from_rest_considers_from_its_first_pose_on(built):
     waiting = filtering.Tracker(TOLD, filtering.Filter(CONFIG, NOISE, considered=STD))
-    rest = [[0.0, 0.0, 0.0], [0.0, 0.0, 9.81]]
-    pose = [waiting.push(k * DT, *rest) for k in range(50)][-1]
+    resting_sample = [[0.0, 0.0, 0.0], [0.0, 0.0, 9.81]]
+    pose = [waiting.push(k * DT, *resting_sample) for k in range(50)][-1]
     variance = np.diag(pose.covariance)[9:12]
     assert (variance > 0.9 * STD.gyro_bias**2).all()

@@ -88,11 +88,11 @@ def test_certainty_agrees_with_the_errors():
     runs = walks()
     error, spread, nis, final = monte_carlo(runs, SIGMA)
     for name, index in PARTS.items():
-        found = nees_of(error, spread, index)[20:]
+        nees_by_time = nees_of(error, spread, index)[20:]
         low, high = bounds(len(index) * RUNS)
-        assert low < found.mean() < high, (name, found.mean())
+        assert low < nees_by_time.mean() < high, (name, nees_by_time.mean())
         # Of single times one in twenty is outside, and their errors are those of times nearby.
-        assert np.mean((found > low) & (found < high)) > 0.6, name
+        assert np.mean((nees_by_time > low) & (nees_by_time < high)) > 0.6, name
     low, high = bounds(3 * RUNS)
     by_time = nis[:, CLONES:].mean(0) / 3
     assert np.mean((by_time > low) & (by_time < high)) > 0.92
@@ -106,11 +106,11 @@ def test_certainty_agrees_with_the_errors():
     whole = np.asarray(jax.vmap(covariance)(final))
     last = np.s_[15 + CLONE * CLONES + 3 : 15 + CLONE * (CLONES + 1)]
     first = np.s_[18:21]
-    apart = whole[:, last, last] + whole[:, first, first]
-    apart = apart - whole[:, last, first] - whole[:, first, last]
+    window_covariance = whole[:, last, last] + whole[:, first, first]
+    window_covariance = window_covariance - whole[:, last, first] - whole[:, first, last]
     offsets = np.asarray(final.clone_offset)
     wrong = runs.position[:, -1] - runs.position[:, -1 - CLONES] - (offsets[:, -1] - offsets[:, 0])
-    assert low < nees(wrong, apart) < high
+    assert low < nees(wrong, window_covariance) < high
 
 
 CORRELATED_SIGMA = 0.05
@@ -152,15 +152,15 @@ def test_the_smoother_is_consistent_with_correlated_errors():
     for index in list(PARTS.values())[:4]:
         # The yaw's error hardly changes along a walk: a mean over time is no narrower.
         low, high = bounds(len(index) * 16, 0.999)
-        found = nees_of(error, smoothed.covariance, index)[100:-100].mean()
-        assert low < found < high, index
+        mean_nees = nees_of(error, smoothed.covariance, index)[100:-100].mean()
+        assert low < mean_nees < high, index
 
 
 OWN = filtering.FilterConfig(0.02, 4, 3)
 
 
 @quick
-def told_by_a_network(R, gyro, accel, bias, weights, seen):
+def told_by_a_network(R, gyro, accel, bias, weights, displacement):
     """What the network predicts, turned into the world, the derivative of its innovation by θ, and
     that of the filter."""
 
@@ -174,21 +174,25 @@ def told_by_a_network(R, gyro, accel, bias, weights, seen):
     def cut(theta):
         return geometry.exp(-theta) @ R
 
-    def said(theta):
+    def prediction(theta):
         return network(cut_window(cut(theta), gyro, accel, jnp.zeros(3), bias, OWN.cut, OWN.dt))
 
     def innovation(theta):
-        return said(theta) - geometry.yaw_rotation(cut(theta)).T @ seen
+        return prediction(theta) - geometry.yaw_rotation(cut(theta)).T @ displacement
 
     nothing, single = jnp.zeros(3), filtering.FilterConfig(0.01, 1, 1)
     state = filtering.initial_state(filtering.Filter(single), jnp.eye(3), nothing, nothing)
-    clones = jnp.stack([R, jnp.eye(3)]), jnp.stack([-seen, nothing])
+    clones = jnp.stack([R, jnp.eye(3)]), jnp.stack([-displacement, nothing])
     state = state._replace(clone_rotation=clones[0], clone_offset=clones[1])
     step = Step(Imu(np.zeros((1, 3)), np.zeros((1, 3)), None), 1, 0, single, NOISE)
     measured = Displacement(nothing, jnp.eye(3), jnp.bool_(True), "own")
     linear, defined = linearise_displacement(measured, state, step)
-    found = linear.jacobian["oldest_rotation"], defined
-    return geometry.yaw_rotation(R) @ said(nothing), jax.jacfwd(innovation)(nothing), found
+    linearisation = linear.jacobian["oldest_rotation"], defined
+    return (
+        geometry.yaw_rotation(R) @ prediction(nothing),
+        jax.jacfwd(innovation)(nothing),
+        linearisation,
+    )
 
 
 @pytest.mark.parametrize("angles", [(0.3, 0.9, -2.0), (0.4, np.pi / 2, 1.0)])
@@ -206,9 +210,11 @@ def test_own_frame_jacobian_is_that_of_an_equivariant_network(angles):
     force = force - force.mean(0) + [0, 0, 9.81]  # on average the device does not accelerate
     accel = np.einsum("kji,kj->ki", attitudes, force) + bias
     weights = 0.2 * rng.normal(size=n)
-    seen = weights @ force  # in the world
-    told, slope, (jacobian, defined) = told_by_a_network(R, gyro, accel, bias, weights, seen)
-    np.testing.assert_allclose(told, seen, atol=1e-9)
+    displacement = weights @ force  # in the world
+    prediction, slope, (jacobian, defined) = told_by_a_network(
+        R, gyro, accel, bias, weights, displacement
+    )
+    np.testing.assert_allclose(prediction, displacement, atol=1e-9)
     assert bool(defined)
     np.testing.assert_allclose(jacobian, slope, atol=1e-7)
     assert np.abs(jacobian[:, 2]).max() > 0.5

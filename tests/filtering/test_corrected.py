@@ -69,9 +69,9 @@ def test_the_variances_of_each_axis_spread_the_path_as_drawn_noise_does():
     ends = np.array([path(gyro + error[:, 3:], accel + error[:, :3]) for error in drawn])
     np.testing.assert_allclose(path(gyro, accel)[3:], history.position[0], atol=1e-9)
     spread = np.cov(ends.T)
-    found = np.asarray(history.covariance[0])[3:9, 3:9]
+    covariance = np.asarray(history.covariance[0])[3:9, 3:9]
     scale = np.sqrt(np.outer(np.diag(spread), np.diag(spread)))
-    np.testing.assert_allclose(found / scale, spread / scale, atol=0.08)
+    np.testing.assert_allclose(covariance / scale, spread / scale, atol=0.08)
 
 
 def test_a_variance_that_is_none_is_refused():

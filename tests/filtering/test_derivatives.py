@@ -64,8 +64,8 @@ def loss(x, around):
 
     def network(windows):
         ramp = jnp.linspace(0.5, 1.5, N * CLONES)[None, :, None]
-        seen = jnp.mean(ramp * windows.astype(jnp.float64), axis=1) @ x["network"]
-        pooled = around.share * seen + (1 - around.share) * jnp.tanh(x["network"].sum(0))[None]
+        response = jnp.mean(ramp * windows.astype(jnp.float64), axis=1) @ x["network"]
+        pooled = around.share * response + (1 - around.share) * jnp.tanh(x["network"].sum(0))[None]
         leap = jnp.where(jnp.max(jnp.abs(windows[:, :, :3])) > KNOCK, 50.0, 0.0)
         return Prediction(pooled + leap, -2.0 + 0.1 * pooled)
 
@@ -79,8 +79,8 @@ def loss(x, around):
     moved = (
         part + change for part, change in zip(first[1:], jnp.split(x["state"], 4), strict=True)
     )
-    rest = filtering.ZeroVelocity(0.01)
-    ekf = filtering.Filter(CONFIG, noise, std, measurements=(rest,))
+    zero_velocity = filtering.ZeroVelocity(0.01)
+    ekf = filtering.Filter(CONFIG, noise, std, measurements=(zero_velocity,))
     state = filtering.initial_state(ekf, first.rotation, *moved)
     shift, larger, later, spread_of_time = x["fix"]
     fix = filtering.Fix(
@@ -90,8 +90,8 @@ def loss(x, around):
         jnp.asarray(FIX.time_std) + spread_of_time,
         FIX.threshold,
     )
-    given = state, x["gyro"], x["accel"], around.valid, (fix,)
-    _, history = filtering.run_odometry(network, ekf, *given)
+    inputs = state, x["gyro"], x["accel"], around.valid, (fix,)
+    _, history = filtering.run_odometry(network, ekf, *inputs)
     of_rows = (
         jnp.sum(WEIGHTS * history.position, axis=1)
         + jnp.sum(history.rotation[:, 0] + history.velocity, axis=1)
@@ -113,12 +113,12 @@ def at(points, around=EARLY):
     """Values, histories and gradients at all of these points, what is around them the same or of
     each."""
     around = around if isinstance(around, list) else [around] * len(points)
-    found = []
+    batches = []
     for first in range(0, len(points), BATCH):
         some = list(zip(points, around, strict=True))[first : first + BATCH]
         some += [some[-1]] * (BATCH - len(some))
-        found.append(GRADIENT(*jax.tree.map(lambda *leaves: np.stack(leaves), *some)))
-    joined = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *found)
+        batches.append(GRADIENT(*jax.tree.map(lambda *leaves: np.stack(leaves), *some)))
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *batches)
     (value, history), gradient = joined
     return value, history, gradient
 
@@ -141,15 +141,15 @@ def point():
 def assert_slopes(x, around, names, rows=slice(None), step=1e-4, rtol=1e-5):
     """Along two random directions for each of the names, every entry of the rows as far."""
     gradient = at([x], around)[2]
-    rng, points, found = np.random.default_rng(0), [], []
+    rng, points, slopes = np.random.default_rng(0), [], []
     for name in 2 * names:
         direction, size = np.zeros_like(x[name]), x[name][rows].shape
         direction[rows] = rng.uniform(0.5, 1.5, size) * rng.choice([-1.0, 1.0], size)
         points += [{**x, name: x[name] + sign * step * direction} for sign in (1, -1)]
-        found.append(np.sum(gradient[name][0] * direction))
+        slopes.append(np.sum(gradient[name][0] * direction))
     ahead, behind = at(points, around)[0].reshape(-1, 2).T
     expected = (ahead - behind) / (2 * step)
-    np.testing.assert_allclose(found, expected, rtol=rtol, err_msg=str(names))
+    np.testing.assert_allclose(slopes, expected, rtol=rtol, err_msg=str(names))
     assert (np.abs(expected) > 1e-6).all()
 
 
@@ -165,12 +165,12 @@ def test_gradient_against_differences():
     _, history, _ = at([x], broken)
     weight, nis = history.gate_passed[0, CLONES:], history.nis[0, CLONES:]
     assert np.isnan(nis[: HALF - CLONES]).any() and (weight < 0.999).any()
-    wanted = np.where(weight < 1, 1 / (1 + np.exp((nis - 8.0) / 2.0)), weight)
-    np.testing.assert_allclose(weight, wanted, rtol=1e-9)
+    expected_weight = np.where(weight < 1, 1 / (1 + np.exp((nis - 8.0) / 2.0)), weight)
+    np.testing.assert_allclose(weight, expected_weight, rtol=1e-9)
     assert (history.accepted[0, CLONES:][np.isfinite(nis)] == 1).all()
     assert_slopes(x, broken, ["noise", "correlation", "factor", "std", "state", "network", "fix"])
-    there = np.delete(np.arange(HALF * N), HOLES)
-    assert_slopes(x, broken, ["gyro", "accel"], there)
+    present_samples = np.delete(np.arange(HALF * N), HOLES)
+    assert_slopes(x, broken, ["gyro", "accel"], present_samples)
     assert_slopes(x, EARLY._replace(share=1.0), ["network"], step=1e-3, rtol=1e-3)
     _, _, without = at([x | {"correlation": np.array([0.0, 0.3])}])
     assert all(np.isfinite(leaf).all() for leaf in without.values())
@@ -203,8 +203,8 @@ def test_gradients_are_finite_for_hostile_input():
     assert np.isfinite(value).all() and history.outcomes["zero_velocity"].accepted[0].any()
     assert np.nanmin(history.gate_passed[1]) < 1e-6 and np.isnan(history.nis[2, HALF:]).any()
     for name, leaf in gradient.items():
-        for kind, each in zip(points, leaf, strict=True):
-            assert np.isfinite(each).all() and np.abs(each).max() > 0, (kind, name)
+        for kind, slope in zip(points, leaf, strict=True):
+            assert np.isfinite(slope).all() and np.abs(slope).max() > 0, (kind, name)
 
 
 def scanned(scan, start, inputs):

@@ -73,10 +73,10 @@ def test_a_missing_component_leaves_the_others():
     weights = np.array([3 / 0.9, 2 / 0.7])
     weights = weights / weights.sum()
     mean = np.block([np.diag([weights[0], weights[0], 1.0]), weights[1] * np.eye(3, 2)])
-    both = np.zeros((5, 5))
-    both[:3, :3], both[3:, 3:] = SHAPE, SHAPE[:2, :2]
+    joint_covariance = np.zeros((5, 5))
+    joint_covariance[:3, :3], joint_covariance[3:, 3:] = SHAPE, SHAPE[:2, :2]
     np.testing.assert_allclose(fix.position[9], mean @ [1.0, 4.0, 3.0, 2.0, 8.0])
-    np.testing.assert_allclose(fix.covariance[9], mean @ both @ mean.T, atol=1e-15)
+    np.testing.assert_allclose(fix.covariance[9], mean @ joint_covariance @ mean.T, atol=1e-15)
     np.testing.assert_allclose(fix.before_end[9], weights @ [0.02, -0.02])
 
 
@@ -166,8 +166,8 @@ def test_a_part_of_a_fix_is_the_textbooks_update():
         jacobian = np.zeros((len(part), len(before)))
         jacobian[range(len(part)), [6 + axis for axis in part]] = 1.0
         jacobian[range(len(part)), [3 + axis for axis in part]] = -fix.before_end[0]
-        late = fix.time_std[0] * np.asarray(without.velocity)
-        spread = (fix.covariance[0] + np.outer(late, late))[np.ix_(part, part)]
+        shift = fix.time_std[0] * np.asarray(without.velocity)
+        spread = (fix.covariance[0] + np.outer(shift, shift))[np.ix_(part, part)]
         spread = spread + jacobian @ before @ jacobian.T
         expected = without.position - fix.before_end[0] * without.velocity
         fix.position[0] += expected - START[2]

@@ -28,8 +28,8 @@ THERE = np.ones(N * INTERVALS, bool)
 
 
 def run(valid=THERE, gyro=WALK[1], displacement=WALK[3]):
-    given = gyro, WALK[2], displacement, WALK[4], valid
-    return filtering.run_filter(filtering.Filter(CONFIG, NOISE), start(), *given)
+    signals = gyro, WALK[2], displacement, WALK[4], valid
+    return filtering.run_filter(filtering.Filter(CONFIG, NOISE), start(), *signals)
 
 
 bridge = jax.jit(gaps.bridge, static_argnums=4)
@@ -62,9 +62,9 @@ def test_holes_are_filled_with_the_last_sample(missing_before):
     imu, age, after = bridge(gyro, accel, valid, memory, CONFIG)
     ages, held, variances = gap_of(good, missing_before, 3)
     np.testing.assert_allclose(age, np.array(ages) * DT)
-    for found, signal, remembered in ((imu.gyro, gyro, 5.0), (imu.accel, accel, 6.0)):
+    for values, signal, remembered in ((imu.gyro, gyro, 5.0), (imu.accel, accel, 6.0)):
         np.testing.assert_array_equal(
-            found, [signal[j] if j >= 0 else np.full(3, remembered) for j in held]
+            values, [signal[j] if j >= 0 else np.full(3, remembered) for j in held]
         )
     np.testing.assert_allclose(imu.gap.gyro_variance, np.array(variances) * CONFIG.gap_gyro_std**2)
     np.testing.assert_allclose(
@@ -150,17 +150,17 @@ def test_a_short_hole_is_bridged_a_long_one_costs_certainty():
     valid, broken = THERE.copy(), WALK[1].copy()
     valid[[*range(100, 103), *range(200, 240)]] = False
     broken[~valid] = np.nan
-    (_, whole), (_, found) = run(), run(valid=valid, gyro=broken)
-    gap = np.asarray(found.imu_gap)
+    (_, whole), (_, history) = run(), run(valid=valid, gyro=broken)
+    gap = np.asarray(history.imu_gap)
     assert not np.any(whole.imu_gap) and np.all(whole.healthy)
     np.testing.assert_allclose(gap[[19, 20, 21]], [0, 0.06, 0])
     np.testing.assert_allclose(gap[39:49], [0, *(0.1 * np.arange(1, 9)), 0], atol=1e-12)
-    sigma, before = (np.sqrt(np.asarray(h.covariance_diagonal)) for h in (found, whole))
+    sigma, before = (np.sqrt(np.asarray(h.covariance_diagonal)) for h in (history, whole))
     assert (sigma[20, :6] > before[20, :6]).all() and (sigma[47, :6] > 5 * before[47, :6]).all()
-    assert (np.asarray(found.healthy) == 1).all() and np.isfinite(found.position).all()
+    assert (np.asarray(history.healthy) == 1).all() and np.isfinite(history.position).all()
     # what it says of itself holds: off by no more than four of its own sigmas in the gap and after
     # it
-    off = np.abs(np.asarray(found.velocity) - np.asarray(whole.velocity))
+    off = np.abs(np.asarray(history.velocity) - np.asarray(whole.velocity))
     assert (off[39:] < 4 * np.sqrt(sigma[39:, 3:6] ** 2 + before[39:, 3:6] ** 2)).all()
 
 
@@ -203,5 +203,5 @@ def test_the_filter_coasts_where_nothing_is_known():
     # Nothing was there to hold, so every sample has the variance of one just beyond the limit: e_4
     # = 1, Σ e = 3, of which 3² − 2² is its.
     growth = history.covariance_diagonal[-1, 0] - np.radians(1.0) ** 2
-    each = (3**2 - 2**2) * CONFIG.gap_gyro_std**2 + NOISE.gyro_density**2 / DT
-    np.testing.assert_allclose(growth, 30 * DT**2 * each, rtol=1e-6)
+    sample_variance = (3**2 - 2**2) * CONFIG.gap_gyro_std**2 + NOISE.gyro_density**2 / DT
+    np.testing.assert_allclose(growth, 30 * DT**2 * sample_variance, rtol=1e-6)

@@ -12,7 +12,7 @@ def test_gate_boundaries_count_samples():
     convergence, age of success, end of pause."""
     seconds = dict(convergence_seconds=0.3, success_seconds=0.7, pause_seconds=1.2)
     config = filtering.FilterConfig(0.1, 1, 1, **seconds)
-    gate = jax.jit(lambda memory, *given: innovation_gate(memory, config, *given))
+    gate = jax.jit(lambda memory, *arguments: innovation_gate(memory, config, *arguments))
 
     def step(memory, now, nis=20.0, tested=True):
         memory = filtering.GateState(*map(jnp.asarray, memory))

@@ -364,12 +364,12 @@ def test_an_update_is_that_of_the_group():
     residual, spread = np.array([0.8, -0.6, 0.2]), 0.01 * np.eye(3)
     results = updated(state, residual, spread)
     for rows, world, after in zip((position, carrier), (True, False), results, strict=True):
-        rotation, (velocity, place, *clones), whole = dense_update(
+        rotation, (velocity, dense_position, *clones), whole = dense_update(
             state, rows, residual, spread, world
         )
         np.testing.assert_allclose(after.rotation, rotation, atol=1e-10)
         np.testing.assert_allclose(after.velocity, velocity, atol=1e-10)
-        np.testing.assert_allclose(after.position, place, atol=1e-10)
+        np.testing.assert_allclose(after.position, dense_position, atol=1e-10)
         offsets = np.asarray(after.anchor) + np.asarray(after.clone_offset)
         np.testing.assert_allclose(offsets, clones, atol=1e-10)
         np.testing.assert_allclose(covariance(after), whole, atol=1e-9)
@@ -470,16 +470,16 @@ def walked_straight(position):
     return history.position, history.rotation, history.outcomes["fix"].accepted
 
 
-@pytest.mark.parametrize("yaw, taken", [(0.8, True), (3.0, False)])
-def test_a_fix_on_the_arc_of_an_uncertain_yaw_is_taken(yaw, taken):
+@pytest.mark.parametrize("yaw, acceptance", [(0.8, True), (3.0, False)])
+def test_a_fix_on_the_arc_of_an_uncertain_yaw_is_taken(yaw, acceptance):
     """With a standard deviation of 0.5 rad, one at 0.8 rad lies 5 m beside the tangent of the arc,
     five times its own standard deviation. One in the opposite direction is refused."""
     rows, position = np.arange(79, 100, 5), np.full((100, 2), np.nan)
     distance = 2.0 + 2.0 * ((rows + 1) * N * DT - 2.0)
     position[rows] = distance[:, None] * [np.cos(yaw), np.sin(yaw)]
     places, rotations, accepted = walked_straight(position)
-    assert (np.asarray(accepted)[rows] == taken).all()
-    if taken:
+    assert (np.asarray(accepted)[rows] == acceptance).all()
+    if acceptance:
         np.testing.assert_allclose(places[-1, :2], position[-1], atol=0.2)
         turned = np.arctan2(rotations[-1, 1, 0], rotations[-1, 0, 0])
         assert turned == pytest.approx(yaw, abs=0.02)

@@ -63,9 +63,9 @@ def run(equivariance="none"):
     return program(ekf, equivariance=equivariance)(start(ekf=ekf), *recording())
 
 
-def assert_close(found, expected, rtol=1e-5, atol=1e-5):
+def assert_close(result, expected, rtol=1e-5, atol=1e-5):
     jax.tree.map(
-        lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol), found, expected
+        lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol), result, expected
     )
 
 

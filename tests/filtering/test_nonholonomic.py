@@ -136,10 +136,10 @@ def test_a_car_that_slides_is_not_believed_to_go_straight():
     history = run(rides, tight)
     accepted = np.asarray(history.outcomes["nonholonomic"].accepted[0])
     assert not accepted[107:114].any() and accepted[:99].mean() > 0.98 and accepted[-50:].all()
-    left = Rotation.from_euler("ZYX", tight[2:5]).as_matrix()[:, 1]
+    lateral_axis = Rotation.from_euler("ZYX", tight[2:5]).as_matrix()[:, 1]
     rate = rides.gyro[0, 110 * N - 1] - history.gyro_bias[0, 109]
     velocity = history.rotation[0, 109].T @ history.velocity[0, 109]
-    assert abs(left @ (velocity + np.cross(rate, np.array(tight[-3:]))) - 4.0) < 0.3
+    assert abs(lateral_axis @ (velocity + np.cross(rate, np.array(tight[-3:]))) - 4.0) < 0.3
     error = np.asarray(history.velocity[0]) - rides.velocity[0]
     assert np.abs(error[-1]).max() < 0.5
 
@@ -231,8 +231,8 @@ def test_a_network_gives_the_factors_of_both_standard_deviations():
 
     wider = MOUNTED._replace(lateral_std=4 * MOUNTED[0], vertical_std=0.5 * MOUNTED[1])
     for factors, same in (([4.0, 0.5], wider), ([np.nan, 1.0], MOUNTED), ([1.0, 1.0], MOUNTED)):
-        found, expected = updated(MOUNTED, factors), updated(same)
-        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), found, expected)
+        result, expected = updated(MOUNTED, factors), updated(same)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), result, expected)
     assert abs(updated(wider)[1].nis - updated(MOUNTED)[1].nis) > 0.5
 
 

@@ -50,8 +50,8 @@ def start():
 
 @functools.partial(quick, static_argnames="config")
 def run(state, gyro, accel, displacement, covariance, config, measurements):
-    given = state, gyro, accel, displacement, covariance
-    return filtering.run_filter(filtering.Filter(config, NOISE), *given, measurements=measurements)
+    inputs = state, gyro, accel, displacement, covariance
+    return filtering.run_filter(filtering.Filter(config, NOISE), *inputs, measurements=measurements)
 
 
 def test_a_height_is_the_textbooks_update():
@@ -61,12 +61,12 @@ def test_a_height_is_the_textbooks_update():
     whole = jax.jit(covariance)
     for k in range(INTERVALS):
         rows, row = slice(N * k, N * (k + 1)), slice(k, k + 1)
-        given = GYRO[rows], ACCEL[rows], DISPLACEMENT[row], SPREAD[row]
+        signals = GYRO[rows], ACCEL[rows], DISPLACEMENT[row], SPREAD[row]
         none = Height(np.full(1, np.nan), np.full(1, std))
-        without, _ = run(state, *given, CONFIG, (none,))
+        without, _ = run(state, *signals, CONFIG, (none,))
         height = np.nan if k % 3 == 0 else without.position[2] + 0.1 * np.sin(k)
         height = np.asarray(100.0 if k == 20 else height)
-        state, history = run(state, *given, CONFIG, (none._replace(height=height[None]),))
+        state, history = run(state, *signals, CONFIG, (none._replace(height=height[None]),))
         outcome = history.outcomes["height"]
         assert outcome.present[0] == np.isfinite(height)
         assert outcome.accepted[0] == (np.isfinite(height) and k != 20)
@@ -126,15 +126,15 @@ def test_known_displacements_are_those_of_the_filter():
     angles = np.arange(INTERVALS + 1)[:, None] * 0.1 * turn
     rotations = Rotation.from_rotvec(angles).as_matrix() @ rotation
     position = rng.normal(size=(INTERVALS + 1, 3))
-    found = filtering.displacements(rotations, position, CONFIG)
-    assert np.isnan(found[:CLONES]).all() and found.shape == (INTERVALS, 3)
+    displacements = filtering.displacements(rotations, position, CONFIG)
+    assert np.isnan(displacements[:CLONES]).all() and displacements.shape == (INTERVALS, 3)
     for k in range(CLONES, INTERVALS):
         # Clone k is taken at the end of interval k, that is at row k + 1.
         old, new = k - CLONES + 1, k + 1
         yaw = np.arctan2(rotations[old, 1, 0], rotations[old, 0, 0])
         c, s = np.cos(yaw), np.sin(yaw)
         x, y, z = position[new] - position[old]
-        np.testing.assert_allclose(found[k], [c * x + s * y, c * y - s * x, z], atol=1e-12)
+        np.testing.assert_allclose(displacements[k], [c * x + s * y, c * y - s * x, z], atol=1e-12)
     assert np.isnan(filtering.displacements(rotations[:3], position[:3], CONFIG)).all()
 
 
@@ -159,8 +159,8 @@ def test_a_measurement_from_the_oldest_clone_waits_until_there_is_one():
     missing = np.full((INTERVALS, 3), np.nan)
     ahead = Ahead(np.ones(INTERVALS), np.full(INTERVALS, 1e-4))
     _, history = run(start(), GYRO, ACCEL, missing, SPREAD, CONFIG, (ahead,))
-    taken = np.asarray(history.outcomes["ahead"].accepted)
-    np.testing.assert_array_equal(taken, np.arange(INTERVALS) >= CLONES)
+    acceptance = np.asarray(history.outcomes["ahead"].accepted)
+    np.testing.assert_array_equal(acceptance, np.arange(INTERVALS) >= CLONES)
     moved = np.asarray(history.position[:, 0])
     assert abs(moved[CLONES] - moved[0] - 1) < 0.2  # it was believed
 

@@ -71,7 +71,7 @@ def update_gradient(state, displacement, covariance, frame):
 
 
 @pytest.mark.parametrize(
-    "frame, pitch, apart, accepted",
+    "frame, pitch, distance, accepted",
     [
         ("given", np.pi / 2, 1.0, False),
         ("given", np.pi / 2 - 0.9e-5, 1.0, False),  # gimbal lock begins at 1e-5
@@ -81,19 +81,19 @@ def update_gradient(state, displacement, covariance, frame):
     ],
     ids=["gimbal lock", "almost", "close by", "own frame, never locked", "coincident clones"],
 )
-def test_update_has_finite_derivatives_everywhere(frame, pitch, apart, accepted):
+def test_update_has_finite_derivatives_everywhere(frame, pitch, distance, accepted):
     rotation = Rotation.from_euler("y", pitch).as_matrix()
     state = filtering.initial_state(
         filtering.Filter(CONFIG), rotation, np.zeros(3), np.zeros(3)
     )._replace(
         clone_rotation=np.tile(rotation, (3, 1, 1)),
-        clone_offset=np.array([[-apart, 0, 0], [0, 0, 0], [0, 0, 0]]),
+        clone_offset=np.array([[-distance, 0, 0], [0, 0, 0], [0, 0, 0]]),
         clone_covariance=0.1 * np.eye(18),
         step=jnp.int32(5),
         gate=filtering.GateState(jnp.bool_(True), jnp.int32(25), jnp.int32(0)),
     )
-    given = state, np.array([apart + 0.1, 0, 0]), 0.01 * np.eye(3)
-    gradients, (new, outcome) = update_gradient(*given, frame)
+    inputs = state, np.array([distance + 0.1, 0, 0]), 0.01 * np.eye(3)
+    gradients, (new, outcome) = update_gradient(*inputs, frame)
     floats = [leaf for leaf in jax.tree.leaves(gradients) if leaf.dtype == jnp.float64]
     assert len(floats) == 18 and all(np.isfinite(leaf).all() for leaf in floats)
     assert bool(outcome.accepted) == accepted and outcome.present

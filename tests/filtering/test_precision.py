@@ -44,7 +44,7 @@ def hour():
 def test_float32_holds_for_an_hour():
     rotation, velocity, *signals, truth = hour()
     spread = np.tile(SIGMA**2 * np.eye(3), (MEASUREMENTS, 1, 1))
-    found = []
+    results = []
     for dtype in (np.float64, np.float32):
         single = dtype == np.float32
         config = filtering.FilterConfig(DT, N, CLONES, history="core", allow_float32=single)
@@ -55,9 +55,9 @@ def test_float32_holds_for_an_hour():
         assert history.position.dtype == dtype and (history.healthy == 1).all()
         assert np.abs(state.rotation @ state.rotation.T - np.eye(3)).max() < 1e-6
         np.testing.assert_array_equal(state.core_covariance, state.core_covariance.T)
-        found.append((history, np.sqrt(((history.position - truth) ** 2).sum(1).mean())))
+        results.append((history, np.sqrt(((history.position - truth) ** 2).sum(1).mean())))
 
-    (double, ate), (single, single_ate) = found
+    (double, ate), (single, single_ate) = results
     assert ate > 1  # a variance of the position that has grown is what breaks the plain form
     assert np.sqrt(double.covariance_diagonal[-1, 6:8]).max() > 2
     assert abs(single_ate / ate - 1) < 0.05

@@ -15,15 +15,15 @@ DT = 0.005
 
 def through(stamps, values, imu_rate, dt=DT, hole=None):
     """The rows (gyro, accel, valid) that the filter gets, and the newest stamp when each came."""
-    stream, rows, known = Stream(create_grid(dt, hole, imu_rate and float(imu_rate))), [], []
+    stream, rows, arrivals = Stream(create_grid(dt, hole, imu_rate and float(imu_rate))), [], []
     samples = zip(stamps.tolist(), values.tolist(), strict=True)
     for time, row in checked_at_first(samples, 60):  # 400 Hz: a row from 46 on
         stream.push(time, tuple(row))
         new = stream.ready
         rows += list(stream.rows(new))
         stream.take(new)
-        known += [time] * new
-    return np.array(rows).reshape(-1, 7), np.array(known)
+        arrivals += [time] * new
+    return np.array(rows).reshape(-1, 7), np.array(arrivals)
 
 
 def linear(stamps, values, dt=DT):
@@ -66,12 +66,12 @@ def test_pure_tones(rate, dt, jitter, highest):
     assert 21 * dt < delay < 22.01 * dt
     inside = slice(round(0.3 / dt), None)  # at the start the FIR's reach is filled by reflection
     passed = np.array([0.0, 0.5, 1.0]) * highest
-    rows, known = through(stamps, pairs(passed, stamps - stamps[0]), rate, dt)
+    rows, arrivals = through(stamps, pairs(passed, stamps - stamps[0]), rate, dt)
     grid = np.arange(len(rows)) * dt
     assert amplitudes(rows[:, :6] - pairs(passed, grid))[inside].max() < 0.01
     np.testing.assert_array_equal(rows[:, 6], 1.0)
-    late = known - stamps[0] - grid - delay
-    assert -1e-6 < late.min() and late.max() < 1.5 / rate
+    excess_delay = arrivals - stamps[0] - grid - delay
+    assert -1e-6 < excess_delay.min() and excess_delay.max() < 1.5 / rate
     # Where stamps jitter, no interpolation can read tones near the IMU's own Nyquist frequency.
     stopped = np.linspace(0.5 / dt, (0.2 if jitter else 0.49) * rate, 3)
     vibration = pairs(stopped, stamps - stamps[0])
@@ -86,10 +86,10 @@ def slow(stamps, values, rate, factor, half):
     Lines between samples more than 1.75 of the IMU's intervals apart; the first run goes on before
     its start by odd reflection, all else beyond the ends has no weight."""
     taps = firwin(2 * half + 1, 0.9 / factor, window=("kaiser", 6.75526))
-    step, elapsed, there = DT / factor, stamps - stamps[0], np.isfinite(values).all(axis=1)
+    step, elapsed, finite_rows = DT / factor, stamps - stamps[0], np.isfinite(values).all(axis=1)
     grid = np.arange(int(np.floor(elapsed[-1] / DT + 1e-6)) + 1)
     rows = np.tile([*[np.nan] * 6, 0.0], (len(grid), 1))
-    elapsed, values = elapsed[there], values[there]
+    elapsed, values = elapsed[finite_rows], values[finite_rows]
     for run in np.split(np.arange(len(elapsed)), np.flatnonzero(np.diff(elapsed) > 1.5 * DT) + 1):
         time, samples = elapsed[run], values[run]
         first, last = int(np.ceil(time[0] / step - 1e-4)), int(np.floor(time[-1] / step + 1e-4))
@@ -97,17 +97,17 @@ def slow(stamps, values, rate, factor, half):
         fine = np.stack([np.interp(points, time, column) for column in samples.T], axis=1)
         if len(run) >= 4:
             curve, line = CubicSpline(time, samples)(points), np.zeros(len(points), bool)
-            for left, right in itertools.pairwise(time):
-                line |= (left <= points) & (points < right) & (right - left > 1.75 / rate)
+            for left_end, right in itertools.pairwise(time):
+                line |= (left_end <= points) & (points < right) & (right - left_end > 1.75 / rate)
             fine = np.where(line[:, None], fine, curve)
-        known = {first + j: row for j, row in enumerate(fine)}
+        fine_rows = {first + j: row for j, row in enumerate(fine)}
         if first == 0:
-            known |= {-j: 2 * fine[0] - fine[j] for j in range(1, len(fine))}
+            fine_rows |= {-j: 2 * fine[0] - fine[j] for j in range(1, len(fine))}
         for k in grid[(grid * factor >= first) & (grid * factor <= last)]:
             near = [
-                (tap, known[k * factor + j])
+                (tap, fine_rows[k * factor + j])
                 for tap, j in zip(taps, range(-half, half + 1), strict=True)
-                if k * factor + j in known
+                if k * factor + j in fine_rows
             ]
             weights, around = (np.array(part) for part in zip(*near, strict=True))
             rows[k] = [*(weights @ around / weights.sum()), 1.0]
@@ -135,33 +135,33 @@ def test_against_a_slow_resampler(kind):
         values[random.integers(0, len(stamps), 20), 4] = np.inf
         values[:31] = np.nan
     stamps, values = stamps[keep], values[keep]
-    rows, known = through(stamps, values, rate)
-    wanted = slow(stamps, values, rate, factor, half)
-    assert 20 < len(wanted) - len(rows) < 25  # the last wait for the FIR's reach
-    wanted = wanted[: len(rows)]
-    np.testing.assert_array_equal(rows[:, 6], wanted[:, 6])
+    rows, arrivals = through(stamps, values, rate)
+    reference = slow(stamps, values, rate, factor, half)
+    assert 20 < len(reference) - len(rows) < 25  # the last wait for the FIR's reach
+    reference = reference[: len(rows)]
+    np.testing.assert_array_equal(rows[:, 6], reference[:, 6])
     # Between samples the end of the spline is felt: the taps are 1e-4 there, the noise up to 4.
-    np.testing.assert_allclose(rows, wanted, rtol=0, atol=1e-6 if kind == "multiple" else 2e-3)
-    assert (wanted[:, 6] == 0).any() == (kind not in ("multiple", "no multiple", "jitter"))
-    late = known - stamps[0] - np.arange(len(rows)) * DT
-    assert late.min() > -1e-6 and late[rows[:, 6] == 1].max() < 0.11 + 0.16
+    np.testing.assert_allclose(rows, reference, rtol=0, atol=1e-6 if kind == "multiple" else 2e-3)
+    assert (reference[:, 6] == 0).any() == (kind not in ("multiple", "no multiple", "jitter"))
+    delays = arrivals - stamps[0] - np.arange(len(rows)) * DT
+    assert delays.min() > -1e-6 and delays[rows[:, 6] == 1].max() < 0.11 + 0.16
 
 
 def interpolated(stamps, values, dt, hole):
     """The grid by its definition, without a low-pass: every point on its own, looking for its
     neighbours among the samples that are there."""
-    there = np.isfinite(values).all(1)
-    known, rows = stamps[there], values[there]
+    finite_rows = np.isfinite(values).all(1)
+    times, rows = stamps[finite_rows], values[finite_rows]
     grid = []
     for k in range(int(np.floor((stamps[-1] - stamps[0]) / dt + 1e-9)) + 1):
         point = stamps[0] + k * dt
-        equal = np.flatnonzero(np.abs(known - point) < 1e-9)
-        before, after = np.flatnonzero(known < point), np.flatnonzero(known > point)
+        equal = np.flatnonzero(np.abs(times - point) < 1e-9)
+        before, after = np.flatnonzero(times < point), np.flatnonzero(times > point)
         if len(equal):
             grid.append((*rows[equal[0]], 1.0))
-        elif len(before) and len(after) and known[after[0]] - known[before[-1]] <= hole:
-            grid.append((*[np.interp(point, known, column) for column in rows.T], 1.0))
-        elif len(before) and not len(after) and stamps[-1] - known[before[-1]] <= hole:
+        elif len(before) and len(after) and times[after[0]] - times[before[-1]] <= hole:
+            grid.append((*[np.interp(point, times, column) for column in rows.T], 1.0))
+        elif len(before) and not len(after) and stamps[-1] - times[before[-1]] <= hole:
             break  # a sample to come may still fill it
         else:
             grid.append((*[np.nan] * 6, 0.0))
@@ -188,14 +188,14 @@ def test_clock_without_a_low_pass(kind):
     if kind == "fast":  # so fast an IMU is refused after a second
         stamps, values = stamps[:240], values[:240]
     assert create_grid(0.01, hole).delay == 0
-    rows, known = through(stamps, values, None, 0.01, hole)
-    wanted = interpolated(stamps, values, 0.01, hole)
-    np.testing.assert_allclose(rows, wanted, atol=1e-9)
-    assert (wanted[:, 6] == 0).any() == (kind in ("missing", "holes"))
+    rows, arrivals = through(stamps, values, None, 0.01, hole)
+    reference = interpolated(stamps, values, 0.01, hole)
+    np.testing.assert_allclose(rows, reference, atol=1e-9)
+    assert (reference[:, 6] == 0).any() == (kind in ("missing", "holes"))
     if kind != "missing":
         # at most one sample late: all of the grid that the stamps have reached is there
         points = stamps[0] + 0.01 * np.arange(len(rows)) - 1e-8
-        np.testing.assert_array_equal(known, stamps[np.searchsorted(stamps, points)])
+        np.testing.assert_array_equal(arrivals, stamps[np.searchsorted(stamps, points)])
 
 
 def test_two_stamps_almost_alike_do_no_harm():
@@ -211,7 +211,7 @@ def test_a_lost_sample_of_a_slower_imu_is_no_hole():
     """250 Hz: 8 ms between two samples, and a hole is 7.5 ms. What is missing holds the last row.
     Of 140 Hz, which nobody can know where a sample is lost, 0.10 rms remain at best."""
 
-    def both(time):
+    def mixture(time):
         """140 Hz and 10 Hz, each in three phases."""
         return np.concatenate([tones(140.0, time)[:, ::2], tones(10.0, time)[:, ::2]], axis=1)
 
@@ -219,10 +219,10 @@ def test_a_lost_sample_of_a_slower_imu_is_no_hole():
     lost = np.random.default_rng(0).uniform(size=len(stamps)) < 0.03
     lost[[0, -1]] = False
     alone = lost & ~np.roll(lost, 1) & ~np.roll(lost, -1)
-    rows, _ = through(stamps[~lost], both(stamps - stamps[0])[~lost], 250)
+    rows, _ = through(stamps[~lost], mixture(stamps - stamps[0])[~lost], 250)
     assert int((rows[:, 6] == 0).sum()) <= 2 * (lost & ~alone).sum()
     last = np.maximum.accumulate(np.where(rows[:, 6] == 1, np.arange(len(rows)), 0))
-    wanted = both(np.arange(len(rows)) * DT) * [0, 0, 0, 1, 1, 1]
-    squares = (rows[last, :6] - wanted)[60:].reshape(-1, 2, 3) ** 2
+    expected = mixture(np.arange(len(rows)) * DT) * [0, 0, 0, 1, 1, 1]
+    squares = (rows[last, :6] - expected)[60:].reshape(-1, 2, 3) ** 2
     vibration, gait = np.sqrt(squares.mean(axis=(0, 2)))
     assert vibration < 0.22 and gait < 0.02

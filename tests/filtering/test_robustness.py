@@ -126,15 +126,15 @@ def test_a_displacement_that_nothing_makes_is_rejected_before_the_gate_begins_to
     rows = slice(10, 14)
     without, leaping = displacement.copy(), displacement.copy()
     without[rows], leaping[rows, 1] = np.nan, leap
-    _, wanted = FILTER(ekf, state, gyro, accel, without, covariance)
+    _, reference = FILTER(ekf, state, gyro, accel, without, covariance)
     _, history = FILTER(ekf, state, gyro, accel, leaping, covariance)
     for name in ("position", "velocity", "covariance_diagonal", "healthy"):
-        np.testing.assert_array_equal(getattr(history, name), getattr(wanted, name))
+        np.testing.assert_array_equal(getattr(history, name), getattr(reference, name))
     assert (history.accepted[rows] == 0).all() and history.healthy.all()
     no_covariance = covariance.copy()
     no_covariance[rows] = -np.eye(3)  # which spoils the state only where it is used
     _, history = FILTER(ekf, state, gyro, accel, leaping, no_covariance)
-    np.testing.assert_array_equal(history.position, wanted.position)
+    np.testing.assert_array_equal(history.position, reference.position)
     believed = displacement.copy()
     believed[rows, 1] += 30.0
     _, history = FILTER(ekf, state, gyro, accel, believed, covariance)
@@ -178,9 +178,9 @@ def test_a_displacement_that_nothing_makes_has_no_gradient_in_training(leap):
         return (history.position**2).sum()
 
     gradients = quick(jax.value_and_grad(loss, argnums=(0, 1)))
-    wanted, expected = gradients(without, covariance)
+    expected_value, expected = gradients(without, covariance)
     value, gradient = gradients(leaping, covariance)
-    assert value == wanted
+    assert value == expected_value
     for one, other in zip(gradient, expected, strict=True):
         assert not np.any(one[np.array(rows)]) and np.any(one)
         others = np.setdiff1d(np.arange(ROWS), rows)

@@ -64,21 +64,21 @@ turned by its own rate or by that of the one before."""
 
 
 def by_hand(config, cut, gyro, accel):
-    (lead, corrected, own), context = cut, config.context_samples
+    (lead, corrected, own_rate), context = cut, config.context_samples
 
     def measure(k, clone_rotation, gyro_bias, accel_bias):
         if k < config.first_measured:
             return np.full(3, np.nan), np.eye(3)
         samples = slice((k - CLONES + 1) * N - context - lead, (k + 1) * N - lead)
         rates, forces = gyro[samples] - gyro_bias, accel[samples] - accel_bias
-        seen = (rates, forces) if corrected else (gyro[samples], accel[samples])
+        signals = (rates, forces) if corrected else (gyro[samples], accel[samples])
         turns = Rotation.from_rotvec(rates * DT).as_matrix()
         unyaw, R, rows = scekf_numpy.yaw_matrix(clone_rotation).T, clone_rotation, []
         for turn in turns[:context][::-1]:
             R = R @ turn.T
-        for j, (w, a) in enumerate(zip(*seen, strict=True)):
+        for j, (w, a) in enumerate(zip(*signals, strict=True)):
             if j and config.window_rotation != "single":
-                R = R @ turns[j if own else j - 1]
+                R = R @ turns[j if own_rate else j - 1]
             rows.append(np.concatenate([unyaw @ R @ a, unyaw @ R @ w]))
         return predict_numpy(np.array(rows))
 
@@ -99,23 +99,23 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
     assert program(config)._cache_size() == 2  # a state that a run leaves has a window …
     program(config)(later, gyro, accel, BASE, SLOPE)
     assert program(config)._cache_size() == 2  # … and all of these share a program
-    wanted = by_hand(config, CUTS[window_rotation], gyro, accel)
-    assert np.nansum(wanted["accepted"]) > 5
+    reference = by_hand(config, CUTS[window_rotation], gyro, accel)
+    assert np.nansum(reference["accepted"]) > 5
     for name in ("accepted", "gate_passed"):
-        np.testing.assert_array_equal(getattr(history, name), wanted[name])
+        np.testing.assert_array_equal(getattr(history, name), reference[name])
     for name in ("displacement", *Mean._fields, "innovation"):
         np.testing.assert_allclose(
-            getattr(history, name), wanted[name], atol=3e-6, err_msg=name
+            getattr(history, name), reference[name], atol=3e-6, err_msg=name
         )  # the network is float32
-    std = ROOT_SCALE * np.exp(np.maximum(-2.0 + 0.1 * wanted["displacement"], -4.0))
+    std = ROOT_SCALE * np.exp(np.maximum(-2.0 + 0.1 * reference["displacement"], -4.0))
     np.testing.assert_allclose(history.measurement_std, std, rtol=1e-5)
     gate, attention = (np.asarray(history.diagnostics[name]) for name in ("gate", "attention"))
-    np.testing.assert_allclose(gate, np.tanh(wanted["displacement"]), atol=3e-6)
+    np.testing.assert_allclose(gate, np.tanh(reference["displacement"]), atol=3e-6)
     assert np.isnan(attention[:first]).all() and (attention[first:] == 1).all()
     if window_rotation == "tlio":  # each of the three differences is large enough to be seen
         for cut in [(0, False, True), (1, True, True), (1, False, False)]:
             other = by_hand(config, cut, gyro, accel)["displacement"]
-            assert np.nanmax(np.abs(other - wanted["displacement"])) > 1e-4
+            assert np.nanmax(np.abs(other - reference["displacement"])) > 1e-4
 
 
 @pytest.mark.parametrize("cut", [3, 11, 16])
@@ -165,18 +165,18 @@ def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     gyro, accel = recording(1)
     final, history = program(CONFIG)(start(CONFIG), gyro, accel, BASE, SLOPE)
     fixed = None, CONFIG.displacement_frame
-    given = (
+    inputs = (
         filtering.Filter(CONFIG, NOISE),
         start(CONFIG),
         gyro,
         accel,
         *history.unscaled_displacements(NOISE),
     )
-    again_final, again = filtering.run_filter(*given, *fixed)
+    again_final, again = filtering.run_filter(*inputs, *fixed)
     assert again.diagnostics == {}
-    for wanted, found in [(history._replace(diagnostics={}), again), (final, again_final)]:
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), wanted, found)
-    smoothed = filtering.smooth(*given, *fixed)
+    for original, repetition in [(history._replace(diagnostics={}), again), (final, again_final)]:
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), original, repetition)
+    smoothed = filtering.smooth(*inputs, *fixed)
     np.testing.assert_allclose(smoothed.position[-1], final.position, atol=1e-10)
     variances = history.covariance_diagonal[-1]
     np.testing.assert_allclose(smoothed.covariance_diagonal[-1], variances, rtol=1e-6)
@@ -188,7 +188,7 @@ def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
 
 
 def test_under_a_vmap_the_network_is_asked_no_earlier_and_says_the_same():
-    signals, calls = [np.stack([each, each]) for each in recording(0)], []
+    signals, calls = [np.stack([signal, signal]) for signal in recording(0)], []
 
     def counting(windows):
         jax.debug.callback(lambda: calls.append(1))

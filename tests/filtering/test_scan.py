@@ -21,9 +21,9 @@ covariance = jax.jit(whole_covariance.covariance)
 MEAN = ("rotation", "velocity", "position", "gyro_bias", "accel_bias")
 
 
-def assert_close(found, wanted, absolute, relative=0.0):
+def assert_close(values, expected, absolute, relative=0.0):
     np.testing.assert_allclose(
-        np.asarray(found), np.asarray(wanted), atol=absolute, rtol=relative, equal_nan=True
+        np.asarray(values), np.asarray(expected), atol=absolute, rtol=relative, equal_nan=True
     )
 
 
@@ -36,16 +36,16 @@ def replay(name):
         filtering.Filter(config), run["rotation0"], run["velocity0"], run["position0"]
     )
     covariance = run["displacement_std"][:, :, None] ** 2 * np.eye(3)
-    given = run["gyro"], run["accel"], run["displacement"], covariance
+    signals = run["gyro"], run["accel"], run["displacement"], covariance
     if name.startswith("nominal_200hz"):  # filled up, it has the program of "outliers_200hz"
-        fill = zip(given, (7000, 7000, 700, 700), (0.0, 0.0, np.nan, np.nan), strict=True)
-        given = [filled_up(*each) for each in fill]
+        fill = zip(signals, (7000, 7000, 700, 700), (0.0, 0.0, np.nan, np.nan), strict=True)
+        signals = [filled_up(*arguments) for arguments in fill]
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16227766e-2, config.dt)
     final, history = jax.device_get(
-        filtering.run_filter(filtering.Filter(config, noise), state, *given)
+        filtering.run_filter(filtering.Filter(config, noise), state, *signals)
     )
     rows = len(covariance)
-    return run, rows == len(given[2]), final, jax.tree.map(lambda leaf: leaf[:rows], history)
+    return run, rows == len(signals[2]), final, jax.tree.map(lambda leaf: leaf[:rows], history)
 
 
 @pytest.mark.parametrize(
@@ -115,10 +115,10 @@ def ours(config, noise, walk=WALK, measurements=(), every=None):
     every, n = every or len(measured[0]), config.samples_per_clone
     for begin in range(0, len(measured[0]), every):
         rows, samples = slice(begin, begin + every), slice(begin * n, (begin + every) * n)
-        given = gyro[samples], accel[samples], *(each[rows] for each in measured)
+        signals = gyro[samples], accel[samples], *(column[rows] for column in measured)
         others = jax.tree.map(lambda leaf, rows=rows: leaf[rows], measurements)
         state, history = filtering.run_filter(
-            filtering.Filter(config, noise), state, *given, measurements=others
+            filtering.Filter(config, noise), state, *signals, measurements=others
         )
         histories.append(history)
     return state, jax.tree.map(lambda *parts: np.concatenate(parts), *histories)
@@ -134,22 +134,22 @@ def plain():
     return ours(GATED(DT, N, CLONES), noise_of(GATED(DT, N, CLONES)))
 
 
-def assert_same(history, wanted):
+def assert_same(history, expected):
     for field in DECISIONS:
-        np.testing.assert_array_equal(getattr(history, field), wanted[field], err_msg=field)
+        np.testing.assert_array_equal(getattr(history, field), expected[field], err_msg=field)
     for field in (*MEAN, "innovation", "displacement"):
-        assert_close(getattr(history, field), wanted[field], 1e-9)
-    assert_close(history.nis, wanted["nis"], 0, 1e-6)
-    measured = np.isfinite(wanted["nis"])
-    spread = wanted["innovation_covariance"][measured]
-    likelihood = np.where(measured, -0.5 * wanted["nis"], np.nan)
+        assert_close(getattr(history, field), expected[field], 1e-9)
+    assert_close(history.nis, expected["nis"], 0, 1e-6)
+    measured = np.isfinite(expected["nis"])
+    spread = expected["innovation_covariance"][measured]
+    likelihood = np.where(measured, -0.5 * expected["nis"], np.nan)
     likelihood[measured] -= 0.5 * np.linalg.slogdet(2 * np.pi * spread)[1]
     assert_close(history.log_likelihood, likelihood, 0, 1e-6)
-    assert_close(history.covariance_diagonal, wanted["covariance_diagonal"], 0, 1e-7)
-    sigma = np.sqrt(wanted["covariance_diagonal"])
+    assert_close(history.covariance_diagonal, expected["covariance_diagonal"], 0, 1e-7)
+    sigma = np.sqrt(expected["covariance_diagonal"])
     scale = sigma[:, :, None] * sigma[:, None, :]
     if history.covariance is not None:
-        assert_close(history.covariance / scale, wanted["covariance"] / scale, 1e-7)
+        assert_close(history.covariance / scale, expected["covariance"] / scale, 1e-7)
 
 
 def drawn_fixes(axes):
@@ -167,13 +167,13 @@ def drawn_fixes(axes):
     return fixes
 
 
-def laid(fixes):
+def interval_fixes(fixes):
     """As the filter takes them, on a clock that begins at 100 s."""
     time = [100.0 + (k + 1) * N * DT - before for k, (_, _, before, _) in fixes.items()]
-    position, covariance, _, late = (np.stack(x) for x in zip(*fixes.values(), strict=True))
+    position, covariance, _, time_std = (np.stack(x) for x in zip(*fixes.values(), strict=True))
     config = GATED(DT, N, CLONES)
     return filtering.fixes_on_intervals(
-        time, position, covariance, INTERVALS, config, 100.0, late[0]
+        time, position, covariance, INTERVALS, config, 100.0, time_std[0]
     )
 
 
@@ -188,27 +188,27 @@ def test_random_walk(fail_scale, correlation, axes, every):
     of 10 with a whole round."""
     config = GATED(DT, N, CLONES, mahalanobis_fail_scale=fail_scale)
     noise, fixes = noise_of(config, correlation), drawn_fixes(axes) if axes else {}
-    measurements = (laid(fixes),) if axes else ()
+    measurements = (interval_fixes(fixes),) if axes else ()
     final, history = ours(config, noise, measurements=measurements, every=every)
-    wanted = oracle(config, noise, fixes=fixes)
-    assert np.isnan(wanted["accepted"]).sum() == 4 + len(MISSING)
-    rejected = wanted["gate_passed"] == 0
+    expected = oracle(config, noise, fixes=fixes)
+    assert np.isnan(expected["accepted"]).sum() == 4 + len(MISSING)
+    rejected = expected["gate_passed"] == 0
     # the gate worked, and a pause let outliers pass
-    assert rejected.sum() >= 5 and (wanted["gate_passed"][list(OUTLIERS)] == 1).any()
-    assert (wanted["accepted"][rejected] == float(fail_scale > 0)).all()
-    assert_same(history, wanted)
+    assert rejected.sum() >= 5 and (expected["gate_passed"][list(OUTLIERS)] == 1).any()
+    assert (expected["accepted"][rejected] == float(fail_scale > 0)).all()
+    assert_same(history, expected)
     if correlation is not None:
-        assert np.abs(wanted["correlated"][-1]).min() > 1e-3
-        assert_close(final.correlated, wanted["correlated"][-1], 1e-9)
+        assert np.abs(expected["correlated"][-1]).min() > 1e-3
+        assert_close(final.correlated, expected["correlated"][-1], 1e-9)
         spread = final.core_covariance[CORRELATED, CORRELATED]
-        assert_close(spread, wanted["correlated_covariance"][-1], 1e-12, 1e-7)
+        assert_close(spread, expected["correlated_covariance"][-1], 1e-12, 1e-7)
     if axes:
         outcome = history.outcomes["fix"]
-        there = np.isfinite(wanted["fix_nis"])
-        np.testing.assert_array_equal(outcome.present, there)
-        refused = np.flatnonzero(there & ~np.asarray(outcome.accepted))
+        presence = np.isfinite(expected["fix_nis"])
+        np.testing.assert_array_equal(outcome.present, presence)
+        refused = np.flatnonzero(presence & ~np.asarray(outcome.accepted))
         assert FAR in refused and len(refused) < len(fixes) / 2
-        assert_close(outcome.nis[there], wanted["fix_nis"][there], 0, 1e-6)
+        assert_close(outcome.nis[presence], expected["fix_nis"][presence], 0, 1e-6)
 
 
 def test_what_was_measured_can_be_given_again():
@@ -218,23 +218,23 @@ def test_what_was_measured_can_be_given_again():
     displacement, covariance = WALK[-2:]
     measured = np.isfinite(history.nis)
     assert np.abs(covariance[measured][:, 0, 1]).min() > 0 and measured.sum() > INTERVALS / 2
-    for found, wanted in zip(
+    for values, expected in zip(
         history.unscaled_displacements(noise), (displacement, covariance), strict=True
     ):
-        assert_close(found[measured], wanted[measured], 0, 1e-12)
+        assert_close(values[measured], expected[measured], 0, 1e-12)
 
 
 def test_without_size_and_without_fixes_nothing_changes():
     """Also where the only fix is refused. The variance of a correlated error is 1 at all times."""
-    config, (_, wanted) = GATED(DT, N, CLONES), plain()
-    none = laid(drawn_fixes(3))
+    config, (_, reference) = GATED(DT, N, CLONES), plain()
+    none = interval_fixes(drawn_fixes(3))
     none.position[:] = np.nan
     none.position[FAR] = 1e6
     nothing = noise_of(config, ERRORS._replace(share=0.0))
-    final, found = ours(config, nothing, measurements=(none,), every=8)
-    for name in found._fields:
+    final, history = ours(config, nothing, measurements=(none,), every=8)
+    for name in history._fields:
         if name not in ("outcomes", "diagnostics"):
-            assert_close(getattr(found, name), getattr(wanted, name), 1e-12, 1e-9)
+            assert_close(getattr(history, name), getattr(reference, name), 1e-12, 1e-9)
     assert_close(final.core_covariance[CORRELATED, CORRELATED], np.eye(3), 1e-12)
     # Another noise, as arrays, and a state that a run left compile nothing.
     compiled = scan._run_filter._cache_size()

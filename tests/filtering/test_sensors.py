@@ -159,8 +159,8 @@ def test_pressures_become_heights_above_the_first():
 
 
 def test_pressures_of_once_a_second_are_interpolated():
-    for apart in (1.0, 2.9):
-        time = np.arange(0.0, 28.0, apart)
+    for spacing in (1.0, 2.9):
+        time = np.arange(0.0, 28.0, spacing)
         pressure = np.full(len(time), 101325.0)
         height = filtering.barometer_on_intervals(time, pressure, INTERVALS, CONFIG).height
         assert np.isfinite(height).all()

@@ -103,15 +103,15 @@ def most_probable(start, gyro, accel, measurements, stops, fixes=()):
     for _ in range(4):
         information, gradient = np.zeros((15 * len(x), 15 * len(x))), np.zeros(15 * len(x))
         for index, residual, spread in factors:
-            here = [x[i] for i in index]
+            states = [x[i] for i in index]
             slope = differences(
-                lambda e, r=residual, h=here: r(*map(plus, h, np.split(e, len(h), axis=-1))),
+                lambda e, r=residual, h=states: r(*map(plus, h, np.split(e, len(h), axis=-1))),
                 15 * len(index),
             )
             at = np.concatenate([np.arange(15 * i, 15 * i + 15) for i in index])
             weighted = np.linalg.solve(spread, slope).T
             information[np.ix_(at, at)] += weighted @ slope
-            gradient[at] += weighted @ residual(*here)
+            gradient[at] += weighted @ residual(*states)
         scale = np.sqrt(np.diag(information))
         covariance = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
         step = -covariance @ gradient
@@ -161,23 +161,27 @@ def drawn_fixes(truth):
     return fixes
 
 
-def laid(fixes):
+def fix_measurements(fixes):
     rows, position, covariance, before = (np.stack(column) for column in zip(*fixes, strict=True))
     time = (rows + 1) * GATED.clone_seconds - before
     return (filtering.fixes_on_intervals(time, position, covariance, INTERVALS, GATED),)
 
 
-def assert_most_probable(filtered, smoothed, wanted, spread):
-    """The smoothed states are the wanted ones, and those of the filter are not, but for the last
+def assert_most_probable(filtered, smoothed, expected, spread):
+    """The smoothed states are the expected ones, and those of the filter are not, but for the last
     row: what agreed was no trifle."""
     sigma = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
-    found = np.stack([minus(x, y) for x, y in zip(rows_of(smoothed), wanted, strict=True)]) / sigma
-    assert np.abs(found).max() < 1e-3
+    error = (
+        np.stack([minus(x, y) for x, y in zip(rows_of(smoothed), expected, strict=True)]) / sigma
+    )
+    assert np.abs(error).max() < 1e-3
     np.testing.assert_allclose(smoothed.covariance_diagonal, sigma**2, rtol=1e-3)
     if smoothed.covariance is not None:
         scale = sigma[:, :, None] * sigma[:, None, :]
         np.testing.assert_allclose(smoothed.covariance / scale, spread / scale, atol=1e-3)
-    before = np.stack([minus(x, y) for x, y in zip(rows_of(filtered), wanted, strict=True)]) / sigma
+    before = (
+        np.stack([minus(x, y) for x, y in zip(rows_of(filtered), expected, strict=True)]) / sigma
+    )
     assert (np.abs(before[:-CLONES]).max(0) > 0.1).all()
     assert (np.abs(before[:-CLONES]).max(0)[3:9] > 0.3).all()
     assert (np.asarray(filtered.covariance_diagonal)[CLONES] > 1.5 * sigma[CLONES] ** 2)[3:6].all()
@@ -199,7 +203,7 @@ def test_equals_least_squares_over_all_states():
         filtering.initial_state(filtering.Filter(GATED, start=STD), *start),
         drawn_fixes(truth),
     )
-    ekf, others = filtering.Filter(GATED, NOISE), laid(fixes)
+    ekf, others = filtering.Filter(GATED, NOISE), fix_measurements(fixes)
     arguments = ekf, state, gyro, accel, displacement, covariance
     _, filtered = filtering.run_filter(*arguments, measurements=others)
     smoothed = filtering.smooth(*arguments, measurements=others)
@@ -213,38 +217,40 @@ def test_equals_least_squares_over_all_states():
     applied = np.flatnonzero(outcome.accepted)
     assert [k for k, *_ in fixes if k not in applied] == [FAR]
     measurements = {k: (displacement[k], 2.0 * factor[k] * covariance[k]) for k in present}
-    fixes = [each for each in fixes if each[0] in applied]
-    wanted = most_probable(start, gyro, accel, measurements, {}, fixes)
-    assert_most_probable(filtered, smoothed, *wanted)
+    fixes = [fix for fix in fixes if fix[0] in applied]
+    optimum = most_probable(start, gyro, accel, measurements, {}, fixes)
+    assert_most_probable(filtered, smoothed, *optimum)
 
 
 def test_goes_on_from_a_state_with_clones():
     """What is known of the second half of a run does not depend on where the filter was stopped
     before it, nor on what comes after it without a measurement."""
     _, start, *signals = walk(5)
-    measurements = laid([(0, np.full(2, np.nan), np.eye(2), 0.0)])  # the programs of the test above
+    measurements = fix_measurements(
+        [(0, np.full(2, np.nan), np.eye(2), 0.0)]
+    )  # the programs of the test above
     half = INTERVALS // 2
     state = filtering.initial_state(filtering.Filter(GATED, start=STD), *start)
-    wanted = filtering.smooth(
+    reference = filtering.smooth(
         filtering.Filter(GATED, NOISE), state, *signals, measurements=measurements
     )
     counts = N * half, N * half, half, half
     early = [x[:count] for x, count in zip(signals, counts, strict=True)]
     state, _ = filtering.run_filter(filtering.Filter(GATED, NOISE), state, *early)
     # Filled up to the length of the first run.
-    late = [np.roll(x, -count, axis=0) for x, count in zip(signals, counts, strict=True)]
-    late[2][half:] = np.nan
-    found = filtering.smooth(
-        filtering.Filter(GATED, NOISE), state, *late, measurements=measurements
+    second_half = [np.roll(x, -count, axis=0) for x, count in zip(signals, counts, strict=True)]
+    second_half[2][half:] = np.nan
+    continuation = filtering.smooth(
+        filtering.Filter(GATED, NOISE), state, *second_half, measurements=measurements
     )
-    sigma = np.sqrt(np.asarray(wanted.covariance_diagonal)[half:])
-    for name in wanted._fields[:5]:
+    sigma = np.sqrt(np.asarray(reference.covariance_diagonal)[half:])
+    for name in reference._fields[:5]:
         np.testing.assert_allclose(
-            getattr(found, name)[:half], getattr(wanted, name)[half:], atol=1e-7 * SMALL
+            getattr(continuation, name)[:half], getattr(reference, name)[half:], atol=1e-7 * SMALL
         )
     scale = sigma[:, :, None] * sigma[:, None, :]
     np.testing.assert_allclose(
-        found.covariance[:half] / scale, wanted.covariance[half:] / scale, atol=1e-8
+        continuation.covariance[:half] / scale, reference.covariance[half:] / scale, atol=1e-8
     )
 
 
@@ -258,26 +264,26 @@ def test_a_gate_with_a_slope_and_rest_and_the_gradient_through_them():
     @functools.partial(jax.value_and_grad, has_aux=True)
     def loss(x):
         noise = NOISE._replace(accel_density=NOISE.accel_density * (1 + x[1]))
-        rest = filtering.ZeroVelocity(5 * SMALL)
-        ekf = filtering.Filter(WEIGHTED, noise, STD, measurements=(rest,))
+        zero_velocity = filtering.ZeroVelocity(5 * SMALL)
+        ekf = filtering.Filter(WEIGHTED, noise, STD, measurements=(zero_velocity,))
         state = filtering.initial_state(ekf, *start)
         moved = jnp.asarray(displacement).at[8, 0].add(x[0] * SMALL)
         arguments = ekf, state, gyro, accel, moved, covariance
         _, filtered = filtering.run_filter(*arguments)
         smoothed = filtering.smooth(*arguments)
-        found = (smoothed.position[5, 0] - start[2][0]) / SMALL
-        return found + smoothed.covariance_diagonal[6, 4] / SMALL**2, (filtered, smoothed)
+        position = (smoothed.position[5, 0] - start[2][0]) / SMALL
+        return position + smoothed.covariance_diagonal[6, 4] / SMALL**2, (filtered, smoothed)
 
-    (_, both), _ = loss(np.zeros(2))
-    filtered, smoothed = jax.device_get(both)
+    (_, histories), _ = loss(np.zeros(2))
+    filtered, smoothed = jax.device_get(histories)
     weight = filtered.gate_passed
     present = np.flatnonzero(np.isfinite(weight))
     stops = np.flatnonzero(filtered.outcomes["zero_velocity"].accepted)
     assert len(stops) >= 2 and weight[present].min() < 0.9 and smoothed.covariance is None
     measurements = {k: (displacement[k], 2.0 / weight[k] * covariance[k]) for k in present}
     stops = {k: 5 * SMALL for k in stops}
-    wanted = most_probable(start, gyro, accel, measurements, stops)
-    assert_most_probable(filtered, smoothed, *wanted)
+    optimum = most_probable(start, gyro, accel, measurements, stops)
+    assert_most_probable(filtered, smoothed, *optimum)
 
     x = np.array([0.1, 0.2])
     (value, _), gradient = loss(x)

@@ -22,8 +22,8 @@ def test_the_bias_of_a_raw_gyro_is_uncertain_where_it_is_level():
         filtering.Filter(CONFIG), rotation, np.zeros(3), np.zeros(3), level_gyro_bias=0.05
     )
     covariance = state.core_covariance[9:12, 9:12]
-    found = np.sqrt(np.linalg.eigvalsh(covariance))
-    np.testing.assert_allclose(found, [1e-4, 0.05, 0.05], rtol=1e-6)
+    std = np.sqrt(np.linalg.eigvalsh(covariance))
+    np.testing.assert_allclose(std, [1e-4, 0.05, 0.05], rtol=1e-6)
     up = rotation[2] / np.linalg.norm(rotation[2])
     np.testing.assert_allclose(covariance @ up, 1e-8 * up, atol=1e-15)
 
@@ -95,9 +95,9 @@ def test_a_second_of_which_most_is_missing_is_no_rest():
     for present, seconds in ((24, 1.0), (25, 2.0)):
         broken = gyro.copy()
         broken[50 + present :] = np.nan
-        rest = rest_at_start(broken, accel, DT)
-        assert rest.seconds == seconds
-        np.testing.assert_allclose(rest.gyro_bias, gyro[0], rtol=1e-12)
+        standstill = rest_at_start(broken, accel, DT)
+        assert standstill.seconds == seconds
+        np.testing.assert_allclose(standstill.gyro_bias, gyro[0], rtol=1e-12)
 
 
 def test_level_state_says_how_far_the_velocity_can_be_from_zero():
@@ -111,8 +111,8 @@ def test_level_state_says_how_far_the_velocity_can_be_from_zero():
         return jnp.sqrt(state.core_covariance[3, 3])
 
     spread = np.sin(np.arange(50)).std()
-    for amplitude, wanted in ((0.0, 0.05), (0.4, 1.5 * 0.4 * spread), (5.0, 1.0)):
-        np.testing.assert_allclose(velocity_std(amplitude), wanted, rtol=1e-9)
+    for amplitude, expected_std in ((0.0, 0.05), (0.4, 1.5 * 0.4 * spread), (5.0, 1.0)):
+        np.testing.assert_allclose(velocity_std(amplitude), expected_std, rtol=1e-9)
         slope = 0 if amplitude != 0.4 else 1.5 * spread
         np.testing.assert_allclose(jax.grad(velocity_std)(amplitude), slope, rtol=1e-6)
 
@@ -122,19 +122,21 @@ def test_level_state_takes_the_bias_of_a_second_on_a_table(samples, gyro_std, ac
     rng, bias = np.random.default_rng(3), np.array([0.02, -0.01, 0.03])
     noise = rng.standard_normal((2, 50, 3))
     gyro, accel = bias + 0.002 * noise[0], [0, 0, 9.81] + 0.02 * noise[1]
-    found = filtering.level_state(filtering.Filter(CONFIG), gyro, accel).gyro_bias
-    np.testing.assert_allclose(found, gyro.mean(0), rtol=1e-12)
-    np.testing.assert_allclose(found, rest_at_start(gyro, accel, CONFIG.dt).gyro_bias, rtol=1e-12)
+    gyro_bias = filtering.level_state(filtering.Filter(CONFIG), gyro, accel).gyro_bias
+    np.testing.assert_allclose(gyro_bias, gyro.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(
+        gyro_bias, rest_at_start(gyro, accel, CONFIG.dt).gyro_bias, rtol=1e-12
+    )
     # What does not turn is not turned.
     still, biased = (
         filtering.level_state(filtering.Filter(CONFIG), x * gyro, accel).rotation for x in (0, 1)
     )
     np.testing.assert_array_equal(biased, still)
     shaken = gyro + gyro_std * noise[0], accel + accel_std * noise[1]
-    found = filtering.level_state(
-        filtering.Filter(CONFIG), *(each[:samples] for each in shaken)
+    gyro_bias = filtering.level_state(
+        filtering.Filter(CONFIG), *(signal[:samples] for signal in shaken)
     ).gyro_bias
-    np.testing.assert_array_equal(found, 0)
+    np.testing.assert_array_equal(gyro_bias, 0)
 
 
 def test_level_state_refuses_accelerations_without_gravity():

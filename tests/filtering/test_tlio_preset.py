@@ -20,7 +20,7 @@ def test_the_whole_tracker_as_recorded():
     @jax.jit
     def filtered(weights):
         start = (recorded[name] for name in ("rotation0", "velocity0", "position0"))
-        given = (
+        inputs = (
             filtering.initial_state(filtering.Filter(config), *start),
             recorded["gyro"],
             recorded["accel"],
@@ -29,7 +29,7 @@ def test_the_whole_tracker_as_recorded():
         def predict(windows):
             return models.Inference(model)(weights, windows)
 
-        return filtering.run_odometry(predict, filtering.Filter(config, noise), *given)[1]
+        return filtering.run_odometry(predict, filtering.Filter(config, noise), *inputs)[1]
 
     variables = interop.load_tlio_state_dict(tlio_weights.weights())
     history = filtered(models.inference_variables(model, variables))

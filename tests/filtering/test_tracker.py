@@ -90,8 +90,8 @@ def start(config=CONFIG):
     velocity, position, gyro_bias = np.array(
         [[0.5, 0.0, 0.0], [3.0, -2.0, 1.0], [0.02, -0.01, 0.03]]
     )
-    given = rotation, velocity, position, gyro_bias, 0.1
-    return with_correlated_error(filtering.initial_state(filtering.Filter(config), *given))
+    arguments = rotation, velocity, position, gyro_bias, 0.1
+    return with_correlated_error(filtering.initial_state(filtering.Filter(config), *arguments))
 
 
 @functools.cache
@@ -104,7 +104,7 @@ def compiled(config=CONFIG):
 @functools.cache
 def program(config):
     config = dataclasses.replace(config, history="core")
-    return jax.jit(lambda *given: filtering.run_odometry(predict, filter_of(config), *given))
+    return jax.jit(lambda *inputs: filtering.run_odometry(predict, filter_of(config), *inputs))
 
 
 def scan(state, gyro, accel, valid, config=CONFIG):
@@ -142,25 +142,25 @@ def test_equals_run_odometry_with_every_measurement(config, missing):
     gyro, accel = recording()
     valid = ~np.isin(np.arange(len(gyro)), missing)
     state = start(config)
-    final, wanted = scan(state, gyro, accel, valid, config)
+    final, history = scan(state, gyro, accel, valid, config)
     tracker = compiled(config)
     tracker._start(state)
     tracker.set_rate(1 / DT)  # a new stream
     time = 1.7e9 + np.arange(len(gyro)) * DT  # as a phone stamps them
     broken = np.where(valid[:, None], gyro, np.nan)
     pushed = [tracker.push(*row) for row in zip(time, broken, accel, strict=True)]
-    found = [pose for pose in pushed if pose is not None]
-    assert len(found) == INTERVALS
+    poses = [pose for pose in pushed if pose is not None]
+    assert len(poses) == INTERVALS
     ends = time[0] + np.arange(1, INTERVALS + 1) * N * DT
-    np.testing.assert_allclose([p.time for p in found], ends, atol=1e-6)
+    np.testing.assert_allclose([p.time for p in poses], ends, atol=1e-6)
     for name in (*Mean._fields, "covariance", "accepted", "nis"):
-        rows = np.array([getattr(pose, name) for pose in found])
-        np.testing.assert_allclose(rows, getattr(wanted, name), rtol=1e-9, atol=1e-9, err_msg=name)
-    assert all(pose.healthy for pose in found)
-    assert (wanted.gate_passed == 0).any() and (wanted.gate_passed == 1).sum() > 20
-    assert all(outcome.accepted.any() for outcome in wanted.outcomes.values())
-    assert config is AS_TLIO or wanted.outcomes.keys() > set(measurements.names())
-    assert np.isnan(np.asarray(wanted.nis)[config.first_measured :]).any()
+        rows = np.array([getattr(pose, name) for pose in poses])
+        np.testing.assert_allclose(rows, getattr(history, name), rtol=1e-9, atol=1e-9, err_msg=name)
+    assert all(pose.healthy for pose in poses)
+    assert (history.gate_passed == 0).any() and (history.gate_passed == 1).sum() > 20
+    assert all(outcome.accepted.any() for outcome in history.outcomes.values())
+    assert config is AS_TLIO or history.outcomes.keys() > set(measurements.names())
+    assert np.isnan(np.asarray(history.nis)[config.first_measured :]).any()
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9),
         tracker.filter_state(),
@@ -205,8 +205,8 @@ def test_unhealthy_once_is_unhealthy_for_good(tracker):
     bad = int(np.argmax(speed > CONFIG.speed_limit))
     assert 0 < bad < 30 and np.isfinite(speed).all()
     np.testing.assert_array_equal(history.healthy, np.arange(len(speed)) < bad)
-    found = feed(tracker, gyro, accel, np.arange(len(gyro)) * DT)
-    np.testing.assert_array_equal([p.healthy for p in found], np.asarray(history.healthy) > 0)
+    poses = feed(tracker, gyro, accel, np.arange(len(gyro)) * DT)
+    np.testing.assert_array_equal([p.healthy for p in poses], np.asarray(history.healthy) > 0)
     assert not final.healthy and not tracker.filter_state().healthy
     tracker._start(tracker.filter_state())
     assert tracker.pose().healthy is False
@@ -216,13 +216,13 @@ def test_a_stop_of_the_stream_is_caught_up_in_one_push(tracker):
     gyro, accel = recording()
     time = np.arange(len(gyro)) * DT
     keep = ~np.isin(np.arange(len(gyro)), np.arange(90, 121))
-    found = feed(tracker, gyro[keep], accel[keep], time[keep])
-    _, wanted = scan(start(), gyro, accel, keep)
-    steps = [round(p.time / (N * DT)) - 1 for p in found]
+    poses = feed(tracker, gyro[keep], accel[keep], time[keep])
+    _, history = scan(start(), gyro, accel, keep)
+    steps = [round(p.time / (N * DT)) - 1 for p in poses]
     # of those that one push made it returns the last
     assert set(range(INTERVALS)) - set(steps) == set(range(22, 29))
-    expected = wanted.position[np.array(steps)]
-    np.testing.assert_allclose([p.position for p in found], expected, atol=1e-9)
+    expected = history.position[np.array(steps)]
+    np.testing.assert_allclose([p.position for p in poses], expected, atol=1e-9)
 
 
 def test_between_clones_it_integrates_the_imu(tracker):
@@ -233,49 +233,57 @@ def test_between_clones_it_integrates_the_imu(tracker):
         assert tracker.push(m * DT, gyro[m], accel[m]) is None
         pose = tracker.pose()
         samples, none = slice(1, m + 1), (np.full((1, 3), np.nan), np.zeros((1, 3, 3)))
-        wanted = scekf_numpy.run_from(
+        reference = scekf_numpy.run_from(
             state, NOISE, CONFIG, gyro[samples], accel[samples], *none, n=m, clones=9
         )
         assert pose.time == pytest.approx((m + 1) * DT)
         for name in ("rotation", "velocity", "position", "covariance"):
             np.testing.assert_allclose(
-                getattr(pose, name), wanted[name][0], atol=1e-12, rtol=1e-9, err_msg=name
+                getattr(pose, name), reference[name][0], atol=1e-12, rtol=1e-9, err_msg=name
             )
     # and from clones in the middle of the run on, with updates behind them, whether it is asked at
     # every sample or only now and then
-    made = tracker.push(N * DT, gyro[N], accel[N])
+    clone_pose = tracker.push(N * DT, gyro[N], accel[N])
     for k in range(N + 1, 120):
-        mean = [made.rotation, made.velocity, made.position] if (k - 1) % N == 0 else mean
-        mean = scekf_numpy.step_mean(*mean, made.gyro_bias, made.accel_bias, gyro[k], accel[k], DT)
+        mean = (
+            [clone_pose.rotation, clone_pose.velocity, clone_pose.position]
+            if (k - 1) % N == 0
+            else mean
+        )
+        mean = scekf_numpy.step_mean(
+            *mean, clone_pose.gyro_bias, clone_pose.accel_bias, gyro[k], accel[k], DT
+        )
         after = tracker.push(k * DT, gyro[k], accel[k])
         assert (after is not None) == (k % N == 0)
         if after is not None:
-            made = after
-            jax.tree.map(np.testing.assert_array_equal, tracker.pose(), made)
+            clone_pose = after
+            jax.tree.map(np.testing.assert_array_equal, tracker.pose(), clone_pose)
         elif k % 3:
             pose = tracker.pose()
             for name, value in zip(("rotation", "velocity", "position"), mean, strict=True):
                 np.testing.assert_allclose(getattr(pose, name), value, atol=1e-11, err_msg=name)
             assert pose.time == pytest.approx(k * DT + DT)
-            np.testing.assert_array_equal([pose.accepted, pose.nis], [made.accepted, made.nis])
-    assert made.accepted == 1
+            np.testing.assert_array_equal(
+                [pose.accepted, pose.nis], [clone_pose.accepted, clone_pose.nis]
+            )
+    assert clone_pose.accepted == 1
 
 
 def test_between_clones_it_coasts_through_a_gap(tracker):
     gyro, accel = recording()
     for k in range(N):
-        made = tracker.push(k * DT, gyro[k], accel[k])
-    bias = np.asarray(made.gyro_bias), np.asarray(made.accel_bias)
+        clone_pose = tracker.push(k * DT, gyro[k], accel[k])
+    bias = np.asarray(clone_pose.gyro_bias), np.asarray(clone_pose.accel_bias)
     # grid samples 4, 5, 6 are missing; two are bridged, the third is not
     tracker.push((N + 2) * DT, gyro[5], np.full(3, np.nan))
     pose = tracker.pose()
-    mean = [made.rotation, made.velocity, made.position]
+    mean = [clone_pose.rotation, clone_pose.velocity, clone_pose.position]
     for _ in range(2):
         mean = scekf_numpy.step_mean(*mean, *bias, gyro[N - 1], accel[N - 1], DT)
     mean = [*mean[:2], mean[2] + mean[1] * DT]
     for name, value in zip(("rotation", "velocity", "position"), mean, strict=True):
         np.testing.assert_allclose(getattr(pose, name), value, atol=1e-12, err_msg=name)
-    assert (np.diag(pose.covariance)[:9] > np.diag(made.covariance)[:9] * 1.0001).all()
+    assert (np.diag(pose.covariance)[:9] > np.diag(clone_pose.covariance)[:9] * 1.0001).all()
     assert pose.time == pytest.approx((N + 3) * DT)
 
 
@@ -283,8 +291,8 @@ def test_mistakes_change_nothing(tracker):
     """Neither now nor for the samples that come after them."""
     time, (gyro, accel), zeros = 0.9 + np.arange(20) * DT, recording(), np.zeros(3)
     other = Tracker(predict, filter_of(), start())
-    for each in (tracker, other):
-        feed(each, gyro[:6], accel[:6], time[:6])
+    for instance in (tracker, other):
+        feed(instance, gyro[:6], accel[:6], time[:6])
     for arguments, words in (
         ((1.0, zeros, zeros), r"^time: must increase, found 1\.0 after 1\.0"),
         ((float("nan"), zeros, zeros), r"^time: must be a finite number"),
@@ -297,7 +305,7 @@ def test_mistakes_change_nothing(tracker):
         with pytest.raises(ValueError, match=words):
             tracker.push(*arguments)
     jax.tree.map(np.testing.assert_array_equal, tracker.pose(), other.pose())
-    after = [feed(each, gyro[6:20], accel[6:20], time[6:]) for each in (tracker, other)]
+    after = [feed(instance, gyro[6:20], accel[6:20], time[6:]) for instance in (tracker, other)]
     assert len(after[0]) == 4
     jax.tree.map(np.testing.assert_array_equal, *after)
 
@@ -308,25 +316,25 @@ def test_a_stamp_that_leaps_is_believed_once_a_second_one_agrees(tracker):
     gyro, accel = recording()
     wrong, keep, leap, time = 100, 120, 59.0, np.arange(len(gyro)) * DT
     alone = np.where(np.arange(len(gyro)) == wrong, time + leap, time)
-    found = feed(tracker, gyro, accel, alone)
-    _, wanted = scan(start(), gyro, accel, np.arange(len(gyro)) != wrong)
-    assert len(found) == INTERVALS
-    np.testing.assert_allclose([p.position for p in found], wanted.position, atol=1e-9)
+    poses = feed(tracker, gyro, accel, alone)
+    _, history = scan(start(), gyro, accel, np.arange(len(gyro)) != wrong)
+    assert len(poses) == INTERVALS
+    np.testing.assert_allclose([p.position for p in poses], history.position, atol=1e-9)
 
     stopped = Tracker(predict, filter_of(), start())
     feed(stopped, gyro[:keep], accel[:keep], time[:keep])
-    for apart in (20.0, 40.0, 5.0, 30.0):
-        assert stopped.push(apart, gyro[keep], accel[keep]) is None
+    for stamp in (20.0, 40.0, 5.0, 30.0):
+        assert stopped.push(stamp, gyro[keep], accel[keep]) is None
     assert stopped.push(time[keep] + leap, gyro[keep], accel[keep]) is None
     assert stopped.pose().time == pytest.approx(keep * DT)
-    made = stopped.push(time[keep + 1] + leap, gyro[keep + 1], accel[keep + 1])
+    pose = stopped.push(time[keep + 1] + leap, gyro[keep + 1], accel[keep + 1])
     samples = keep + round(leap / DT) + 2
-    assert made.time == pytest.approx(samples // N * N * DT)
+    assert pose.time == pytest.approx(samples // N * N * DT)
     assert stopped.pose().time == pytest.approx(samples * DT)
 
 
 def test_mistakes_at_the_start():
-    given = {"predict": predict, "ekf": filter_of(), "state": start()}
+    arguments = {"predict": predict, "ekf": filter_of(), "state": start()}
     spoilt = filtering.Filter(CONFIG, NOISE._replace(gyro_density=-1.0))
     longer = filtering.Filter(dataclasses.replace(CONFIG, clones_per_window=5), NOISE)
     for change, words in (
@@ -343,7 +351,7 @@ def test_mistakes_at_the_start():
         ),
     ):
         with pytest.raises(ValueError, match=f"^{words}"):
-            Tracker(**given | change)
+            Tracker(**arguments | change)
 
 
 def resting():
@@ -360,25 +368,27 @@ def test_from_rest(built, lost):
     # 45 samples: no whole number of intervals
     tracker = Tracker(predict, filter_of(), rest_seconds=0.9)
     assert tracker.pose() is None and tracker.filter_state() is None
-    first, given = 10, (gyro[:40].copy(), accel[:40].copy())
+    first, signals = 10, (gyro[:40].copy(), accel[:40].copy())
     if lost == "missing":
-        given[0][first - 3 : first] = np.nan  # 60 ms, and the filter bridges 50
+        signals[0][first - 3 : first] = np.nan  # 60 ms, and the filter bridges 50
     else:
-        given[1][:first] = 0.0
-    assert feed(tracker, *given, time[:40]) == [] and tracker.pose() is None
-    rest = slice(first, first + 45)
+        signals[1][:first] = 0.0
+    assert feed(tracker, *signals, time[:40]) == [] and tracker.pose() is None
+    resting_samples = slice(first, first + 45)
     state = with_correlated_error(
-        filtering.level_state(filtering.Filter(CONFIG), gyro[rest], accel[rest])
+        filtering.level_state(
+            filtering.Filter(CONFIG), gyro[resting_samples], accel[resting_samples]
+        )
     )
     intervals = (len(gyro) - first) // N
     used = slice(first, first + intervals * N)
-    _, wanted = scan(state, gyro[used], accel[used], np.ones(intervals * N, bool))
-    found = feed(tracker, gyro[40:], accel[40:], time[40:])
-    assert len(found) == intervals - 45 // N + 1  # the first stands for all intervals of the rest
-    np.testing.assert_allclose(found[0].time, time[first] + 45 // N * N * DT)
-    later = slice(45 // N - 1, len(wanted.position))
-    np.testing.assert_allclose([p.position for p in found], wanted.position[later], atol=1e-9)
-    np.testing.assert_allclose([p.nis for p in found], wanted.nis[later], rtol=1e-7)
+    _, history = scan(state, gyro[used], accel[used], np.ones(intervals * N, bool))
+    poses = feed(tracker, gyro[40:], accel[40:], time[40:])
+    assert len(poses) == intervals - 45 // N + 1  # the first stands for all intervals of the rest
+    np.testing.assert_allclose(poses[0].time, time[first] + 45 // N * N * DT)
+    later = slice(45 // N - 1, len(history.position))
+    np.testing.assert_allclose([p.position for p in poses], history.position[later], atol=1e-9)
+    np.testing.assert_allclose([p.nis for p in poses], history.nis[later], rtol=1e-7)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3])
@@ -392,19 +402,19 @@ def test_a_rest_with_holes_is_a_rest(built, share):
     for row in range(2, len(lost)):
         lost[row] &= not lost[row - 2 : row].all()  # never three in a row
     tracker = Tracker(predict, filter_of(), rest_seconds=0.9)
-    found = feed(tracker, gyro[~lost], accel[~lost], time[~lost])
+    poses = feed(tracker, gyro[~lost], accel[~lost], time[~lost])
     number, came = np.arange(45), ~lost[:45]
-    rest = [
+    resting_signals = [
         np.stack([np.interp(number, number[came], axis[:45][came]) for axis in signal.T], axis=1)
         for signal in (gyro, accel)
     ]
-    state = with_correlated_error(filtering.level_state(filtering.Filter(CONFIG), *rest))
-    _, wanted = scan(state, gyro, accel, ~lost)
-    steps = [round((pose.time - 7.0) / (N * DT)) - 1 for pose in found]
+    state = with_correlated_error(filtering.level_state(filtering.Filter(CONFIG), *resting_signals))
+    _, history = scan(state, gyro, accel, ~lost)
+    steps = [round((pose.time - 7.0) / (N * DT)) - 1 for pose in poses]
     assert 10 <= steps[0] <= 12 and len(steps) > 50 and tracker.hindrance == ""
-    positions = wanted.position[np.array(steps)]
-    np.testing.assert_allclose([p.position for p in found], positions, atol=1e-9)
-    assert any(pose.quiet for pose in found) and not all(pose.quiet for pose in found)
+    positions = history.position[np.array(steps)]
+    np.testing.assert_allclose([p.position for p in poses], positions, atol=1e-9)
+    assert any(pose.quiet for pose in poses) and not all(pose.quiet for pose in poses)
 
 
 @pytest.mark.parametrize(
@@ -419,13 +429,13 @@ def test_what_is_no_rest_is_said(built, missing, hindrance, start):
     gyro, accel = (signal[:80] for signal in resting())
     time = np.arange(80) * DT
     broken = np.where(np.isin(np.arange(80), missing)[:, None], np.nan, gyro)
-    tracker, said = Tracker(predict, filter_of(), rest_seconds=0.9), set()
+    tracker, hindrances = Tracker(predict, filter_of(), rest_seconds=0.9), set()
     for row in zip(time, broken, accel, strict=True):
         pose = tracker.push(*row)
-        said.add(tracker.hindrance)
+        hindrances.add(tracker.hindrance)
         if pose is not None:
             break
-    assert hindrance in said and tracker.hindrance == ""
+    assert hindrance in hindrances and tracker.hindrance == ""
     assert tracker.pose().time == pytest.approx((start + 45) * DT, abs=N * DT)
 
 
@@ -437,9 +447,9 @@ def test_a_rest_without_gravity_is_told_once_and_another_starts(built):
     assert feed(tracker, gyro[:49], accel[:49] / 9.81, time[:49]) == []
     with pytest.raises(ValueError, match=r"^accel: shows no gravity, its mean is 1 m/s²"):
         tracker.push(time[49], gyro[49], accel[49] / 9.81)
-    found = feed(tracker, gyro[50:], accel[50:], time[50:])
+    poses = feed(tracker, gyro[50:], accel[50:], time[50:])
     # The first pose stands for all intervals of the rest.
-    assert len(found) == (len(time) - 50) // N - 50 // N + 1 and found[0].healthy
+    assert len(poses) == (len(time) - 50) // N - 50 // N + 1 and poses[0].healthy
     with pytest.raises(ValueError, match=r"^time: must increase"):
         tracker.push(time[-1], gyro[0], accel[0])
 
@@ -448,43 +458,45 @@ def test_a_rest_without_gravity_is_told_once_and_another_starts(built):
 def walk(rate):
     """8 s on foot, shaken at 44, 49 and 40 Hz: at 50 Hz aliases to 6, 1 and 10 Hz. A start, and
     the walk."""
-    made = simulated.pedestrian(4, 4, seconds=8.0, rate=float(rate))
-    shake = np.sin(2 * np.pi * made.time[:, None] * [44.0, 49.0, 40.0] + [1.0, 2.0, 0.5])
-    rotation = geometry.matrix_from_quaternion(jnp.asarray(made.orientation[0]))
+    sequence = simulated.pedestrian(4, 4, seconds=8.0, rate=float(rate))
+    shake = np.sin(2 * np.pi * sequence.time[:, None] * [44.0, 49.0, 40.0] + [1.0, 2.0, 0.5])
+    rotation = geometry.matrix_from_quaternion(jnp.asarray(sequence.orientation[0]))
     state = filtering.initial_state(
-        filtering.Filter(CONFIG), rotation, made.velocity[0], made.position[0]
+        filtering.Filter(CONFIG), rotation, sequence.velocity[0], sequence.position[0]
     )
-    walked = made._replace(gyro=made.gyro + 2.0 * shake, accel=made.accel + 15.0 * shake[:, ::-1])
+    walked = sequence._replace(
+        gyro=sequence.gyro + 2.0 * shake, accel=sequence.accel + 15.0 * shake[:, ::-1]
+    )
     return with_correlated_error(state), walked
 
 
 @pytest.mark.parametrize("rate", [100, 104])
 def test_a_faster_imu_gives_the_trajectory_of_the_batch_path(built, rate):
     """To 1 µm at a multiple of the filter's rate, else 1 mm; mere interpolation is 10 cm off."""
-    (state, walked), n, there = walk(rate), N * INTERVALS, np.ones(N * INTERVALS, bool)
+    (state, walked), n, valid = walk(rate), N * INTERVALS, np.ones(N * INTERVALS, bool)
     even = resample(walked, 1 / DT)
-    wanted = np.asarray(scan(state, even.gyro[:n], even.accel[:n], there)[1].position)
-    tracker, found = (
+    positions = np.asarray(scan(state, even.gyro[:n], even.accel[:n], valid)[1].position)
+    tracker, arrivals = (
         Tracker(predict, filter_of(), state, imu_rate=float(rate)),
         [],
     )
     for row in checked_at_first(zip(walked.time, walked.gyro, walked.accel, strict=True)):
         pose = tracker.push(*row)
-        found += [] if pose is None else [(row[0], pose)]
+        arrivals += [] if pose is None else [(row[0], pose)]
     assert 21 * DT < tracker.delay < 22.01 * DT
-    for number, (stamp, pose) in enumerate(found, start=1):
+    for number, (stamp, pose) in enumerate(arrivals, start=1):
         assert pose.time == pytest.approx(number * N * DT)
         # the last sample of its interval is stamped DT before its time
         assert -1e-6 < stamp - (pose.time - DT) - tracker.delay < 1.01 / rate
-    off = np.abs(np.array([pose.position for _, pose in found[:INTERVALS]]) - wanted).max()
+    off = np.abs(np.array([pose.position for _, pose in arrivals[:INTERVALS]]) - positions).max()
     assert off < (1e-6 if rate == 100 else 1e-3)
     grid = np.arange(n) * DT
     rows = [
         np.stack([np.interp(grid, walked.time, column) for column in signal.T], axis=1)
         for signal in (walked.gyro, walked.accel)
     ]
-    aliased = np.asarray(scan(state, *rows, there)[1].position)
-    assert np.linalg.norm(aliased - wanted, axis=1).max() > 0.1
+    aliased = np.asarray(scan(state, *rows, valid)[1].position)
+    assert np.linalg.norm(aliased - positions, axis=1).max() > 0.1
 
 
 STILL = np.zeros(3), [0, 0, 9.81]
@@ -507,12 +519,12 @@ def test_no_hole_hides_that_the_imu_is_faster(tracker, hole):
     in the holes does not count: two seconds of samples are enough."""
     count = np.arange(400)
     stops = np.minimum(count // 40, 1) if hole == 0.9 else count // 40
-    taken = 0
+    sample_count = 0
     with pytest.raises(ValueError, match=r"^imu_rate: the samples come at 100 Hz"):
         for time in 1.7e9 + count / 100 + stops * hole:
             tracker.push(time, *STILL)
-            taken += 1
-    assert 196 < taken - len(np.unique(stops[:taken])) < 200
+            sample_count += 1
+    assert 196 < sample_count - len(np.unique(stops[:sample_count])) < 200
 
 
 @pytest.mark.parametrize("kind", ["jitter", "a slower IMU", "lost", "a change"])
@@ -539,11 +551,11 @@ def test_the_rate_is_measured_as_long_as_the_stream_lasts(tracker, kind):
 def test_the_example_replays_a_recording(tmp_path, monkeypatch, capsys):
     """examples/replay_csv.py, through the low-pass of a faster IMU, with an empty row and a hole;
     with the network of gnio-jax, else the newest run, as by every command."""
-    examples, asked, load = Path(__file__).parents[2] / "examples", [], networks.load
-    with tiny_run.known():
+    examples, requests, load = Path(__file__).parents[2] / "examples", [], networks.load
+    with tiny_run.registry_entry():
         config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig("tiny"))
         run = tiny_run.save(tmp_path / "run", config)
-        answer = lambda which: asked.append(which) or load(run)  # noqa: E731
+        answer = lambda which: requests.append(which) or load(run)  # noqa: E731
         monkeypatch.setattr(networks, "load", answer)
         lines = (examples / "walk.csv").read_text().splitlines()[:601]
         lines[150] = f"{lines[150].partition(',')[0]},,,,,,"
@@ -553,13 +565,13 @@ def test_the_example_replays_a_recording(tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
         runpy.run_path(str(examples / "replay_csv.py"), run_name="__main__")
     out, err = capsys.readouterr()
-    assert asked == [None] and err == "" and "Hz to 50 Hz: poses come 4" in out
+    assert requests == [None] and err == "" and "Hz to 50 Hz: poses come 4" in out
     assert out.count("p99") == 2 and "DIVERGED" not in out
-    found = np.loadtxt(tmp_path / "out" / "found.txt")
+    poses = np.loadtxt(tmp_path / "out" / "found.txt")
     # A pose every 0.1 s, but of the steps of the rest and of those with the hole the last ones;
     # they are behind by the low-pass.
-    assert found.shape[1] == 8 and 44 <= len(found) <= 48
-    assert found[0, 0] == pytest.approx(1.0, abs=1e-3) and 5.4 < found[-1, 0] < 5.6
-    np.testing.assert_allclose(np.linalg.norm(found[:, 4:], axis=1), 1, atol=1e-6)
+    assert poses.shape[1] == 8 and 44 <= len(poses) <= 48
+    assert poses[0, 0] == pytest.approx(1.0, abs=1e-3) and 5.4 < poses[-1, 0] < 5.6
+    np.testing.assert_allclose(np.linalg.norm(poses[:, 4:], axis=1), 1, atol=1e-6)
     assert (tmp_path / "out" / "found.png").read_bytes()[:4] == b"\x89PNG"
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["found.png", "found.txt"]

@@ -37,8 +37,8 @@ def at_rest(state, tried, test_seconds):
 
 def run(rotation, velocity, gyro, accel, displacement):
     """With no more certainty of the start than a twentieth of a metre a second."""
-    std, rest = filtering.InitialStd(velocity=0.05), filtering.ZeroVelocity(0.02)
-    ekf = filtering.Filter(CONFIG, NOISE, std, measurements=(rest,))
+    std, zero_velocity = filtering.InitialStd(velocity=0.05), filtering.ZeroVelocity(0.02)
+    ekf = filtering.Filter(CONFIG, NOISE, std, measurements=(zero_velocity,))
     spread = np.tile(0.02**2 * np.eye(3), (INTERVALS, 1, 1))
     state = filtering.initial_state(ekf, rotation, velocity, np.zeros(3))
     return filtering.run_filter(ekf, state, gyro, accel, displacement, spread)[1]
@@ -53,13 +53,13 @@ def test_rest_counts_only_after_its_time(seconds, intervals):
     shaken = STILL._replace(accel=STILL.accel.at[3, 2].add(-1.01 * config.rest_accel))
     held = STILL._replace(gap=Gap(jnp.zeros(N).at[-1].set(1e-6), jnp.zeros(N), jnp.ones(N)))
     state = filtering.initial_state(filtering.Filter(config), np.eye(3), np.zeros(3), np.zeros(3))
-    found, expected, count = [], [], 0
+    decisions, expected, count = [], [], 0
     for imu in [*5 * [STILL], turning, *5 * [STILL], shaken, *5 * [STILL], held, *5 * [STILL]]:
         state, quiet = detect_rest(state, imu, config)
         count = count + 1 if imu is STILL else 0
-        found.append(bool(quiet))
+        decisions.append(bool(quiet))
         expected.append(count >= intervals)
-    assert found == expected and sum(found) == 4 * (6 - intervals)
+    assert decisions == expected and sum(decisions) == 4 * (6 - intervals)
 
 
 def test_a_shaken_imu_is_quiet_by_its_means_unless_it_turns():
@@ -109,8 +109,8 @@ def resting(
     )
     gate = filtering.GateState(jnp.bool_(converged), jnp.int32(last_success), jnp.int32(pause_end))
     state = state._replace(gate=gate, step=jnp.int32(now // N))
-    new, found = at_rest(state, np.bool_(tried), test_seconds)
-    return state, new, found
+    new, outcome = at_rest(state, np.bool_(tried), test_seconds)
+    return state, new, outcome
 
 
 @pytest.mark.parametrize(
@@ -130,16 +130,20 @@ def test_a_young_rest_at_a_speed_that_the_filter_knows_is_refused(seconds, test_
     ekf = filtering.Filter(config, start=filtering.InitialStd(velocity=0.1))
 
     @jax.jit
-    def update(state, there):
-        found = filtering.Outcome(there, there, jnp.zeros(3), nothing, nothing, nothing, no)
-        step = filtering.Step(STILL, 0, 1, config, filtering.NoiseModel(), {"displacement": found})
+    def update(state, presence):
+        displacement = filtering.Outcome(
+            presence, presence, jnp.zeros(3), nothing, nothing, nothing, no
+        )
+        step = filtering.Step(
+            STILL, 0, 1, config, filtering.NoiseModel(), {"displacement": displacement}
+        )
         return ZeroVelocity(0.05).update(state, step)[:2]
 
-    for speed, there, count in ((11.0, False, refused), (0.1, False, 0), (11.0, True, 0)):
+    for speed, presence, count in ((11.0, False, refused), (0.1, False, 0), (11.0, True, 0)):
         state = filtering.initial_state(ekf, np.eye(3), np.array([speed, 0, 0]), np.zeros(3))
         accepted, present = [], []
         for _ in range(8):
-            state, outcome = update(state, np.bool_(there))
+            state, outcome = update(state, np.bool_(presence))
             accepted.append(bool(outcome.accepted))
             present.append(bool(outcome.present))
         assert present == [False] * waiting + [True] * (8 - waiting)
@@ -170,12 +174,14 @@ EDGE = np.sqrt(CONFIG.gate_threshold * (0.1**2 + 0.05**2))
     ],
 )
 def test_rest_passes_a_chi_square_test_where_the_gate_is_active(gate, speed, accepted):
-    state, new, found = resting(speed=speed, **gate)
-    np.testing.assert_allclose(found.nis, speed**2 / (0.1**2 + 0.05**2), rtol=1e-12)
-    assert bool(found.accepted) == accepted and bool(found.present)
+    state, new, outcome = resting(speed=speed, **gate)
+    np.testing.assert_allclose(outcome.nis, speed**2 / (0.1**2 + 0.05**2), rtol=1e-12)
+    assert bool(outcome.accepted) == accepted and bool(outcome.present)
     jax.tree.map(np.testing.assert_array_equal, new.gate, state.gate)
-    wanted = np.asarray(state.velocity) * (0.05**2 / (0.1**2 + 0.05**2) if accepted else 1.0)
-    np.testing.assert_allclose(new.velocity, wanted, rtol=1e-12)
+    expected_velocity = np.asarray(state.velocity) * (
+        0.05**2 / (0.1**2 + 0.05**2) if accepted else 1.0
+    )
+    np.testing.assert_allclose(new.velocity, expected_velocity, rtol=1e-12)
     variance = 1 / (1 / 0.1**2 + accepted / 0.05**2)
     diagonal = np.diag(additive_errors(new).core_covariance)
     np.testing.assert_allclose(diagonal[3:6], variance, rtol=1e-12)

@@ -66,16 +66,16 @@ def frame_weights(width, vectors, scalars, depth, turns):
 
 
 def test_ronins_weights_are_tlios_under_other_names():
-    found = interop.load_state_dict(ronin_weights())
-    assert (found.model.name, found.model.output_dim, found.features) == ("ronin_resnet", 2, 7)
+    ronin = interop.load_state_dict(ronin_weights())
+    assert (ronin.model.name, ronin.model.output_dim, ronin.features) == ("ronin_resnet", 2, 7)
     tlio = interop.load_state_dict(tlio_weights.weights())
     assert tlio.model.name == "tlio"
     jax.tree.map(
         np.testing.assert_array_equal,
-        found.variables["params"]["encoder"],
+        ronin.variables["params"]["encoder"],
         tlio.variables["params"]["encoder"],
     )
-    head, other = (w.variables["params"]["displacement"] for w in (found, tlio))
+    head, other = (w.variables["params"]["displacement"] for w in (ronin, tlio))
     np.testing.assert_array_equal(head["neck_bn"]["scale"], other["neck_bn"]["scale"])
     np.testing.assert_array_equal(head["fc3"]["kernel"], other["fc3"]["kernel"][:, :2])
 
@@ -94,15 +94,15 @@ def test_eqnios_weights_are_recognised_and_their_inner_channels_stay(frame, inne
     sizes = (64, 3, 9, 2, False) if frame == "o2_frame" else (128, 2, 5, 2, True)
     sizes = (128, 2, 5, 1, True) if frame == "so2_frame_shallow" else sizes
     outer = frame_weights(*sizes)
-    found = interop.load_state_dict(outer | {f"{inner}.{key}": w for key, w in weights.items()})
+    network = interop.load_state_dict(outer | {f"{inner}.{key}": w for key, w in weights.items()})
     name = {"ronin": "ronin_resnet", "tlio": "tlio"}[inner]
-    assert (found.model.name, found.model.equivariance) == (name, frame)
-    params = found.variables["params"]
+    assert (network.model.name, network.model.equivariance) == (name, frame)
+    params = network.variables["params"]
     stem = weights["input_block.0.weight"].T
     np.testing.assert_array_equal(params["encoder"]["stem_conv"]["kernel"], np.float32(stem))
-    wanted = np.float32(outer["layers.0.0.conv_layer_vec.weight"][..., 0].T)
-    np.testing.assert_array_equal(params["frame"]["block1"]["vector_filter"]["kernel"], wanted)
-    shapes = models.variable_shapes(models.from_config(found.model))["params"]
+    kernel = np.float32(outer["layers.0.0.conv_layer_vec.weight"][..., 0].T)
+    np.testing.assert_array_equal(params["frame"]["block1"]["vector_filter"]["kernel"], kernel)
+    shapes = models.variable_shapes(models.from_config(network.model))["params"]
     assert jax.tree.map(jnp.shape, params) == jax.tree.map(jnp.shape, shapes)
 
 
@@ -160,8 +160,8 @@ def test_the_frame_of_read_weights_is_that_of_pytorchs_layers():
     weights = {f"tlio.{key}": w for key, w in tlio_weights.weights().items()}
     params = interop.load_state_dict(outer | weights).variables["params"]["frame"]
     frame = EquivariantFrame(64, 2, True)
-    found = quick(frame.apply)({"params": params}, jnp.asarray(windows))
-    np.testing.assert_allclose(found.heading, x.numpy(), atol=1e-5)
+    output = quick(frame.apply)({"params": params}, jnp.asarray(windows))
+    np.testing.assert_allclose(output.heading, x.numpy(), atol=1e-5)
 
 
 def test_a_run_of_ronins_weights_and_mistakes(tmp_path):

@@ -19,9 +19,9 @@ from tests.support import tlio_weights
 WEIGHTS = tlio_weights.weights()
 
 
-def equal(found, wanted):
-    assert jax.tree.structure(found) == jax.tree.structure(wanted)
-    jax.tree.map(np.testing.assert_array_equal, found, wanted)
+def equal(variables, expected):
+    assert jax.tree.structure(variables) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, variables, expected)
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +59,11 @@ def test_a_checkpoint_of_pytorch(tmp_path, loaded, form):
         state = {**state, **halved}
     zipped = {"_use_new_zipfile_serialization": form != "old format"}
     torch.save(state, tmp_path / "checkpoint_7.pt", **zipped)
-    found = interop.load_tlio_state_dict(tmp_path / "checkpoint_7.pt")
+    variables = interop.load_tlio_state_dict(tmp_path / "checkpoint_7.pt")
     if form == "half precision":
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2**-8), found, loaded)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2**-8), variables, loaded)
     else:
-        equal(found, loaded)
+        equal(variables, loaded)
 
 
 def test_a_torchscript_archive(tmp_path, loaded):
@@ -102,8 +102,8 @@ def test_a_checkpoint_with_more_than_tensors_is_not_run(tmp_path, monkeypatch):
 
 def changed(**parts):
     """The weights with some replaced (their names with __ for dots), or left out by None."""
-    given = WEIGHTS | {key.replace("__", "."): value for key, value in parts.items()}
-    return {key: value for key, value in given.items() if value is not None}
+    weights = WEIGHTS | {key.replace("__", "."): value for key, value in parts.items()}
+    return {key: value for key, value in weights.items() if value is not None}
 
 
 ZEROS = functools.partial(np.zeros, dtype=np.float32)
@@ -111,7 +111,7 @@ NOT_FINITE = "'output_block1.fc3.bias' holds values that are not finite numb"
 
 
 @pytest.mark.parametrize(
-    "given, problem",
+    "state, problem",
     [
         ({}, "'output_block1.fc1.weight' is missing"),
         ({"model_state_dict": 3}, "its model_state_dict is not a mapping"),
@@ -127,9 +127,9 @@ NOT_FINITE = "'output_block1.fc3.bias' holds values that are not finite numb"
         (changed(output_block1__fc3__bias=np.array(["a"] * 3)), NOT_FINITE),
     ],
 )
-def test_weights_that_do_not_fit(given, problem):
+def test_weights_that_do_not_fit(state, problem):
     with pytest.raises(InputError, match=f"^state dict: {re.escape(problem)}"):
-        interop.load_tlio_state_dict(given)
+        interop.load_tlio_state_dict(state)
 
 
 def test_files_that_are_none(tmp_path):
@@ -140,9 +140,9 @@ def test_files_that_are_none(tmp_path):
         ("damaged", "cannot be read"),
         ("objects", "cannot be read"),
     ]:
-        with pytest.raises(InputError, match=f"{name}.npz: {problem}") as told:
+        with pytest.raises(InputError, match=f"{name}.npz: {problem}") as refusal:
             interop.load_tlio_state_dict(tmp_path / f"{name}.npz")
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(refusal.value)
 
 
 @pytest.fixture(scope="module")
@@ -175,8 +175,8 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     ):
         with pytest.raises(SystemExit, match="2"):
             command(monkeypatch, file, tmp_path / name, *options)
-        told = capsys.readouterr().err
-        assert problem in told and told.count("\n") == 1 and not (tmp_path / "new").exists()
+        message = capsys.readouterr().err
+        assert problem in message and message.count("\n") == 1 and not (tmp_path / "new").exists()
 
 
 def test_a_run_appears_whole_or_not_at_all(file, tmp_path, monkeypatch):

@@ -41,11 +41,11 @@ def test_corrections_against_numpy():
     }
     correction = np.hstack([0.1 * head["accel"], np.pi / 180 * head["gyro"]])
     variance = np.exp(np.hstack([head["accel_log_variance"], head["gyro_log_variance"]]) - 5)
-    found = jax.device_get(quick(network.apply)(variables, jnp.asarray(imu)))
+    output = jax.device_get(quick(network.apply)(variables, jnp.asarray(imu)))
     rows = np.arange(31) // 9
-    wanted = np.where(np.arange(31)[:, None] < 9, 0, correction[rows])
-    np.testing.assert_allclose(found.imu[0], wanted, atol=1e-5)
-    np.testing.assert_allclose(found.variance[0], variance[rows], rtol=1e-4)
+    expected = np.where(np.arange(31)[:, None] < 9, 0, correction[rows])
+    np.testing.assert_allclose(output.imu[0], expected, atol=1e-5)
+    np.testing.assert_allclose(output.variance[0], variance[rows], rtol=1e-4)
 
 
 def start(dtype=float):
@@ -86,8 +86,8 @@ def test_preintegration_and_its_covariance_against_small_steps_and_differences()
                 moved, v, p = stepped(other, dt, 1)
                 sides.append(np.concatenate([(turn.inv() * moved).as_rotvec(), v, p]))
             columns.append((sides[0] - sides[1]) / (2 * step) * std[k, channel])
-    wanted = np.array(columns).T @ np.array(columns)
-    np.testing.assert_allclose(path.covariance[-1], wanted, rtol=1e-4, atol=1e-9)
+    covariance = np.array(columns).T @ np.array(columns)
+    np.testing.assert_allclose(path.covariance[-1], covariance, rtol=1e-4, atol=1e-9)
 
 
 def windows_of(imu, dt):
@@ -115,12 +115,14 @@ def test_the_loss_is_small_for_true_samples_and_has_a_gradient_for_every_paramet
     config = LossConfig(mse_weight=0.0, nll_weight=0.0, preintegration_weight=1.0)
 
     def loss(params, shift=None):
-        said = model.apply({**variables, "params": params}, windows.imu)
+        prediction = model.apply({**variables, "params": params}, windows.imu)
         if shift is not None:  # in the place of the corrector's
             corrected = jnp.float32(smooth[None] + shift)
-            said = said._replace(diagnostics={**said.diagnostics, "corrected": corrected})
+            prediction = prediction._replace(
+                diagnostics={**prediction.diagnostics, "corrected": corrected}
+            )
         stage = loss_stage(config, 0, 1)
-        return losses(said, windows, config, stage, 2, dt).total
+        return losses(prediction, windows, config, stage, 2, dt).total
 
     true, wrong = (float(quick(lambda p, s=s: loss(p, s))(variables["params"])) for s in (0, 0.3))
     assert wrong > 10 * abs(true)
@@ -141,17 +143,17 @@ def test_a_corrector_learns_from_the_preintegration_alone():
         stage = loss_stage(config, 0, 1)
 
         def loss(params):
-            said = model.apply({**variables, "params": params}, windows.imu)
-            return losses(said, windows, config, stage, 2, dt).total
+            prediction = model.apply({**variables, "params": params}, windows.imu)
+            return losses(prediction, windows, config, stage, 2, dt).total
 
         return quick(jax.grad(loss))(variables["params"])
 
-    alone, both = (
+    alone, joint_gradient = (
         gradient(LossConfig(mse_weight=weight, nll_weight=0.0, preintegration_weight=1.0))
         for weight in (0.0, 1.0)
     )
     for path, leaf in jax.tree.leaves_with_path(alone["corrector"]):
-        other = functools.reduce(lambda tree, key: tree[key.key], path, both["corrector"])
+        other = functools.reduce(lambda tree, key: tree[key.key], path, joint_gradient["corrector"])
         np.testing.assert_allclose(leaf, other, rtol=1e-5, atol=1e-7 * np.abs(leaf).max())
     of_network = [
         max(
@@ -160,7 +162,7 @@ def test_a_corrector_learns_from_the_preintegration_alone():
             if name != "corrector"
             for leaf in jax.tree.leaves(tree[name])
         )
-        for tree in (both, alone)
+        for tree in (joint_gradient, alone)
     ]
     assert of_network[0] > 1e-3 and of_network[1] == 0
     with pytest.raises(InputError, match="is 0, and a corrector learns from the preintegration"):
@@ -170,11 +172,11 @@ def test_a_corrector_learns_from_the_preintegration_alone():
 def test_the_loss_needs_a_target():
     config = LossConfig(preintegration_weight=1.0)
     stage = loss_stage(config, 0, 1)
-    rest = np.tile([0, 0, 9.81, 0, 0, 0], (10, 1))
+    resting_imu = np.tile([0, 0, 9.81, 0, 0, 0], (10, 1))
     samples = {"corrected": jnp.zeros((1, 10, 6)), "corrected_variance": jnp.ones((1, 10, 6))}
-    said = Prediction(jnp.zeros((1, 3)), jnp.zeros((1, 3)), samples)
+    prediction = Prediction(jnp.zeros((1, 3)), jnp.zeros((1, 3)), samples)
     with pytest.raises(InputError, match="at least 11 samples, and these have 10; raise"):
-        losses(said, windows_of(rest, 0.01), config, stage)
+        losses(prediction, windows_of(resting_imu, 0.01), config, stage)
 
 
 def test_the_network_sees_the_corrected_samples_in_its_frame():
@@ -182,22 +184,22 @@ def test_the_network_sees_the_corrected_samples_in_its_frame():
     variables = drawn(models.variable_shapes(model, 20))
     smooth = np.cumsum(RNG.normal(0, 0.05, (20, 6)), axis=0)
     windows = windows_of(smooth, 0.01)
-    found = jax.device_get(quick(model.apply)(variables, windows.imu))
+    prediction = jax.device_get(quick(model.apply)(variables, windows.imu))
     axes = np.asarray(windows.imu[0, :, 6:]).reshape(-1, 2, 3)
     axes = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=2)
-    body = found.diagnostics["corrected"][0].reshape(-1, 2, 3)
-    seen = np.float32(np.einsum("nij,nkj->nki", axes, body).reshape(1, -1, 6))
+    body = prediction.diagnostics["corrected"][0].reshape(-1, 2, 3)
+    corrected_windows = np.float32(np.einsum("nij,nkj->nki", axes, body).reshape(1, -1, 6))
     inner = {
         kind: {k: v for k, v in tree.items() if k != "corrector"}
         for kind, tree in variables.items()
     }
-    wanted = quick(plain.apply)(inner, jnp.asarray(seen))
-    np.testing.assert_allclose(found.displacement, wanted.displacement, atol=1e-5)
+    plain_prediction = quick(plain.apply)(inner, jnp.asarray(corrected_windows))
+    np.testing.assert_allclose(prediction.displacement, plain_prediction.displacement, atol=1e-5)
     # So does the filter, with the variances.
     parts = {kind: tree["corrector"] for kind, tree in variables.items()}
     accel, gyro, variance = airimu.Corrector(parts).correct(smooth[:, :3], smooth[:, 3:])
     np.testing.assert_allclose(np.hstack([accel, gyro]), body.reshape(-1, 6), atol=1e-4)
-    of_windows = found.diagnostics["corrected_variance"][0]
+    of_windows = prediction.diagnostics["corrected_variance"][0]
     np.testing.assert_allclose(variance, of_windows, rtol=1e-3)
 
 

@@ -45,7 +45,7 @@ def test_forward_against_numpy():
     accel, gyro = RNG.standard_normal((2, 2, 40, 3))
     model = models.create("airio", width=4)
     variables = drawn(models.variable_shapes(model, 40))
-    (q, s), wanted = float64(variables), []
+    (q, s), expected = float64(variables), []
     for turn, a, w in zip(attitude, accel, gyro, strict=True):
         vector = Rotation.from_matrix(turn).as_rotvec()
         parts = {"imu": np.hstack([a, w]), "attitude": vector}
@@ -57,12 +57,12 @@ def test_forward_against_numpy():
         v, variance = decoded(x, q["displacement"]), np.exp(decoded(x, q["log_std"]) - 5)
         moved = np.mean([turn[r] @ v[k] for k, r in enumerate(rows)], axis=0)
         spread = [np.diag(turn[r] @ np.diag(variance[k]) @ turn[r].T) for k, r in enumerate(rows)]
-        wanted.append((v[:3], moved, np.log(np.mean(spread, axis=0)) / 2))
-    velocity, moved, log_std = (np.stack(part) for part in zip(*wanted, strict=True))
-    for found in predicted(model, variables, with_axes(attitude, accel, gyro), False):
-        np.testing.assert_allclose(found.diagnostics["body_velocity"], velocity, atol=1e-5)
-        np.testing.assert_allclose(found.displacement, moved, atol=1e-5)
-        np.testing.assert_allclose(found.log_std, log_std, atol=1e-5)
+        expected.append((v[:3], moved, np.log(np.mean(spread, axis=0)) / 2))
+    velocity, moved, log_std = (np.stack(part) for part in zip(*expected, strict=True))
+    for prediction in predicted(model, variables, with_axes(attitude, accel, gyro), False):
+        np.testing.assert_allclose(prediction.diagnostics["body_velocity"], velocity, atol=1e-5)
+        np.testing.assert_allclose(prediction.displacement, moved, atol=1e-5)
+        np.testing.assert_allclose(prediction.log_std, log_std, atol=1e-5)
 
 
 def test_rotation_vectors_are_scipys_and_their_derivative_is_finite_at_the_identity():
@@ -70,8 +70,8 @@ def test_rotation_vectors_are_scipys_and_their_derivative_is_finite_at_the_ident
     axis = RNG.standard_normal((len(angles), 3))
     vectors = angles[:, None] * axis / np.linalg.norm(axis, axis=1)[:, None]
     matrices = Rotation.from_rotvec(vectors).as_matrix()
-    found = quick(airio.rotation_vector)(jnp.asarray(matrices))
-    np.testing.assert_allclose(found, vectors, atol=1e-9)
+    rotation_vectors = quick(airio.rotation_vector)(jnp.asarray(matrices))
+    np.testing.assert_allclose(rotation_vectors, vectors, atol=1e-9)
     slope = quick(jax.jacrev(airio.rotation_vector))(jnp.eye(3))
     # The vector of I + hat(v) is v to first order.
     hat = np.array([[0, -3, 2], [3, 0, -1], [-2, 1, 0]]) * 1.0
@@ -90,14 +90,14 @@ def test_the_loss_is_hubers_and_the_likelihood_of_the_velocity_in_the_body():
     error, bound = truth - velocity[0], 0.005
     huber = np.where(abs(error) < bound, error**2 / 2, bound * (abs(error) - bound / 2))
     likelihood = error**2 / np.exp(2 * log_std[0]) + 2 * log_std[0]
-    wanted = 100 * (huber.mean() + 1e-4 * likelihood.mean())
+    expected = 100 * (huber.mean() + 1e-4 * likelihood.mean())
     says = {"body_velocity": jnp.asarray(velocity), "body_velocity_log_std": jnp.asarray(log_std)}
     prediction = Prediction(jnp.zeros((1, 3)), jnp.zeros((1, 3)), says)
     imu = jnp.asarray(with_axes(attitude, zeros, zeros), jnp.float32)
     windows = Windows(imu, jnp.zeros((1, 3)), jnp.asarray(steps))
     config = LossConfig(name="body_velocity")
-    found = losses(prediction, windows, config, loss_stage(config, 0, 1)).total
-    np.testing.assert_allclose(found, wanted, rtol=1e-5)
+    loss = losses(prediction, windows, config, loss_stage(config, 0, 1)).total
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
 
 def test_windows_that_are_too_short_are_refused():

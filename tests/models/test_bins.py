@@ -30,19 +30,19 @@ def test_6848_parameters_whatever_the_number_of_bins():
 def test_mean_and_variance_are_those_of_the_bins():
     head = BinHead(bins=4, reach=2.0)
     variables = drawn(jax.eval_shape(head.init, jax.random.key(0), jnp.asarray(HIDDEN)))
-    found, says = quick(head.apply)(variables, jnp.float32(HIDDEN))
+    means, says = quick(head.apply)(variables, jnp.float32(HIDDEN))
     q = jax.tree.map(lambda x: np.asarray(x, float), variables["params"])
     code = []
     for centre in CENTRES:
         angles = [centre / 2 * 0.5 * 64 ** (j / 31) for j in range(32)]
         code.append(np.sin(q["code_scale"] * [*np.sin(angles), *np.cos(angles)]))
     embedding = linear(np.array(code), q["embedding"])
-    for h, mean, log_std in zip(HIDDEN, found, says["log_std"], strict=True):
+    for h, mean, log_std in zip(HIDDEN, means, says["log_std"], strict=True):
         query = linear(h, q["query"]).reshape(3, 32)
         shares = softmax(query @ embedding.T)
-        wanted = shares @ CENTRES
-        variance = shares @ CENTRES**2 - wanted**2 + 1 / 12  # uniform within a bin of 1 m
-        np.testing.assert_allclose(mean, wanted, atol=1e-5)
+        expected_mean = shares @ CENTRES
+        variance = shares @ CENTRES**2 - expected_mean**2 + 1 / 12  # uniform within a bin of 1 m
+        np.testing.assert_allclose(mean, expected_mean, atol=1e-5)
         np.testing.assert_allclose(np.exp(2 * log_std), variance, rtol=1e-4)
 
 
@@ -89,16 +89,16 @@ def test_the_loss_is_hubers_and_the_divergence_from_a_label_with_the_true_mean()
         jnp.zeros((1, 3)),
         {"bin_logits": jnp.asarray(logits), "bin_reach": jnp.full(1, 2.0)},
     )
-    config, wanted = LossConfig(name="bins"), 0.0
+    config, expected = LossConfig(name="bins"), 0.0
     for axis in (0, 1):
         error = abs(truth[0, axis] - mean[0, axis])
         label = label_of(truth[0, axis], max(error, 0.1))
         p = softmax(logits[0, axis])
-        wanted += 0.1 * (error - 0.05) if error > 0.1 else error**2 / 2
-        wanted += np.sum(label * np.log(np.maximum(label, 1e-300) / p))
+        expected += 0.1 * (error - 0.05) if error > 0.1 else error**2 / 2
+        expected += np.sum(label * np.log(np.maximum(label, 1e-300) / p))
     windows = Windows(jnp.zeros((1, 5, 6)), jnp.asarray(truth), jnp.zeros((1, 5, 3)))
-    found = losses(prediction, windows, config, loss_stage(config, 0, 1), 2).total
-    np.testing.assert_allclose(found, wanted, rtol=1e-3)
+    loss = losses(prediction, windows, config, loss_stage(config, 0, 1), 2).total
+    np.testing.assert_allclose(loss, expected, rtol=1e-3)
 
 
 def test_a_network_with_bins_has_their_uncertainty():

@@ -20,7 +20,7 @@ from tests.support.tiny_network import Tiny
 
 
 def test_networks_have_as_many_parameters_as_published():
-    for name, options, wanted in (
+    for name, options, expected_count in (
         ("gnio", {}, 4_934_153),
         ("gnio", {"bank_size": 128}, 4_966_921),
         ("gnio", {"bank_size": 0}, 3_846_144 + 3 * (512 * 3 + 3)),
@@ -50,7 +50,7 @@ def test_networks_have_as_many_parameters_as_published():
         ("trunk", {"block": "wavelet"}, 646_303),
         ("experts", {}, 1_933_422),
     ):
-        assert count(shapes(name, 200, **options)["params"]) == wanted, (name, options)
+        assert count(shapes(name, 200, **options)["params"]) == expected_count, (name, options)
 
 
 SOFTMAX = {("key", "bias"), ("key_content", "bias"), ("key_position", "bias")}
@@ -92,9 +92,9 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
     statistics = variables["batch_stats"]
 
     def loss(params, windows, key):
-        given = {"params": params, "batch_stats": statistics}
+        network_variables = {"params": params, "batch_stats": statistics}
         prediction, changed = model.apply(
-            given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
+            network_variables, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
         )
         balance = prediction.diagnostics.get("task_log_std", jnp.zeros((1, 2), jnp.float32))
         if not models.predicts_displacement(model):  # what it says in its place
@@ -181,8 +181,8 @@ def test_options_that_cannot_be_are_refused():
 def choices(kind):
     """The choices in a type, also in those of a union's members."""
     kinds = [kind, *typing.get_args(kind)]
-    literals = [each for each in kinds if typing.get_origin(each) is typing.Literal]
-    return set().union(*(typing.get_args(each) for each in literals))
+    literals = [member for member in kinds if typing.get_origin(member) is typing.Literal]
+    return set().union(*(typing.get_args(literal) for literal in literals))
 
 
 def test_the_settings_have_the_options_and_choices_of_the_networks():
@@ -192,7 +192,7 @@ def test_the_settings_have_the_options_and_choices_of_the_networks():
     for option, kind in typing.get_type_hints(ModelConfig).items():
         if option in ("name", "options"):
             continue
-        kinds = [known[option] for known in networks if option in known]
+        kinds = [options[option] for options in networks if option in options]
         assert kinds and choices(kind) == set().union(*map(choices, kinds)), option
 
 

@@ -37,13 +37,13 @@ def lstm(x, q):
 
 def local_attention(x, q, s, groups=4):
     n, channels = x.shape
-    padded, each = np.vstack([np.zeros(channels), x, np.zeros(channels)]), channels // groups
+    padded, size = np.vstack([np.zeros(channels), x, np.zeros(channels)]), channels // groups
     key = np.zeros((n, channels))
     for t in range(n):
         for out in range(channels):
-            own = slice(out // each * each, out // each * each + each)
+            group = slice(out // size * size, out // size * size + size)
             kernel = q["key_conv"]["kernel"][:, :, out]
-            key[t, out] = sum(padded[t + k, own] @ kernel[k] for k in range(3))
+            key[t, out] = sum(padded[t + k, group] @ kernel[k] for k in range(3))
     key = relu(batch_norm(key, q["key_bn"], s["key_bn"]))
     value = conv_norm(x, "value_conv", q, s)
     scores = linear(relu(conv_norm(np.hstack([x, key]), "hidden_conv", q, s)), q["weights"])
@@ -60,7 +60,7 @@ def local_attention(x, q, s, groups=4):
 
 def numpy_forward(variables, windows):
     """Velocities and log standard deviations of every step, with a vertical of 0."""
-    (p, s), found = float64(variables), []
+    (p, s), outputs = float64(variables), []
     for window in np.asarray(windows, np.float64):
         q = p["spatial_embedding"]
         x = linear(conv_norm(window, "conv", q, s["spatial_embedding"], 1, 1), q["linear"])
@@ -76,10 +76,10 @@ def numpy_forward(variables, windows):
             x = layer_norm(x + attention(x, memory, memory, q["cross"]), q["cross_norm"])
             y = linear(relu(linear(x, q["expand"])), q["contract"])
             x = layer_norm(x + y, q["ffn_norm"])
-        both = (p["velocity"], p["log_std"])
-        each = [linear(layer_norm(linear(x, q["hidden"]), q["norm"]), q["output"]) for q in both]
-        found.append(each)
-    return np.pad(np.array(found), ((0, 0), (0, 0), (0, 0), (0, 1))).swapaxes(0, 1)
+        trees = (p["velocity"], p["log_std"])
+        pair = [linear(layer_norm(linear(x, q["hidden"]), q["norm"]), q["output"]) for q in trees]
+        outputs.append(pair)
+    return np.pad(np.array(outputs), ((0, 0), (0, 0), (0, 0), (0, 1))).swapaxes(0, 1)
 
 
 def test_forward_against_numpy():
@@ -90,18 +90,18 @@ def test_forward_against_numpy():
     for values in (velocity[..., :2], log_std[..., :2]):  # windows and steps are told apart
         assert np.ptp(values, axis=0).max() > 0.1 and np.ptp(values, axis=1).min() > 0.05
     task = variables["params"]["task_log_std"]
-    for found in predicted(model, variables, windows):
-        for ours, wanted in (
-            (found.diagnostics["velocity"], velocity),
-            (found.diagnostics["velocity_log_std"], log_std),
-            (found.diagnostics["task_log_std"], np.stack([task, task])),
-            (found.displacement, velocity.mean(axis=1)),
-            (found.log_std, 0.5 * np.log(np.mean(np.exp(2 * log_std), axis=1))),
+    for prediction in predicted(model, variables, windows):
+        for ours, expected in (
+            (prediction.diagnostics["velocity"], velocity),
+            (prediction.diagnostics["velocity_log_std"], log_std),
+            (prediction.diagnostics["task_log_std"], np.stack([task, task])),
+            (prediction.displacement, velocity.mean(axis=1)),
+            (prediction.log_std, 0.5 * np.log(np.mean(np.exp(2 * log_std), axis=1))),
         ):
-            np.testing.assert_allclose(ours, wanted, rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(ours, expected, rtol=1e-3, atol=1e-4)
 
 
 def test_the_mean_of_variances_does_not_overflow():
     log_std = jnp.array([[[-2.0, 0.0, 90.0], [1.0, 0.0, -90.0]]], jnp.float32)
-    wanted = [[0.5 * np.log((np.exp(-4) + np.exp(2)) / 2), 0, 90 - 0.5 * np.log(2)]]
-    np.testing.assert_allclose(heads.root_mean_square(log_std), wanted, rtol=1e-6)
+    expected = [[0.5 * np.log((np.exp(-4) + np.exp(2)) / 2), 0, 90 - 0.5 * np.log(2)]]
+    np.testing.assert_allclose(heads.root_mean_square(log_std), expected, rtol=1e-6)

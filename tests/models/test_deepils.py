@@ -27,7 +27,7 @@ def block(x, q, s, stride):
     y = conv_norm(depthwise(y, q["depthwise2"]["kernel"], 1), "conv2", q, s)
     squeeze, excite = (q["channel_attention"][name]["kernel"] for name in ("squeeze", "excite"))
     pooled = (y.mean(axis=0), y.max(axis=0))
-    y = y * sigmoid(sum(relu(each @ squeeze) @ excite for each in pooled))
+    y = y * sigmoid(sum(relu(vector @ squeeze) @ excite for vector in pooled))
     over_channels = np.array([[step.mean(), step.max()] for step in y])
     y = y * sigmoid(conv(over_channels, q["time_attention"]["conv"]["kernel"], 1, 3))
     return relu(y + (conv_norm(x, "shortcut_conv", q, s, stride) if "shortcut_conv" in q else x))
@@ -49,13 +49,15 @@ def test_forward_against_numpy():
     model = models.create("deepils", width=8, output_dim=2)
     variables = drawn(shapes("deepils", 100, width=8, output_dim=2))
     windows = np.random.default_rng(1).standard_normal((2, 100, 6)).astype(np.float32)
-    wanted = numpy_forward(variables, windows)
-    assert np.ptp(wanted, axis=0).min() > 1e-2  # the windows are told apart
+    displacements = numpy_forward(variables, windows)
+    assert np.ptp(displacements, axis=0).min() > 1e-2  # the windows are told apart
     constant = variables["batch_stats"]["uncertainty"]["log_std"]
-    for found in predicted(model, variables, windows):
-        np.testing.assert_allclose(found.displacement[:, :2], wanted, rtol=2e-4, atol=2e-5)
-        np.testing.assert_array_equal(found.displacement[:, 2:], 0)
-        np.testing.assert_array_equal(found.log_std, np.stack([constant, constant]))
+    for prediction in predicted(model, variables, windows):
+        np.testing.assert_allclose(
+            prediction.displacement[:, :2], displacements, rtol=2e-4, atol=2e-5
+        )
+        np.testing.assert_array_equal(prediction.displacement[:, 2:], 0)
+        np.testing.assert_array_equal(prediction.log_std, np.stack([constant, constant]))
 
 
 def test_the_gradient_of_a_maximum_goes_to_one_place():

@@ -49,9 +49,9 @@ def network(reflections, depth=2):
 
 def predicted(reflections, windows):
     variables, apply = network(reflections)
-    found = apply(variables, jnp.asarray(windows))
-    assert found.displacement.dtype == np.float64
-    return found.displacement, found.covariance(-30.0, float)
+    prediction = apply(variables, jnp.asarray(windows))
+    assert prediction.displacement.dtype == np.float64
+    return prediction.displacement, prediction.covariance(-30.0, float)
 
 
 def residual(reflections, matrix, pseudo=True):
@@ -61,10 +61,10 @@ def residual(reflections, matrix, pseudo=True):
     )
     d, cov, other, its = map(np.asarray, (d, cov, other, its))
     assert np.abs(cov[:, 0, 1]).min() > 1e-3 * np.abs(cov).max(axis=(1, 2)).min()  # full in xy
-    wanted = matrix @ cov @ matrix.T
+    expected_covariance = matrix @ cov @ matrix.T
     return max(
         np.abs(other - d @ matrix.T).max() / np.abs(d).max(),
-        np.abs(its - wanted).max() / np.abs(wanted).max(),
+        np.abs(its - expected_covariance).max() / np.abs(expected_covariance).max(),
     )
 
 
@@ -156,9 +156,9 @@ def test_the_frame_against_numpy_by_gram_and_schmidt(reflections, depth):
     in_training = quick(frame.apply, static_argnums=2)(variables, jnp.asarray(WINDOWS), True)
     np.testing.assert_allclose(in_training.heading, heading, atol=1e-5)
     for window, x, s in zip(WINDOWS, np.asarray(heading), np.asarray(sign), strict=True):
-        wanted = numpy_frame(window, variables["params"], reflections, depth)
-        np.testing.assert_allclose(x, wanted[0], atol=1e-5)
-        np.testing.assert_allclose(s * np.array([-x[1], x[0]]), wanted[1], atol=1e-5)
+        axes = numpy_frame(window, variables["params"], reflections, depth)
+        np.testing.assert_allclose(x, axes[0], atol=1e-5)
+        np.testing.assert_allclose(s * np.array([-x[1], x[0]]), axes[1], atol=1e-5)
 
 
 def test_a_phone_at_rest_has_a_frame_and_finite_derivatives():
@@ -169,8 +169,8 @@ def test_a_phone_at_rest_has_a_frame_and_finite_derivatives():
         model = EqNIO(Stub(), reflections)
 
         def loss(variables, windows, model=model):
-            said = model.apply(variables, windows)
-            likelihood, log_std = said.normalise(said.displacement - 1, None)
+            prediction = model.apply(variables, windows)
+            likelihood, log_std = prediction.normalise(prediction.displacement - 1, None)
             return jnp.sum(likelihood + log_std)
 
         slopes = quick(jax.grad(loss, argnums=(0, 1)))(variables, jnp.asarray(still))
@@ -180,15 +180,15 @@ def test_a_phone_at_rest_has_a_frame_and_finite_derivatives():
 def test_the_likelihood_has_the_full_covariance():
     axes = np.array([[np.cos(0.4), np.sin(0.4)]])
     log_std, error = np.array([[0.3, -1.0, 0.1]]), np.array([[0.5, -0.7, 0.2]])
-    said = Prediction(jnp.zeros((1, 3)), jnp.asarray(log_std), {}, jnp.asarray(axes))
+    prediction = Prediction(jnp.zeros((1, 3)), jnp.asarray(log_std), {}, jnp.asarray(axes))
     for d in (2, 3):
-        covariance = np.asarray(said.covariance(-9.0, float))[0, :d, :d]
-        squared, logs = said.normalise(jnp.asarray(error[:, :d]), None)
-        found = float(jnp.sum(0.5 * squared + logs))
+        covariance = np.asarray(prediction.covariance(-9.0, float))[0, :d, :d]
+        squared, logs = prediction.normalise(jnp.asarray(error[:, :d]), None)
+        likelihood = float(jnp.sum(0.5 * squared + logs))
         e = error[0, :d]
-        wanted = 0.5 * e @ np.linalg.solve(covariance, e)
-        wanted += 0.5 * np.log(np.linalg.det(covariance))
-        np.testing.assert_allclose(found, wanted, rtol=1e-9)
+        expected = 0.5 * e @ np.linalg.solve(covariance, e)
+        expected += 0.5 * np.log(np.linalg.det(covariance))
+        np.testing.assert_allclose(likelihood, expected, rtol=1e-9)
 
 
 def test_the_frames_width_is_an_option_of_networks_with_a_frame():

@@ -55,8 +55,8 @@ class Whole(nn.Module):
         bank = self.param("bank", nn.initializers.normal(), (4,), jnp.float32)
         h = x + jnp.tanh(bank if memory is None else memory)[None, None]
         velocity, log_std = (linear(3, name)(h) for name in ("velocity", "log_std"))
-        seen = {"velocity": velocity, "velocity_log_std": log_std, "gate": x.mean(axis=1)}
-        return Prediction(velocity.mean(axis=1), root_mean_square(log_std), seen)
+        diagnostics = {"velocity": velocity, "velocity_log_std": log_std, "gate": x.mean(axis=1)}
+        return Prediction(velocity.mean(axis=1), root_mean_square(log_std), diagnostics)
 
     @nn.nowrap
     def constants(self, variables):
@@ -64,7 +64,7 @@ class Whole(nn.Module):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def known():
+def registration():
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(registry._MODELS, "whole", Whole)
         yield
@@ -92,43 +92,47 @@ def program(kind):
     return quick(models.Inference(network(kind)))
 
 
-def plain(kind, given, windows):
-    return jax.device_get(program(kind)(models.InferenceVariables(given, {}), windows))
+def plain(kind, weights, windows):
+    return jax.device_get(program(kind)(models.InferenceVariables(weights, {}), windows))
 
 
 @functools.cache
 def predictions(kind):
     """What the network says of every window at every heading; arrays (heading, window, ...)."""
-    said = plain(kind, variables(kind), EVERY)
-    return jax.tree.map(lambda x: x.reshape(len(TURNS), -1, *x.shape[1:]), said)
+    prediction = plain(kind, variables(kind), EVERY)
+    return jax.tree.map(lambda x: x.reshape(len(TURNS), -1, *x.shape[1:]), prediction)
 
 
 @pytest.mark.parametrize("kind, headings", [("four_headings", 4), ("canonical_frame", 5)])
 def test_a_turned_window_gives_the_displacement_turned_alike(kind, headings):
-    said = predictions(kind)
-    wanted = np.einsum("hij,bj->hbi", TURNS, said.displacement[0])
-    scale = np.abs(wanted).max()
-    assert np.abs(wanted[0, :, :2]).max() > 1e-2 * scale  # the plane is not idle
-    np.testing.assert_allclose(said.displacement[:headings], wanted[:headings], atol=2e-5 * scale)
+    prediction = predictions(kind)
+    expected = np.einsum("hij,bj->hbi", TURNS, prediction.displacement[0])
+    scale = np.abs(expected).max()
+    assert np.abs(expected[0, :, :2]).max() > 1e-2 * scale  # the plane is not idle
+    np.testing.assert_allclose(
+        prediction.displacement[:headings], expected[:headings], atol=2e-5 * scale
+    )
     if headings == 4:
-        assert np.abs(said.displacement[4] - wanted[4]).max() > 1e-3 * scale
+        assert np.abs(prediction.displacement[4] - expected[4]).max() > 1e-3 * scale
 
 
 def test_four_headings_are_the_mean_of_the_network_turned_back():
     inner = plain("none", variables("four_headings"), EVERY)
     inner = jax.tree.map(lambda x: np.float64(x).reshape(5, 3, *x.shape[1:])[:4], inner)
-    said, back = predictions("four_headings"), TURNS[:4].transpose(0, 2, 1)[:, None]
+    prediction, back = predictions("four_headings"), TURNS[:4].transpose(0, 2, 1)[:, None]
     mean = (back @ inner.displacement[..., None])[..., 0].mean(axis=0)
-    np.testing.assert_allclose(said.displacement[0], mean, atol=1e-5 * np.abs(mean).max())
+    np.testing.assert_allclose(prediction.displacement[0], mean, atol=1e-5 * np.abs(mean).max())
     variance = turned_variance(inner.log_std, back)
-    np.testing.assert_allclose(np.exp(2 * said.log_std[0]), variance.mean(axis=0), rtol=1e-4)
-    found, each = said.diagnostics, inner.diagnostics
-    np.testing.assert_array_equal(found["gate"][0], np.float32(each["gate"][0]))  # as it is
-    velocity = np.einsum("hij,hbnj->bni", back[:, 0], each["velocity"]) / 4
-    np.testing.assert_allclose(found["velocity"][0], velocity, rtol=1e-4, atol=1e-5)
-    squares = np.exp(2 * each["velocity_log_std"])
+    np.testing.assert_allclose(np.exp(2 * prediction.log_std[0]), variance.mean(axis=0), rtol=1e-4)
+    diagnostics, inner_diagnostics = prediction.diagnostics, inner.diagnostics
+    np.testing.assert_array_equal(
+        diagnostics["gate"][0], np.float32(inner_diagnostics["gate"][0])
+    )  # as it is
+    velocity = np.einsum("hij,hbnj->bni", back[:, 0], inner_diagnostics["velocity"]) / 4
+    np.testing.assert_allclose(diagnostics["velocity"][0], velocity, rtol=1e-4, atol=1e-5)
+    squares = np.exp(2 * inner_diagnostics["velocity_log_std"])
     squares = np.einsum("hij,hbnj->bni", back[:, 0] ** 2, squares) / 4
-    np.testing.assert_allclose(np.exp(2 * found["velocity_log_std"][0]), squares, rtol=1e-4)
+    np.testing.assert_allclose(np.exp(2 * diagnostics["velocity_log_std"][0]), squares, rtol=1e-4)
 
 
 def held(tilt, heading):
@@ -151,22 +155,28 @@ def test_a_device_whose_screen_faces_up_is_seen_in_the_frame_of_its_heading():
     mean = np.mean(np.exp(1j * heading), axis=1)  # x is level, whatever the tilt
     frame = about_z(np.where([True, False, False], np.angle(mean), 0.0))
     pairs = np.einsum("bji,bnkj->bnki", frame, WINDOWS.reshape(3, SAMPLES, 2, 3))
-    seen = np.float32(pairs.reshape(WINDOWS.shape))
-    seen[0] += np.asarray(constant)
-    inner = plain("none", alone, seen)
+    inner_windows = np.float32(pairs.reshape(WINDOWS.shape))
+    inner_windows[0] += np.asarray(constant)
+    inner = plain("none", alone, inner_windows)
     windows = np.concatenate([np.float32(WINDOWS), axes], axis=-1)
-    said = plain("device_heading", variables("device_heading"), windows)
-    wanted = np.einsum("bij,bj->bi", frame, inner.displacement)
-    np.testing.assert_allclose(said.displacement, wanted, atol=1e-5 * np.abs(wanted).max())
+    prediction = plain("device_heading", variables("device_heading"), windows)
+    expected = np.einsum("bij,bj->bi", frame, inner.displacement)
+    np.testing.assert_allclose(
+        prediction.displacement, expected, atol=1e-5 * np.abs(expected).max()
+    )
     squares = np.exp(2 * np.float64(inner.log_std))[..., None] * np.eye(3)
     covariance = frame @ squares @ frame.swapaxes(1, 2)
-    np.testing.assert_allclose(said.covariance(-30.0, float), covariance, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(
+        prediction.covariance(-30.0, float), covariance, rtol=1e-3, atol=1e-4
+    )
     # The whole turned by any angle, axes and all.
     for turn in TURNS:
         vectors = np.einsum("ij,bnkj->bnki", turn, windows.reshape(3, SAMPLES, 4, 3))
         turned_windows = np.float32(vectors.reshape(windows.shape))
-        found = plain("device_heading", variables("device_heading"), turned_windows).displacement
-        np.testing.assert_allclose(found[0], turn @ said.displacement[0], atol=2e-5)
+        displacement = plain(
+            "device_heading", variables("device_heading"), turned_windows
+        ).displacement
+        np.testing.assert_allclose(displacement[0], turn @ prediction.displacement[0], atol=2e-5)
 
 
 def test_the_largest_tilt_of_a_screen_that_faces_up():
@@ -176,11 +186,15 @@ def test_the_largest_tilt_of_a_screen_that_faces_up():
     windows = np.concatenate([np.float32(WINDOWS), axes], axis=-1)
     hidden = np.concatenate([np.float32(WINDOWS), 0 * axes], axis=-1)
     parts = variables("device_heading")
-    for limit, seen in ((None, [False, False, True]), (65.0, [True, False, True])):
+    for limit, expected in ((None, [False, False, True]), (65.0, [True, False, True])):
         options = {} if limit is None else {"largest_tilt": limit}
         model = models.create("whole", equivariance="device_heading", **options)
-        known, unknown = (quick(model.apply)(parts, x).displacement for x in (windows, hidden))
-        np.testing.assert_array_equal(np.any(np.abs(known - unknown) > 1e-4, axis=1), seen)
+        displacement, unknown = (
+            quick(model.apply)(parts, x).displacement for x in (windows, hidden)
+        )
+        np.testing.assert_array_equal(
+            np.any(np.abs(displacement - unknown) > 1e-4, axis=1), expected
+        )
     for limit in (0.0, 90.0):
         with pytest.raises(InputError, match="'largest_tilt' must be above 0 and below 90"):
             models.create("gnio", equivariance="device_heading", largest_tilt=limit)
@@ -197,57 +211,61 @@ def test_no_device_axes_make_a_derivative_infinite():
     @quick
     @jax.grad
     def slope(windows):
-        said = models.Inference(network("device_heading"))(frozen, windows)
-        return said.displacement.sum() + said.covariance(-30.0, jnp.float32).sum()
+        prediction = models.Inference(network("device_heading"))(frozen, windows)
+        return prediction.displacement.sum() + prediction.covariance(-30.0, jnp.float32).sum()
 
-    found = slope(windows)
-    assert np.isfinite(found).all() and np.abs(found[..., :6]).max() > 0
+    slopes = slope(windows)
+    assert np.isfinite(slopes).all() and np.abs(slopes[..., :6]).max() > 0
 
 
 def test_the_network_sees_the_window_in_its_frame():
-    own = {part: dict(tree) for part, tree in variables("canonical_frame").items()}
-    of_frame = {part: tree.pop("frame") for part, tree in own.items()}
+    inner_variables = {part: dict(tree) for part, tree in variables("canonical_frame").items()}
+    of_frame = {part: tree.pop("frame") for part, tree in inner_variables.items()}
     find = quick(equivariance.FrameNetwork().apply, static_argnums=2)
     cosine, sine = np.asarray(find(of_frame, EVERY, False)).T
     np.testing.assert_allclose(cosine**2 + sine**2, 1.0, rtol=1e-6)
     frame = about_z(np.arctan2(sine, cosine))
     pairs = EVERY.reshape(-1, SAMPLES, 2, 3)
-    seen = np.einsum("bji,bnkj->bnki", frame, pairs).reshape(EVERY.shape)
-    inner = plain("none", own, np.float32(seen))
-    said = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), predictions("canonical_frame"))
-    wanted = np.einsum("bij,bj->bi", frame, inner.displacement)
-    np.testing.assert_allclose(said.displacement, wanted, atol=1e-4 * np.abs(wanted).max())
+    inner_windows = np.einsum("bji,bnkj->bnki", frame, pairs).reshape(EVERY.shape)
+    inner = plain("none", inner_variables, np.float32(inner_windows))
+    prediction = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), predictions("canonical_frame"))
+    expected = np.einsum("bij,bj->bi", frame, inner.displacement)
+    np.testing.assert_allclose(
+        prediction.displacement, expected, atol=1e-4 * np.abs(expected).max()
+    )
     squares = np.exp(2 * np.float64(inner.log_std))[..., None] * np.eye(3)
     covariance = frame @ squares @ frame.swapaxes(1, 2)  # full in the plane
-    np.testing.assert_allclose(said.covariance(-30.0, float), covariance, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(
+        prediction.covariance(-30.0, float), covariance, rtol=1e-3, atol=1e-4
+    )
     # The loss of CTIN learns from the velocities.
-    mean = said.diagnostics["velocity"].mean(axis=1)
-    np.testing.assert_allclose(mean, said.displacement, atol=1e-5)
+    mean = prediction.diagnostics["velocity"].mean(axis=1)
+    np.testing.assert_allclose(mean, prediction.displacement, atol=1e-5)
     variance = turned_variance(np.float64(inner.diagnostics["velocity_log_std"]), frame[:, None])
-    found = np.exp(2 * said.diagnostics["velocity_log_std"])
-    np.testing.assert_allclose(found, variance, rtol=1e-3)
+    predicted_variance = np.exp(2 * prediction.diagnostics["velocity_log_std"])
+    np.testing.assert_allclose(predicted_variance, variance, rtol=1e-3)
 
 
 @pytest.mark.parametrize("kind", ["four_headings", "canonical_frame"])
 def test_frozen_it_gives_the_same_numbers_by_its_constants(kind):
     frozen = models.inference_variables(network(kind), variables(kind))
-    found, wanted = program(kind)(frozen, EVERY), predictions(kind)
-    for ours, theirs in zip(found[:2], wanted[:2], strict=True):
+    prediction, expected = program(kind)(frozen, EVERY), predictions(kind)
+    for ours, theirs in zip(prediction[:2], expected[:2], strict=True):
         np.testing.assert_allclose(ours, theirs.reshape(ours.shape), rtol=1e-3, atol=1e-4)
     other = frozen._replace(constants={"memory": frozen.constants["memory"] + 1})
-    assert np.abs(program(kind)(other, EVERY).displacement - found.displacement).max() > 1e-2
+    assert np.abs(program(kind)(other, EVERY).displacement - prediction.displacement).max() > 1e-2
     if kind == "canonical_frame":
         assert not np.any(frozen.variables["batch_stats"]["frame"]["bn1"]["mean"])
     assert hash(models.Inference(network(kind))) == hash(models.Inference(network(kind)))
 
 
 def test_training_applies_the_network_once():
-    given = variables("four_headings")
+    weights = variables("four_headings")
 
     def train(kind):
         key = {"dropout": jax.random.key(2)}
         options = {"train": True, "mutable": ["batch_stats"], "rngs": key}
-        return quick(lambda windows: network(kind).apply(given, windows, **options))(EVERY)
+        return quick(lambda windows: network(kind).apply(weights, windows, **options))(EVERY)
 
     jax.tree.map(np.testing.assert_array_equal, train("four_headings"), train("none"))
 
@@ -272,9 +290,9 @@ def test_turned_variances_against_covariances():
     heading = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     heading[3:] = [[1, 0], [0, 1], [-1, 0]]
     log_std = np.random.default_rng(2).normal(size=(6, 3))
-    wanted = turned_variance(log_std, about_z(angles))
-    found = equivariance.turn_log_std(jnp.asarray(log_std), jnp.asarray(heading))
-    np.testing.assert_allclose(np.exp(2 * found), wanted, rtol=1e-6)
+    variance = turned_variance(log_std, about_z(angles))
+    turned_log_std = equivariance.turn_log_std(jnp.asarray(log_std), jnp.asarray(heading))
+    np.testing.assert_allclose(np.exp(2 * turned_log_std), variance, rtol=1e-6)
     derivative = quick(jax.jacrev(equivariance.turn_log_std, (0, 1)))
     for far in ([40.0, -40.0, 0.0], [-40.0, 40.0, 0.0]):
         slopes = derivative(np.tile(np.float32(far), (6, 1)), np.float32(heading))
@@ -284,16 +302,16 @@ def test_turned_variances_against_covariances():
 def test_a_window_without_horizontal_vectors_has_a_heading_and_finite_derivatives():
     still = np.zeros((2, SAMPLES, 6), np.float32)
     still[..., 2], still[1, :, 5] = 9.81, 1.0
-    given = {part: tree["frame"] for part, tree in variables("canonical_frame").items()}
+    frame_variables = {part: tree["frame"] for part, tree in variables("canonical_frame").items()}
 
     @quick
     @functools.partial(jax.value_and_grad, argnums=(0, 1), has_aux=True)
-    def heading(given, windows):
-        found = equivariance.FrameNetwork().apply(given, windows, False)
-        return found.sum(), found
+    def heading(frame_variables, windows):
+        directions = equivariance.FrameNetwork().apply(frame_variables, windows, False)
+        return directions.sum(), directions
 
-    (_, found), slopes = heading(given, still)
-    np.testing.assert_array_equal(found, [[1, 0], [1, 0]])
+    (_, directions), slopes = heading(frame_variables, still)
+    np.testing.assert_array_equal(directions, [[1, 0], [1, 0]])
     assert all(np.isfinite(slope).all() for slope in jax.tree.leaves(slopes))
     vectors = jnp.float32([[3.0, -4.0], [0.0, 0.0]])
     lengths, slope = jax.vjp(equivariance.length, vectors)

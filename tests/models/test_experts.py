@@ -24,7 +24,7 @@ def test_the_mixture_against_numpy(monkeypatch):
     model = models.create("experts", width=3, experts=3)
     windows = RNG.normal([0, 0, 9.8, 0, 0, 0], 1.0, (2, 40, 6)).astype(np.float32)
     variables = drawn(models.variable_shapes(model, 40))
-    found = jax.device_get(quick(model.apply)(variables, jnp.asarray(windows)))
+    prediction = jax.device_get(quick(model.apply)(variables, jnp.asarray(windows)))
     encoder = quick(lambda v, x: resnet.ResNet18(3).apply(v, x, False))
     q, _ = float64(variables)
     for number, x in enumerate(windows.astype(float)):
@@ -36,7 +36,7 @@ def test_the_mixture_against_numpy(monkeypatch):
                 power[f, sensor] = np.log(abs(line) ** 2 + 1e-6)
         hidden = relu(linear(power.ravel(), q["router_hidden"]))
         shares = softmax(linear(hidden, q["router"]))
-        np.testing.assert_allclose(found.diagnostics["router"][number], shares, atol=1e-4)
+        np.testing.assert_allclose(prediction.diagnostics["router"][number], shares, atol=1e-4)
         d, u = [], []
         for k in (1, 2, 3):
             part = {
@@ -48,8 +48,10 @@ def test_the_mixture_against_numpy(monkeypatch):
         d, u = np.array(d), np.array(u)
         mean = shares @ d
         second = shares @ (np.exp(2 * u) + d**2)
-        np.testing.assert_allclose(found.displacement[number], mean, atol=2e-4)
-        np.testing.assert_allclose(np.exp(2 * found.log_std[number]), second - mean**2, rtol=2e-3)
+        np.testing.assert_allclose(prediction.displacement[number], mean, atol=2e-4)
+        np.testing.assert_allclose(
+            np.exp(2 * prediction.log_std[number]), second - mean**2, rtol=2e-3
+        )
     jax.clear_caches()
 
 
@@ -58,12 +60,12 @@ def test_what_the_router_sees_does_not_turn_and_short_windows_are_filled_up():
     turn, _ = np.linalg.qr(RNG.standard_normal((3, 3)))
     turned = (windows.reshape(1, 20, 2, 3) @ turn).reshape(1, 20, 6)
     see = quick(experts.spectrum)
-    seen = see(jnp.asarray(windows))
-    np.testing.assert_allclose(see(jnp.asarray(turned)), seen, atol=1e-5)
-    assert seen.shape == (1, 32) and not np.any(seen[0, 22:])
+    spectrum = see(jnp.asarray(windows))
+    np.testing.assert_allclose(see(jnp.asarray(turned)), spectrum, atol=1e-5)
+    assert spectrum.shape == (1, 32) and not np.any(spectrum[0, 22:])
     sizes = np.linalg.norm(windows[0].reshape(20, 2, 3), axis=-1)
     power = np.abs(np.fft.rfft(sizes, axis=0) / 20) ** 2
-    np.testing.assert_allclose(seen[0, :22], np.log(power + 1e-6).ravel(), atol=1e-4)
+    np.testing.assert_allclose(spectrum[0, :22], np.log(power + 1e-6).ravel(), atol=1e-4)
 
 
 def test_the_loss_has_the_balance_of_the_shares():
@@ -74,5 +76,5 @@ def test_the_loss_has_the_balance_of_the_shares():
     prediction = Prediction(zeros, zeros, {"router": jnp.asarray(shares)})
     windows = Windows(jnp.zeros((2, 5, 6)), zeros, jnp.zeros((2, 5, 3)))
     config = LossConfig(balance_weight=3.0)
-    found = losses(prediction, windows, config, loss_stage(config, 0, 1)).total
-    np.testing.assert_allclose(found, 3 * balance, rtol=1e-6)
+    loss = losses(prediction, windows, config, loss_stage(config, 0, 1)).total
+    np.testing.assert_allclose(loss, 3 * balance, rtol=1e-6)

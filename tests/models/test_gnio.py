@@ -57,17 +57,17 @@ def test_a_new_head_predicts_that_it_stands_still():
 
 
 def test_first_parameters_are_those_of_flax_and_another_seed_compiles_nothing(caplog):
-    found = models.initialise(Tiny(), jax.random.key(0), 64)
+    variables = models.initialise(Tiny(), jax.random.key(0), 64)
     with jax.log_compiles(), caplog.at_level("WARNING"):
         other = models.initialise(Tiny(), jax.random.key(1), 64)
     assert not [line for line in caplog.messages if "Compiling" in line]
-    of = lambda found: found["params"]["encoder"]["kernel"]  # noqa: E731
-    assert not np.array_equal(of(found), of(other))
-    wanted = quick(Tiny().init)(jax.random.key(0), jnp.zeros((1, 64, 6), jnp.float32))
-    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), found, wanted)
+    of = lambda variables: variables["params"]["encoder"]["kernel"]  # noqa: E731
+    assert not np.array_equal(of(variables), of(other))
+    expected = quick(Tiny().init)(jax.random.key(0), jnp.zeros((1, 64, 6), jnp.float32))
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), variables, expected)
     shapes = models.variable_shapes(Tiny(), 64)
-    assert jax.tree.structure(shapes) == jax.tree.structure(found)
-    for shape, leaf in zip(*map(jax.tree.leaves, (shapes, found)), strict=True):
+    assert jax.tree.structure(shapes) == jax.tree.structure(variables)
+    for shape, leaf in zip(*map(jax.tree.leaves, (shapes, variables)), strict=True):
         assert (shape.shape, shape.dtype) == (leaf.shape, leaf.dtype)
 
 
@@ -98,11 +98,13 @@ def test_forward_against_numpy():
     displacement, log_std, gate, attention = numpy_forward(variables, windows)
     # The bank is projected once, when the network is made ready.
     assert models.inference_variables(model, variables).constants.keys() == {"memory"}
-    for found in predicted(model, variables, windows):
-        np.testing.assert_allclose(found.displacement, displacement, rtol=2e-4, atol=2e-5)
-        np.testing.assert_allclose(found.log_std, log_std, rtol=2e-4, atol=2e-5)
-        np.testing.assert_allclose(found.diagnostics["gate"], gate, rtol=2e-4, atol=2e-5)
-        np.testing.assert_allclose(found.diagnostics["attention"], attention, rtol=2e-4, atol=2e-6)
+    for prediction in predicted(model, variables, windows):
+        np.testing.assert_allclose(prediction.displacement, displacement, rtol=2e-4, atol=2e-5)
+        np.testing.assert_allclose(prediction.log_std, log_std, rtol=2e-4, atol=2e-5)
+        np.testing.assert_allclose(prediction.diagnostics["gate"], gate, rtol=2e-4, atol=2e-5)
+        np.testing.assert_allclose(
+            prediction.diagnostics["attention"], attention, rtol=2e-4, atol=2e-6
+        )
 
 
 SCALES = {
@@ -124,11 +126,11 @@ def test_gates_and_scales():
         shape = jax.eval_shape(head.init, jax.random.key(1), h)
         draw = lambda leaf: 0.3 * random.standard_normal(leaf.shape).astype(leaf.dtype)  # noqa: E731
         variables = jax.tree.map(draw, shape)
-        displacement, seen = head.apply(variables, h)
+        displacement, diagnostics = head.apply(variables, h)
         s = SCALES[scale](linear(np.float64(h), variables["params"]["scale"]))
         g = GATES[gate](linear(np.float64(h), variables["params"]["gate"]))
         np.testing.assert_allclose(displacement, s * g, rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(seen["gate"], g, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(diagnostics["gate"], g, rtol=1e-4, atol=1e-5)
 
 
 def test_gradient_is_finite_where_everything_is_zero():
@@ -138,8 +140,8 @@ def test_gradient_is_finite_where_everything_is_zero():
     shape = jax.eval_shape(lambda key: (bank.init(key, h), head.init(key, h)), jax.random.key(0))
     zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
 
-    def displacement(given, h):
-        return jnp.sum(head.apply(given[1], h + bank.apply(given[0], h)[0])[0])
+    def displacement(variables, h):
+        return jnp.sum(head.apply(variables[1], h + bank.apply(variables[0], h)[0])[0])
 
     for leaf in jax.tree.leaves(quick(jax.grad(displacement, (0, 1)))(zero, h)):
         assert np.isfinite(leaf).all()

@@ -89,19 +89,21 @@ def numpy_forward(variables, windows, heads):
             channels = np.vstack(parts)
         particles = p["particles"]
         content = np.zeros((len(particles), t))
-        each = 2 * (t // (2 * particles.shape[1]))
+        size = 2 * (t // (2 * particles.shape[1]))
         for layer in (1, 2):
             q = p[f"decoder_{layer}"]
-            rows = [[wave for c in row for wave in waves(2 * np.pi * c, each)] for row in particles]
+            rows = [[wave for c in row for wave in waves(2 * np.pi * c, size)] for row in particles]
             located = np.array([row + [0] * (t - len(row)) for row in rows])
             where = perceptron(located, p["particle_positions"])
             among = among_particles(content, where, q["self"], heads)
             content = layer_norm(content + among, q["self_norm"])
-            found = []
+            contents = []
             for name, rows in (("accel", slice(0, 9)), ("gyro", slice(9, 18))):
-                given = np.hstack([content, where]), np.hstack([x[rows], e[rows]]), x[rows]
-                found.append(layer_norm(content + attention(*given, q[name]), q[f"{name}_norm"]))
-            content = perceptron(np.hstack(found), q["fusion"])
+                inputs = np.hstack([content, where]), np.hstack([x[rows], e[rows]]), x[rows]
+                contents.append(
+                    layer_norm(content + attention(*inputs, q[name]), q[f"{name}_norm"])
+                )
+            content = perceptron(np.hstack(contents), q["fusion"])
             content = layer_norm(content + perceptron(content, q["ffn"]), q["ffn_norm"])
             particles = particles + perceptron(content, p["refinement"])
         scores = [perceptron(content[:, feature], p["scores"]["mlp"]) for feature in range(t)]
@@ -118,10 +120,10 @@ def test_forward_against_numpy():
     # The windows are told apart.
     assert np.ptp(velocity, axis=0).min() > 0.02 and np.ptp(weights, axis=0).max() > 1e-3
     constant = variables["batch_stats"]["uncertainty"]["log_std"]
-    for found in predicted(model, variables, windows):
-        said = found.diagnostics
-        np.testing.assert_allclose(said["particles"], particles, rtol=1e-3, atol=2e-4)
-        np.testing.assert_allclose(said["particle_weights"], weights, rtol=1e-3, atol=1e-5)
-        wanted = np.pad(velocity, ((0, 0), (0, 1)))
-        np.testing.assert_allclose(found.displacement, wanted, rtol=1e-3, atol=2e-4)
-        np.testing.assert_array_equal(found.log_std, np.stack([constant, constant]))
+    for prediction in predicted(model, variables, windows):
+        diagnostics = prediction.diagnostics
+        np.testing.assert_allclose(diagnostics["particles"], particles, rtol=1e-3, atol=2e-4)
+        np.testing.assert_allclose(diagnostics["particle_weights"], weights, rtol=1e-3, atol=1e-5)
+        displacement = np.pad(velocity, ((0, 0), (0, 1)))
+        np.testing.assert_allclose(prediction.displacement, displacement, rtol=1e-3, atol=2e-4)
+        np.testing.assert_array_equal(prediction.log_std, np.stack([constant, constant]))

@@ -21,15 +21,15 @@ WINDOWS = np.random.default_rng(1).standard_normal((2, 9, 6)).astype(np.float32)
 def test_forward_against_numpy():
     options = {"width": 4, "angle": "turn"}
     variables = drawn(shapes("ionet", 9, **options))
-    (q, _), wanted = float64(variables), []
+    (q, _), displacements = float64(variables), []
     for x in WINDOWS.astype(float):
         x, last = both_ways(x, q["lstm1"], "lstm")
         x, last = both_ways(x, q["lstm2"], "lstm")
         length, angle = linear(last, q["displacement"])
-        wanted.append([length * np.cos(angle), length * np.sin(angle), 0])
-    for found in predicted(models.create("ionet", **options), variables, WINDOWS):
-        np.testing.assert_allclose(found.displacement, wanted, atol=1e-5)
-        assert set(found.diagnostics) == {"polar_turn"}
+        displacements.append([length * np.cos(angle), length * np.sin(angle), 0])
+    for prediction in predicted(models.create("ionet", **options), variables, WINDOWS):
+        np.testing.assert_allclose(prediction.displacement, displacements, atol=1e-5)
+        assert set(prediction.diagnostics) == {"polar_turn"}
 
 
 @pytest.mark.parametrize("cell", ["lstm", "gru"])
@@ -52,9 +52,9 @@ def test_recurrent_layers_are_pytorchs(cell):
     apply = quick(Bidirectional(5, cell).apply)
     outputs, last = apply({"params": params}, WINDOWS)
     with torch.no_grad():
-        wanted, state = theirs(torch.from_numpy(WINDOWS))
+        expected, state = theirs(torch.from_numpy(WINDOWS))
     final = state[0] if cell == "lstm" else state  # (direction, batch, units)
-    np.testing.assert_allclose(outputs, wanted.numpy(), atol=1e-5)
+    np.testing.assert_allclose(outputs, expected.numpy(), atol=1e-5)
     np.testing.assert_allclose(last, np.concatenate(final.numpy(), axis=-1), atol=1e-5)
 
 
@@ -84,13 +84,13 @@ def test_the_loss_is_that_of_length_and_wrapped_angle_where_there_is_motion():
     angle = np.radians([179.0, 30.0])
     truth = np.array([[2 * np.cos(angle[0]), 2 * np.sin(angle[0]), 5.0], [0.05, 0.0, 0.0]])
     polar = np.array([[2.5, np.radians(-179.0)], [0.15, 3.0]])
-    wanted = np.mean([0.5**2 + 2 * np.radians(2.0) ** 2, 0.1**2])
-    np.testing.assert_allclose(polar_loss(polar, truth), wanted, rtol=1e-4)
+    expected = np.mean([0.5**2 + 2 * np.radians(2.0) ** 2, 0.1**2])
+    np.testing.assert_allclose(polar_loss(polar, truth), expected, rtol=1e-4)
     # A turn is the angle from the first to the last tenth of the window.
     steps = np.zeros((1, 10, 3))
     steps[0, 0], steps[0, -1] = [0.1, 0, 0], [0, 0.1, 0]
-    found = polar_loss(np.array([[0.0, 1.0]]), np.zeros((1, 3)), steps, turn=True)
-    np.testing.assert_allclose(found, 2 * (1 - np.pi / 2) ** 2, rtol=1e-4)
+    loss = polar_loss(np.array([[0.0, 1.0]]), np.zeros((1, 3)), steps, turn=True)
+    np.testing.assert_allclose(loss, 2 * (1 - np.pi / 2) ** 2, rtol=1e-4)
 
 
 def test_at_rest_the_gradient_is_finite():
@@ -99,10 +99,10 @@ def test_at_rest_the_gradient_is_finite():
     still[..., 2] = 9.81
 
     def loss(params):
-        found = models.create("ionet", width=4).apply(
+        prediction = models.create("ionet", width=4).apply(
             {**variables, "params": params}, jnp.asarray(still)
         )
-        return polar_loss(found.diagnostics["polar"], jnp.zeros((1, 3)))
+        return polar_loss(prediction.diagnostics["polar"], jnp.zeros((1, 3)))
 
     gradient = quick(jax.grad(loss))(variables["params"])
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))

@@ -45,7 +45,7 @@ def test_forward_against_numpy(monkeypatch):
     model = models.create("ionext", width=6, output_dim=2)
     variables = drawn(models.variable_shapes(model, 28))
     windows = np.random.default_rng(1).standard_normal((2, 28, 6)).astype(np.float32)
-    (q, s), wanted = float64(variables), []
+    (q, s), displacements = float64(variables), []
     for x in windows.astype(float):
         x = batch_norm(strided(x, q["stem"], 4), q["stem_norm"], s["stem_norm"])
         for stage in range(4):
@@ -55,8 +55,8 @@ def test_forward_against_numpy(monkeypatch):
             name = f"stage{stage + 1}_block1"
             x = block(x, q[name], s[name])
         h = batch_norm(x, q["last_norm"], s["last_norm"]).mean(0)
-        wanted.append([*linear(h, q["displacement"]), 0])
-    size = np.abs(wanted).max()
-    for found in predicted(model, variables, windows, False):
-        np.testing.assert_allclose(found.displacement, wanted, atol=1e-5 * max(size, 1))
+        displacements.append([*linear(h, q["displacement"]), 0])
+    size = np.abs(displacements).max()
+    for prediction in predicted(model, variables, windows, False):
+        np.testing.assert_allclose(prediction.displacement, displacements, atol=1e-5 * max(size, 1))
     jax.clear_caches()  # of a network with fewer blocks

@@ -31,9 +31,9 @@ def test_attention_and_its_gradient_against_the_definition(keys, causal):
         return output, pull_back(jnp.asarray(weight))
 
     ours = functools.partial(attend, mask=None if mask is None else jnp.asarray(mask))
-    both = quick(lambda: (with_gradient(ours), with_gradient(definition)))
-    (found, gradient), (wanted, of_wanted) = both()
-    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
+    program = quick(lambda: (with_gradient(ours), with_gradient(definition)))
+    (attention, gradient), (expected, of_wanted) = program()
+    np.testing.assert_allclose(attention, expected, rtol=1e-5, atol=1e-6)
     for one, other in zip(gradient, of_wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
 

@@ -83,10 +83,9 @@ def test_steps_predict_what_the_whole_recording_predicts_at_once(name, options):
     memory, rows = stepwise(net, *signals)
     first = signals[2][0]
     at_once = whole(net, in_frame(*signals, np.arctan2(first[1, 0], first[0, 0])))
-    for k, (prediction, _) in enumerate(rows):
-        for step, row in zip(jax.tree.leaves(prediction), jax.tree.leaves(at_once), strict=True):
-            np.testing.assert_allclose(step, row[0, k], atol=1e-5, rtol=1e-5)
-    spread = np.ptp([prediction.displacement for prediction, _ in rows], axis=0)
+    predictions = jax.tree.map(lambda *leaves: np.stack(leaves)[None], *(row[0] for row in rows))
+    jax.tree.map(lambda steps, row: assert_close(steps, row, 1e-5), predictions, at_once)
+    spread = np.ptp(predictions.displacement[0], axis=0)
     assert (spread > 1e-4).all() and int(memory.intervals) == INTERVALS
 
 
@@ -217,7 +216,7 @@ def test_four_memories_are_the_mean_over_four_headings(name, options):
 def test_an_error_that_is_constant_in_the_frame_of_the_memory_cancels_at_four_headings():
     """An output that is off by the same vector everywhere, e.g. by the bias of the last layer."""
     signals = in_frame(*walk(), 0.0)
-    for equivariance, left in (("none", 1.0), ("four_headings", 0.0)):
+    for equivariance, share in (("none", 1.0), ("four_headings", 0.0)):
         net = network("gru", equivariance=equivariance)
         params = dict(net.variables.variables["params"])
         layer = params["head"]["displacement"]
@@ -227,8 +226,8 @@ def test_an_error_that_is_constant_in_the_frame_of_the_memory_cancels_at_four_he
         variables = {**net.variables.variables, "params": params}
         shifted = net._replace(variables=net.variables._replace(variables=variables))
         change = whole(shifted, signals).displacement - whole(net, signals).displacement
-        wanted = np.broadcast_to(error * [left, left, 1.0], change.shape)
-        np.testing.assert_allclose(change, wanted, atol=1e-5)
+        expected = np.broadcast_to(error * [share, share, 1.0], change.shape)
+        np.testing.assert_allclose(change, expected, atol=1e-5)
 
 
 def test_training_has_one_of_four_memories():

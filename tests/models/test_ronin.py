@@ -52,10 +52,10 @@ def test_forward_against_numpy():
     variables = drawn(models.variable_shapes(model, 70))
     params, statistics = float64(variables)
     assert statistics.keys() == {"uncertainty"}
-    wanted = [displacement(window.astype(float), params) for window in windows]
-    assert np.abs(wanted).max() > 0.05
+    displacements = [displacement(window.astype(float), params) for window in windows]
+    assert np.abs(displacements).max() > 0.05
     for prediction in predicted(model, variables, windows):
-        np.testing.assert_allclose(prediction.displacement[:, :2], wanted, atol=1e-5)
+        np.testing.assert_allclose(prediction.displacement[:, :2], displacements, atol=1e-5)
         np.testing.assert_array_equal(prediction.displacement[:, 2], 0)
 
 
@@ -67,11 +67,11 @@ def test_at_rest_the_gradient_is_finite_and_training_is_inference_but_for_dropou
     still[..., 2] = gravity
 
     def total(params, windows):
-        both = [
+        outputs = [
             model.apply({**variables, "params": params}, windows, train=train, **more)[0]
             for train, more in ((True, {"mutable": ["batch_stats"]}), (False, {"mutable": []}))
         ]
-        (trained, _, *_), (inferred, _, *_) = both
+        (trained, _, *_), (inferred, _, *_) = outputs
         return jnp.sum(trained**2), (trained, inferred)
 
     slopes, (trained, inferred) = quick(jax.grad(total, (0, 1), has_aux=True))(

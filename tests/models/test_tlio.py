@@ -30,10 +30,12 @@ def test_ronins_displacement_is_that_of_tlio_with_the_same_weights():
     constant = np.array([-1.0, -2.0, -3.0], np.float32)
     variables["batch_stats"]["uncertainty"] = {"log_std": constant}
     model = models.create("ronin_resnet", output_dim=2)
-    wanted = recorded["net_displacement"] * [1, 1, 0]
-    for found in predicted(model, variables, np.concatenate([accel, gyro], axis=-1)):
-        np.testing.assert_allclose(found.displacement, wanted, atol=1e-5)
-        np.testing.assert_array_equal(found.log_std, np.tile(constant, (len(wanted), 1)))
+    displacements = recorded["net_displacement"] * [1, 1, 0]
+    for prediction in predicted(model, variables, np.concatenate([accel, gyro], axis=-1)):
+        np.testing.assert_allclose(prediction.displacement, displacements, atol=1e-5)
+        np.testing.assert_array_equal(
+            prediction.log_std, np.tile(constant, (len(displacements), 1))
+        )
 
 
 def test_a_new_head_predicts_next_to_nothing():

@@ -54,9 +54,9 @@ def test_a_block_against_numpy(block, oracle):
     network = block()
     shapes = jax.eval_shape(lambda key, x: network.init(key, x, False), jax.random.key(0), SIGNAL)
     variables = drawn(shapes)
-    found = quick(lambda v, x: network.apply(v, x, False))(variables, jnp.asarray(SIGNAL))
-    wanted = [oracle(x, *float64(variables)) for x in SIGNAL.astype(float)]
-    np.testing.assert_allclose(found, wanted, atol=1e-5)
+    outputs = quick(lambda v, x: network.apply(v, x, False))(variables, jnp.asarray(SIGNAL))
+    expected = [oracle(x, *float64(variables)) for x in SIGNAL.astype(float)]
+    np.testing.assert_allclose(outputs, expected, atol=1e-5)
 
 
 def test_the_folded_block_gives_the_same_by_one_convolution():
@@ -88,7 +88,7 @@ def test_shrinkage_weighs_three_bases_that_reconstruct_exactly():
     layer = trunk.Shrinkage()
     shapes = jax.eval_shape(layer.init, jax.random.key(0), SIGNAL)
     variables = drawn({"batch_stats": {}, **shapes})
-    found, shares = quick(layer.apply)(variables, jnp.asarray(SIGNAL))
+    outputs, shares = quick(layer.apply)(variables, jnp.asarray(SIGNAL))
     (q, _), root = float64(variables), np.sqrt(3)
     filters = [np.array([0.5, 0.5]), np.array([1 + root, 3 + root, 3 - root, 1 - root]) / 8]
     # Daubechies 3 is the one of six with three vanishing moments: its sums are checked below.
@@ -98,7 +98,7 @@ def test_shrinkage_weighs_three_bases_that_reconstruct_exactly():
         np.testing.assert_allclose(2 * taps @ taps, 1, atol=1e-12)
         for power in range(moments):
             np.testing.assert_allclose(high @ np.arange(len(taps)) ** power, 0, atol=1e-12)
-    for x, said, p in zip(SIGNAL.astype(float), found, shares, strict=True):
+    for x, output, p in zip(SIGNAL.astype(float), outputs, shares, strict=True):
         mean, level = x.mean(0), np.log(x.var(0) + 1e-4)
         rough = np.log(np.mean(np.diff(x, axis=0) ** 2, axis=0) + 1e-4)
         hidden = relu(linear(np.concatenate([mean, level, rough]), q["hidden"]))
@@ -106,6 +106,6 @@ def test_shrinkage_weighs_three_bases_that_reconstruct_exactly():
         np.testing.assert_allclose(p, weights, atol=1e-5)
         limits = np.logaddexp(0, q["thresholds"])
         parts = [shrunk(x, t, h) for t, h in zip(limits, filters, strict=True)]
-        wanted = sum(w * part for w, part in zip(weights, parts, strict=True))
-        np.testing.assert_allclose(said, wanted, atol=1e-5)
+        expected = sum(w * part for w, part in zip(weights, parts, strict=True))
+        np.testing.assert_allclose(output, expected, atol=1e-5)
         np.testing.assert_allclose(shrunk(x, np.zeros((3, 4)), filters[2]), x, atol=1e-9)

@@ -43,8 +43,11 @@ def test_a_published_network_has_its_corrector_within(runs, tmp_path):
     folder.write_published(tmp_path / "named.zip", network, card, "# named")
     named = read_network(tmp_path / "named.zip")
     assert named.config.filter.corrector == "imu"  # no folder of this machine
-    found = networks.load_corrector(named.config.filter, 50.0, named)
-    kernels = (tree["gru1"]["input"]["kernel"] for tree in (found.variables["params"], corrector))
+    loaded_corrector = networks.load_corrector(named.config.filter, 50.0, named)
+    kernels = (
+        tree["gru1"]["input"]["kernel"]
+        for tree in (loaded_corrector.variables["params"], corrector)
+    )
     np.testing.assert_array_equal(*kernels)
     # The network itself is unchanged.
     assert named.variables.keys() == read_network(behind).variables.keys()

@@ -21,7 +21,7 @@ FACTS = Card("walk", "tiny", "simulated walks", "CC0", 1, 0, "", "a test", {})
 
 @pytest.fixture
 def run(tmp_path):
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig("tiny"), seed=7)
         yield tiny_run.save(tmp_path / "trained" / "walk", config)
 
@@ -65,14 +65,14 @@ def test_names_are_those_of_folders_and_zips(networks, run, monkeypatch, tmp_pat
 def test_of_two_networks_of_one_name_the_first_is_found(tmp_path, monkeypatch):
     """The name of a network of gnio-jax stands for no other."""
     folders = [tmp_path / name for name in ("shipped", "first", "second")]
-    for place, names in zip(folders, ("a", "ab", "abc"), strict=True):
+    for directory, names in zip(folders, ("a", "ab", "abc"), strict=True):
         for name in names:
-            (place / name).mkdir(parents=True)
+            (directory / name).mkdir(parents=True)
             for file in (folder.CONFIG, folder.WEIGHTS):
-                (place / name / file).touch()
+                (directory / name / file).touch()
     monkeypatch.setattr(find, "SHIPPED", folders[0])
     monkeypatch.setenv("GNIO_WEIGHTS", os.pathsep.join(map(str, folders[1:])))
-    expected = {name: place / name for name, place in zip("abc", folders, strict=True)}
+    expected = {name: directory / name for name, directory in zip("abc", folders, strict=True)}
     assert find.list_networks() == expected
 
 

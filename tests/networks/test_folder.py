@@ -28,7 +28,7 @@ FACTS = Card("walk", "tiny", "simulated walks", "CC0", 1, 0, "", "a test", {})
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run of the smallest network."""
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         yield tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", tiny_run.CONFIGURED)
 
 
@@ -61,9 +61,9 @@ def facts_of(package):
 def with_facts(package, **changes):
     """The card changed by one who knows how its digest is made."""
     facts = {**facts_of(package), **changes}
-    rest = {name: value for name, value in facts.items() if name != "sha256"}
-    digest = hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
-    head = yaml.safe_dump({**rest, "sha256": digest}, sort_keys=False)
+    remaining_facts = {name: value for name, value in facts.items() if name != "sha256"}
+    digest = hashlib.sha256(json.dumps(remaining_facts, sort_keys=True).encode()).hexdigest()
+    head = yaml.safe_dump({**remaining_facts, "sha256": digest}, sort_keys=False)
     (package / CARD).write_text(f"---\n{head}---\n\n# walk\n", encoding="utf-8")
 
 
@@ -94,8 +94,8 @@ def test_other_programs_read_the_files(run, published):
     entry = json.loads(content[8 : 8 + length])["params/encoder/kernel"]
     assert entry["dtype"] == "F32"
     kernel = np.frombuffer(content[8 + length :][slice(*entry["data_offsets"])], np.float32)
-    own = read_network(run).variables["params"]["encoder"]["kernel"]
-    np.testing.assert_array_equal(kernel.reshape(entry["shape"]), own)
+    expected_kernel = read_network(run).variables["params"]["encoder"]["kernel"]
+    np.testing.assert_array_equal(kernel.reshape(entry["shape"]), expected_kernel)
     files = facts_of(package)["files"]
     for name in (CONFIG, WEIGHTS):
         content = (package / name).read_bytes()
@@ -116,11 +116,11 @@ def test_a_run_has_its_position_and_the_filter_that_was_trained(run, tmp_path):
     first = (tmp_path / WEIGHTS).read_bytes()
     trained = changed(noise={"gyro_density": 0.5, "correlation": None}, start={"velocity": 0.3})
     folder.write_weights(tmp_path, network.variables, 4, 52, trained)
-    found = read_network(tmp_path)
-    assert found.config == dataclasses.replace(tiny_run.CONFIGURED, filter=trained)
-    assert (found.epoch, found.step) == (4, 52)
-    jax.tree.map(np.testing.assert_array_equal, found.variables, network.variables)
-    assert folder.read_settings(tmp_path).config == found.config
+    stored_network = read_network(tmp_path)
+    assert stored_network.config == dataclasses.replace(tiny_run.CONFIGURED, filter=trained)
+    assert (stored_network.epoch, stored_network.step) == (4, 52)
+    jax.tree.map(np.testing.assert_array_equal, stored_network.variables, network.variables)
+    assert folder.read_settings(tmp_path).config == stored_network.config
     folder.write_weights(tmp_path, network.variables, 3, 41)
     assert (tmp_path / WEIGHTS).read_bytes() == first  # the same network has the same digest
 

@@ -55,8 +55,8 @@ def write_yaml(path, mount, opencv=False):
     matrix[:3, :3], matrix[:3, 3] = mount.rotation.as_matrix(), mount.translation
     head = "%YAML:1.0\n---\n" if opencv else "#Default imu sensor yaml file\n"
     tag = " !!opencv-matrix" if opencv else ""
-    about = f"sensor_type: imu\n\nT_BS:{tag}\n  cols: 4\n  rows: 4\n"
-    path.write_text(f"{head}{about}  data: {matrix.ravel().tolist()}\nrate_hz: 200\n")
+    fields = f"sensor_type: imu\n\nT_BS:{tag}\n  cols: 4\n  rows: 4\n"
+    path.write_text(f"{head}{fields}  data: {matrix.ravel().tolist()}\nrate_hz: 200\n")
 
 
 def write_imu(mav, seconds=12.0, step=0.005, bias=0.0, shuffle=False):
@@ -71,8 +71,8 @@ def poses(time, mount, imu_mount):
     turn = imu_mount.rotation.inv() * mount.rotation
     lever = imu_mount.rotation.inv().apply(mount.translation - imu_mount.translation)
     swing = attitude.apply(np.cross(known_walk.rate(time), lever))
-    place = known_walk.position(time) + attitude.apply(lever)
-    return place, attitude * turn, known_walk.velocity(time) + swing
+    position = known_walk.position(time) + attitude.apply(lever)
+    return position, attitude * turn, known_walk.velocity(time) + swing
 
 
 def write_estimate(
@@ -80,9 +80,9 @@ def write_estimate(
 ):
     """state_groundtruth_estimate0, at stamps of its own; `options` as of `write_table`."""
     time = np.arange(first + 0.0013, last, step)
-    place, attitude, speed = poses(time, mount or Mount(), imu_mount or Mount())
+    position, attitude, speed = poses(time, mount or Mount(), imu_mount or Mount())
     biases = np.full((len(time), 6), 0.07)
-    values = np.concatenate([place, attitude.as_quat(scalar_first=True), speed, biases], axis=1)
+    values = np.concatenate([position, attitude.as_quat(scalar_first=True), speed, biases], axis=1)
     folder = mav / "state_groundtruth_estimate0"
     write_table(folder / "data.csv", header, time, values, **options)
     if mount is not None:
@@ -94,16 +94,16 @@ def write_mocap(mav, first=1.0, last=11.0, gaps=(), noise=0.0, flips=(), mount=N
     mm."""
     random = np.random.default_rng(11)
     time = np.arange(first, last, 1 / 120.0)
-    place, attitude, _ = poses(time, mount or Mount(), Mount())
+    position, attitude, _ = poses(time, mount or Mount(), Mount())
     shaken = noise * random.normal(0, np.radians(0.1), (len(time), 3))
     attitude = attitude * Rotation.from_rotvec(shaken)
-    place = place + noise * random.normal(0, 4e-4, place.shape)
+    position = position + noise * random.normal(0, 4e-4, position.shape)
     for when in flips:
         row = int(np.argmin(np.abs(time - when)))
         attitude[row] = attitude[row] * Rotation.from_euler("x", 120, degrees=True)
-        place[row] += 0.3
+        position[row] += 0.3
     sign = np.where(np.arange(len(time)) % 50 < 25, 1.0, -1.0)[:, None]  # q and −q are one rotation
-    values = np.concatenate([place, attitude.as_quat(scalar_first=True) * sign], axis=1)
+    values = np.concatenate([position, attitude.as_quat(scalar_first=True) * sign], axis=1)
     keep = np.all([(time <= start) | (time >= end) for start, end in ((0, 0), *gaps)], axis=0)
     path = mav / "mocap0" / "data.csv"
     write_table(path, POSE_HEADER, time[keep], values[keep], "%.10f", spoil=spoil)

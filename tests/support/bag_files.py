@@ -46,18 +46,18 @@ class Maker:
 
     def pose(self, time, mount):
         """Of the body on which the IMU sits at `mount` (rotation, lever)."""
-        quaternion, place = _body(time, tuple(mount[0].as_quat()), tuple(mount[1]))
+        quaternion, position = _body(time, tuple(mount[0].as_quat()), tuple(mount[1]))
         turn = self.new("geometry_msgs/msg/Quaternion", *quaternion)
-        return self.new("geometry_msgs/msg/Pose", self.vector(place, "Point"), turn)
+        return self.new("geometry_msgs/msg/Pose", self.vector(position, "Point"), turn)
 
-    def joined(self, header, child, place, turn):
-        moved = self.new("geometry_msgs/msg/Transform", self.vector(place), turn)
+    def joined(self, header, child, position, turn):
+        moved = self.new("geometry_msgs/msg/Transform", self.vector(position), turn)
         return self.new("geometry_msgs/msg/TransformStamped", header, child, moved)
 
     def transform(self, time, mount, frame, child):
         pose = self.pose(time, mount)
-        place = [pose.position.x, pose.position.y, pose.position.z]
-        return self.joined(self.header(time, frame), child, place, pose.orientation)
+        position = [pose.position.x, pose.position.y, pose.position.z]
+        return self.joined(self.header(time, frame), child, position, pose.orientation)
 
     def static(self, parent, child, rotation, lever):
         turn = self.new("geometry_msgs/msg/Quaternion", *rotation.as_quat().tolist())
@@ -86,10 +86,10 @@ def imu(make, topic="/imu/data", rate=100.0, seconds=SECONDS, frame="imu_link", 
     """sensor_msgs/Imu; `unit` scales the accelerometer, `no` says which sensor is not measured."""
     name, times = "sensor_msgs/msg/Imu", clock(rate, seconds)
     measured = zip(known_walk.rate(times), known_walk.force(times) * unit, strict=True)
-    known = dict(zip(times.tolist(), measured, strict=True))
+    samples = dict(zip(times.tolist(), measured, strict=True))
 
     def message(time):
-        turning, pull = known[time]
+        turning, pull = samples[time]
         unknown = np.zeros(9)
         unknown[0] = -1.0
         return make.new(
@@ -168,14 +168,16 @@ def _encoded(store, name, message):
 
 def write_mcap(path, kind, entries, encoding=None):
     store, ids = store_of(kind), {}
-    profile, schema, own = ("ros1", "ros1msg", 1) if store is ROS1 else ("ros2", "ros2msg", 2)
+    profile, schema, ros_version = (
+        ("ros1", "ros1msg", 1) if store is ROS1 else ("ros2", "ros2msg", 2)
+    )
     encoding = encoding or ("ros1" if store is ROS1 else "cdr")
     with path.open("wb") as file:
         writer = McapWriter(file)
         writer.start(profile=profile)
         for topic, name, stamp, message in entries:
             if topic not in ids:
-                definition, _ = store.generate_msgdef(name, ros_version=own)
+                definition, _ = store.generate_msgdef(name, ros_version=ros_version)
                 shown = name.replace("/msg/", "/") if store is ROS1 else name
                 number = writer.register_schema(shown, schema, definition.encode())
                 ids[topic] = writer.register_channel(topic, encoding, number)

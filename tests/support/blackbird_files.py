@@ -16,10 +16,10 @@ def write(folder, down=False, text=11, spoil=None, seconds=12.0):
     columns (0: none)."""
     time = np.arange(round(seconds * 100)) / 100
     body = known_walk.attitude(time).as_matrix() @ FLIP
-    place, speed = known_walk.position(time), known_walk.velocity(time)
+    position, speed = known_walk.position(time), known_walk.velocity(time)
     if down:
-        body, place, speed = FLIP @ body, place @ FLIP, speed @ FLIP
-    pose = np.concatenate([place, Rotation.from_matrix(body).as_quat()], axis=1)
+        body, position, speed = FLIP @ body, position @ FLIP, speed @ FLIP
+    pose = np.concatenate([position, Rotation.from_matrix(body).as_quat()], axis=1)
     gyro, accel = known_walk.rate(time) @ FLIP, known_walk.force(time) @ FLIP
     bias = np.array([0.01, -0.02, 0.005])
     fields = {"ts": START + time, "gyro_calib": gyro, "accel_calib": accel, "traj_target": pose}

@@ -104,6 +104,6 @@ def city_drive(mounting=(0.5, 0.1, -0.2), first=0.0):
     gyro = turns + BIAS + ENGINE[0] * shake * [1.0, 0.3, -0.5]
     accel = force + ENGINE[1] * shake * [0.2, -0.4, 1.0]
     rows = slice(round(first * RATE), -1)
-    kept = slice(rows.start, None)
+    imu_rows = slice(rows.start, None)
     orientation = body.as_quat(scalar_first=True)
-    return t[rows] - t[rows][0], gyro[kept], accel[kept], orientation[rows], position[rows]
+    return t[rows] - t[rows][0], gyro[imu_rows], accel[imu_rows], orientation[rows], position[rows]

@@ -19,6 +19,6 @@ def run(*words):
 
 def understood(words):
     """The options of `gnio WORDS`, which does not run. Raises `InputError` for mistakes."""
-    command = next(each for each in commands() if tuple(words[: len(each[0])]) == each[0])
+    command = next(entry for entry in commands() if tuple(words[: len(entry[0])]) == entry[0])
     call = options.Call(" ".join(["gnio", *command[0]]), words[len(command[0]) :])
     return options.read(command[1], call)

@@ -51,6 +51,6 @@ def write_native(path, time=None, reference=True, spoil=None, drop=(), velocity=
 
 def compare_imu(sequence, start=0.0, atol=1e-3):
     """The IMU is that of the known walk, which began at `start` s."""
-    known = imu(sequence.time + start)
-    np.testing.assert_allclose(sequence.gyro, known[:, :3], atol=atol)
-    np.testing.assert_allclose(sequence.accel, known[:, 3:], atol=atol)
+    reference = imu(sequence.time + start)
+    np.testing.assert_allclose(sequence.gyro, reference[:, :3], atol=atol)
+    np.testing.assert_allclose(sequence.accel, reference[:, 3:], atol=atol)

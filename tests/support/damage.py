@@ -152,7 +152,7 @@ def _of_lines(lines, damage):
         case "no header":
             return lines[1:]
         case what if what in ROWS:
-            return [lines[each] for each in _order(len(lines), damage)]
+            return [lines[index] for index in _order(len(lines), damage)]
     separator = "," if any("," in line for line in lines[1:3]) else " "
     cells = [line.split(separator) for line in lines]
     column = _place(max(map(len, cells)), damage.much)
@@ -206,10 +206,10 @@ def of_arrays(arrays, damage):
         case ("shape", _) if array.ndim and array.size:
             arrays[name] = SHAPES[token](array)
         case (what, _) if what in ROWS and array.ndim:  # of all that are as long, or of it alone
-            alike = [each for each in arrays if token and arrays[each].shape[:1] == array.shape[:1]]
-            for each in alike or [name]:
+            alike = [key for key in arrays if token and arrays[key].shape[:1] == array.shape[:1]]
+            for key in alike or [name]:
                 rows = _order(len(array), damage._replace(where=damage.much))
-                arrays[each] = arrays[each][rows]
+                arrays[key] = arrays[key][rows]
     return arrays
 
 

@@ -40,14 +40,14 @@ def write_damaged(name, root, happened):
             contents[damage.file] = after(contents[damage.file], damage)
     places = {damage.file: damage.what for damage in happened if damage.what in PLACES}
     for file, content in contents.items():
-        path, place = root / file, places.get(file)
+        path, kind = root / file, places.get(file)
         path.parent.mkdir(parents=True, exist_ok=True)
-        if place == "folder":
+        if kind == "folder":
             path.mkdir()
-        elif place in ("dangling link", "looping link"):
-            path.symlink_to("nowhere" if place == "dangling link" else path.name)
-        elif place != "delete":
-            path.with_name("old_" * (place == "rename") + path.name).write_bytes(content)
+        elif kind in ("dangling link", "looping link"):
+            path.symlink_to("nowhere" if kind == "dangling link" else path.name)
+        elif kind != "delete":
+            path.with_name("old_" * (kind == "rename") + path.name).write_bytes(content)
 
 
 class TooLong(BaseException):
@@ -94,12 +94,14 @@ def outcome(name, happened):
                 result = data.load(layout.dataset, root, layout.split)
         except InputError as error:
             result = error
-        said = [str(each.message) for each in warned if issubclass(each.category, UserWarning)]
-        said += [str(result)] if isinstance(result, InputError) else []
-        for line in said:
+        messages = [
+            str(warning.message) for warning in warned if issubclass(warning.category, UserWarning)
+        ]
+        messages += [str(result)] if isinstance(result, InputError) else []
+        for line in messages:
             assert len(line.splitlines()) == 1, f"not one line: {line!r}"
             assert len(line) < 2000, f"nobody reads {len(line)} characters"
-        return result, "\n".join(said).replace(str(root), "ROOT")
+        return result, "\n".join(messages).replace(str(root), "ROOT")
 
 
 def check_sequence(sequence, name):
@@ -123,37 +125,39 @@ def check_sequence(sequence, name):
         if attitude is not None:
             assert attitude.shape[1] == 4
             norm = np.linalg.norm(attitude, axis=1)
-            there = np.isfinite(norm)
-            np.testing.assert_allclose(norm[there], 1.0, atol=1e-9)
-            assert there.all() or attitude is sequence.device_orientation
+            finite_rows = np.isfinite(norm)
+            np.testing.assert_allclose(norm[finite_rows], 1.0, atol=1e-9)
+            assert finite_rows.all() or attitude is sequence.device_orientation
     position, velocity = sequence.position[valid], sequence.velocity[valid]
     assert np.isfinite(position).all() and np.isfinite(velocity).all()
     assert np.abs(velocity).max(initial=0.0) < 330.0
     assert np.abs(position).max(initial=0.0) < 2e8
     moved = np.abs(np.diff(sequence.position, axis=0)).max(axis=1)[valid[1:] & valid[:-1]]
     assert moved.max(initial=0.0) < max(11.0, 330.0 / rate)
-    assert all(isinstance(each, str | float | int | bool) for each in sequence.attributes.values())
+    assert all(
+        isinstance(value, str | float | int | bool) for value in sequence.attributes.values()
+    )
 
 
-def check_refusal(said, happened):
+def check_refusal(text, happened):
     """What was said names a damaged file; or, where files are gone, the root; or the recording,
     which only the self-check refuses."""
-    gone = any(damage.what in PLACES for damage in happened) and "ROOT" in said
-    named = any(PurePosixPath(damage.file).name in said for damage in happened)
-    assert named or gone or "self-check" in said, f"names no damaged file: {said}"
+    gone = any(damage.what in PLACES for damage in happened) and "ROOT" in text
+    named = any(PurePosixPath(damage.file).name in text for damage in happened)
+    assert named or gone or "self-check" in text, f"names no damaged file: {text}"
     first, of_field = happened[0], ("drop field", "rename field", "value", "type", "shape")
     if len(happened) == 1 and first.what in of_field and not first.file.endswith(".npy"):
         # Numbers cut to integers are numbers still: the recording as a whole is not trusted.
-        cut = first.what == "type" and "can be trusted" in said
-        whole = "self-check" in said or cut
-        assert re.search(r"(field|column)s? '", said) or whole, f"names no field: {said}"
+        cut = first.what == "type" and "can be trusted" in text
+        whole = "self-check" in text or cut
+        assert re.search(r"(field|column)s? '", text) or whole, f"names no field: {text}"
 
 
 def check(name, happened):
-    result, said = outcome(name, happened)
+    result, text = outcome(name, happened)
     if isinstance(result, InputError):
-        check_refusal(said, happened)
+        check_refusal(text, happened)
     else:
         for sequence in result:
             check_sequence(sequence, name)
-    return result, said
+    return result, text

@@ -23,12 +23,12 @@ def frame(seconds=walk.SECONDS, lag=0.0, tilt=TILT, mount=RIG_OF_PHONE, start=0.
     map's world."""
     time = start + np.arange(round(seconds * 100)) / 100
     then = time - lag
-    own = Rotation.from_euler("z", 0.9) * walk.attitude(time)
+    phone = Rotation.from_euler("z", 0.9) * walk.attitude(time)
     rig = tilt * walk.attitude(then) * mount.inv()
     blocks = {
         "orient": rig.as_quat(scalar_first=True),
         "processedPos": tilt.apply(walk.position(then)),
-        "iphoneOrient": own.as_quat(scalar_first=True),
+        "iphoneOrient": phone.as_quat(scalar_first=True),
         "iphoneAcc": -walk.force(time) / 9.80665,
         "iphoneGyro": walk.rate(time) + BIAS,
         "iphoneMag": np.full((len(time), 3), 30.0),
@@ -42,13 +42,13 @@ def frame(seconds=walk.SECONDS, lag=0.0, tilt=TILT, mount=RIG_OF_PHONE, start=0.
     return pd.DataFrame(columns)
 
 
-def write(root, table, place="building1/known", number=3, subject=7):
-    folder = root / place
+def write(root, table, subfolder="building1/known", number=3, subject=7):
+    folder = root / subfolder
     folder.mkdir(parents=True, exist_ok=True)
     table.reset_index(drop=True).to_feather(folder / f"{number}.feather")
-    about = folder / "metadata.json"
-    entries = json.loads(about.read_text()) if about.exists() else {}
-    about.write_text(
+    metadata = folder / "metadata.json"
+    entries = json.loads(metadata.read_text()) if metadata.exists() else {}
+    metadata.write_text(
         json.dumps(entries | {str(number): {"subjectID": subject, "calibration": "start"}})
     )
     return folder / f"{number}.feather"

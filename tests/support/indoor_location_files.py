@@ -27,19 +27,19 @@ def lines(seconds: float = walk.SECONDS, taps: np.ndarray = TAPS) -> list[str]:
     """The lines of one walk, in the order of their stamps."""
     taps = taps[taps <= seconds]
     stamps = np.round(np.arange(0.0, seconds, 1 / 50.4) * 1e3).astype(int)
-    time, found = stamps / 1e3, []
+    time, entries = stamps / 1e3, []
     for kind, values in (
         ("ACCELEROMETER", walk.force(time)),
         ("MAGNETIC_FIELD", field(time)),
         ("GYROSCOPE", walk.rate(time)),
     ):
         for stamp, (x, y, z) in zip(stamps, values.tolist(), strict=True):
-            found.append((stamp, f"{START + stamp}\tTYPE_{kind}\t{x:.8f}\t{y:.8f}\t{z:.8f}\t3"))
+            entries.append((stamp, f"{START + stamp}\tTYPE_{kind}\t{x:.8f}\t{y:.8f}\t{z:.8f}\t3"))
     for tap, (x, y, _) in zip(taps, walk.position(taps).tolist(), strict=True):
         stamp = round(tap * 1e3)
-        found.append((stamp, f"{START + stamp}\tTYPE_WAYPOINT\t{x:.7f}\t{y:.7f}"))
-    found.sort(key=lambda entry: entry[0])
-    return [*HEADER, *(line for _, line in found), f"#\tendTime:{START + round(seconds * 1e3)}"]
+        entries.append((stamp, f"{START + stamp}\tTYPE_WAYPOINT\t{x:.7f}\t{y:.7f}"))
+    entries.sort(key=lambda entry: entry[0])
+    return [*HEADER, *(line for _, line in entries), f"#\tendTime:{START + round(seconds * 1e3)}"]
 
 
 def write(root: Path, text: list[str] | None = None, floor: str = "F4", name: str = NAME) -> Path:

@@ -16,18 +16,21 @@ START = np.datetime64("2011-09-26T13:02:25.594360375", "ns")
 
 def packets(time):
     """(n, 30) values of the packets at times (s)."""
-    place = known_walk.position(time)
-    latitude = HOME[0] + np.degrees(place[:, 1] / RADIUS)
-    longitude = HOME[1] + np.degrees(place[:, 0] / (RADIUS * np.cos(np.radians(HOME[0]))))
+    position = known_walk.position(time)
+    latitude = HOME[0] + np.degrees(position[:, 1] / RADIUS)
+    longitude = HOME[1] + np.degrees(position[:, 0] / (RADIUS * np.cos(np.radians(HOME[0]))))
     yaw, pitch, roll = known_walk.attitude(time).as_euler("ZYX").T
     east, north, up = known_walk.velocity(time).T
     heading = np.stack([np.cos(yaw), np.sin(yaw)])
-    forward, left = heading[0] * east + heading[1] * north, heading[0] * north - heading[1] * east
+    forward, left_speed = (
+        heading[0] * east + heading[1] * north,
+        heading[0] * north - heading[1] * east,
+    )
     # Accelerations and rates in the level frame: not what is asked for.
     level = np.full((3, len(time)), 7.7)
     accuracy = np.tile([[0.05], [0.01], [4], [9], [4], [4], [0]], len(time))
-    rows = [latitude, longitude, HOME[2] + place[:, 2], roll, pitch, yaw]
-    rows += [north, east, forward, left, up, *known_walk.force(time).T, *level]
+    rows = [latitude, longitude, HOME[2] + position[:, 2], roll, pitch, yaw]
+    rows += [north, east, forward, left_speed, up, *known_walk.force(time).T, *level]
     return np.stack([*rows, *known_walk.rate(time).T, *level, *accuracy], axis=1)
 
 

@@ -35,7 +35,7 @@ class Term(NamedTuple):
 class Walk(NamedTuple):
     """A place of three terms in the world, and an attitude Rz(yaw) Rx(pitch) Ry(roll)."""
 
-    place: tuple[Term, Term, Term]
+    coordinates: tuple[Term, Term, Term]
     angles: tuple[Term, Term, Term]
 
     def paced(self, pace: float) -> Walk:
@@ -53,11 +53,11 @@ class Walk(NamedTuple):
 
     def position(self, time: np.ndarray) -> np.ndarray:
         """(n, 3) m in the world."""
-        return self._at(self.place, 0, time)
+        return self._at(self.coordinates, 0, time)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """(n, 3) m/s in the world."""
-        return self._at(self.place, 1, time)
+        return self._at(self.coordinates, 1, time)
 
     def attitude(self, time: np.ndarray) -> Rotation:
         """n rotations body → world."""
@@ -80,7 +80,7 @@ class Walk(NamedTuple):
     def force(self, time: np.ndarray) -> np.ndarray:
         """(n, 3) specific force in the body, m/s²: what a perfect accelerometer reads, level at
         rest (0, 0, 9.81)."""
-        acceleration = self._at(self.place, 2, time)
+        acceleration = self._at(self.coordinates, 2, time)
         return self.attitude(time).inv().apply(acceleration + np.array([0.0, 0.0, GRAVITY]))
 
 

@@ -46,9 +46,9 @@ class Layout(NamedTuple):
 
     def write(self, root: Path, seconds: float) -> None:
         self.recording(root, seconds)
-        for place, text in self.lists.items():
-            (root / place).parent.mkdir(parents=True, exist_ok=True)
-            (root / place).write_text(text)
+        for path, text in self.lists.items():
+            (root / path).parent.mkdir(parents=True, exist_ok=True)
+            (root / path).write_text(text)
 
 
 DRIVE, FLIGHT = "2011_09_26_drive_0014", "clover/yawForward/maxSpeed5p0/test"
@@ -104,11 +104,11 @@ def _ridi(root: Path, seconds: float) -> None:
 def _hdf5(root: Path, seconds: float) -> None:
     time = np.arange(round(seconds * 200.0)) / 200.0
     attitude = known_walk.attitude(time).as_quat(scalar_first=True)
-    place, valid = known_walk.position(time), np.ones(len(time), dtype=bool)
+    position, valid = known_walk.position(time), np.ones(len(time), dtype=bool)
     signals = known_walk.rate(time), known_walk.force(time)
-    walk = Sequence("walk", time, *signals, attitude, place, known_walk.velocity(time), valid)
-    about = {"dataset": "csv", "group": "walk", "start_time": 12.5}
-    write_hdf5(root / "walk.h5", walk._replace(device_orientation=attitude, attributes=about))
+    walk = Sequence("walk", time, *signals, attitude, position, known_walk.velocity(time), valid)
+    attributes = {"dataset": "csv", "group": "walk", "start_time": 12.5}
+    write_hdf5(root / "walk.h5", walk._replace(device_orientation=attitude, attributes=attributes))
 
 
 LAYOUTS = {

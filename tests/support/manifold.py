@@ -13,8 +13,8 @@ def rotated(rotvec):
 
 def plus(x, delta):
     """x and δ (…, 15): exp(δθ) R, the rest adds."""
-    theta, *rest = np.split(delta, 5, axis=-1)
-    return rotated(theta) @ x[0], *[part + d for part, d in zip(x[1:], rest, strict=True)]
+    theta, *increments = np.split(delta, 5, axis=-1)
+    return rotated(theta) @ x[0], *[part + d for part, d in zip(x[1:], increments, strict=True)]
 
 
 def minus(x, y):

@@ -76,10 +76,10 @@ def predicted(model, variables, windows, folds=True):
             folded = np.float32(0 if path[-1].key == "mean" else 1 - EPSILON)
             np.testing.assert_array_equal(leaf, folded, err_msg=str(path))
     plain = models.InferenceVariables(variables, {})
-    given = [plain, frozen]
+    variants = [plain, frozen]
     if frozen.constants:  # they are used, not computed again
-        given.append(frozen._replace(constants=jax.tree.map(lambda x: 2 * x, frozen.constants)))
-    found = [jax.device_get(program(each, jnp.asarray(windows))) for each in given]
-    for other in found[2:]:
-        assert np.abs(other.displacement - found[1].displacement).max() > 1e-3
-    return found[:2]
+        variants.append(frozen._replace(constants=jax.tree.map(lambda x: 2 * x, frozen.constants)))
+    predictions = [jax.device_get(program(variant, jnp.asarray(windows))) for variant in variants]
+    for other in predictions[2:]:
+        assert np.abs(other.displacement - predictions[1].displacement).max() > 1e-3
+    return predictions[:2]

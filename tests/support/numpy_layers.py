@@ -71,9 +71,9 @@ def attention(query, key, value, q, causal=False):
             for name, x in (("query", query), ("key", key), ("value", value))
         )
         for i in range(len(a)):
-            seen = i + 1 if causal else len(b)
-            weights = softmax(b[:seen] @ a[i] / np.sqrt(a.shape[1]))
-            out[i] += weights @ c[:seen] @ q["out"]["kernel"][h]
+            horizon = i + 1 if causal else len(b)
+            weights = softmax(b[:horizon] @ a[i] / np.sqrt(a.shape[1]))
+            out[i] += weights @ c[:horizon] @ q["out"]["kernel"][h]
     return out
 
 

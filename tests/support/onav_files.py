@@ -41,13 +41,13 @@ def write(root, seconds=known_walk.SECONDS):
     names = [f"Delta{part}[{axis}]" for part in ("Theta", "Velocity") for axis in range(3)]
     zipped(folder, "imu-nav", names, time, increments)
     east, north, up = known_walk.position(time).T
-    place = [
+    coordinates = [
         HOME[0] + north / RADIUS,
         HOME[1] + east / (RADIUS * np.cos(HOME[0])),
         250.0 + up,
     ]
     names = ["Latitude", "Longitude", "AltitudeAboveEllipsoid"]
-    zipped(folder, "position", names, time, np.stack(place, axis=1))
+    zipped(folder, "position", names, time, np.stack(coordinates, axis=1))
     down = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     names = [f"VelocityNED[{axis}]" for axis in range(3)]
     zipped(folder, "velocity", names, time, known_walk.velocity(time) @ down)

@@ -20,13 +20,15 @@ FIELD = Rotation.from_euler("z", -1.1).apply([20.0, 0.0, -40.0])
 def eight(period: float) -> Walk:
     """A figure of eight: after half of its period (s) one turns as fast, to the other side."""
     sway, bounce = (0.02, 0.9, 0.0), (0.02, 1.8, 1.0)
-    place = (
+    coordinates = (
         Term(0.0, 0.0, ((1.2, 2 / period, 0.0), sway)),
         Term(0.0, 0.0, ((2.0, 1 / period, 0.0), bounce)),
         Term(1.2, 0.0, ((0.025, 1.8, 0.0),)),
     )
     yaw = Term(0.0, 0.0, ((2.2, 1 / period, 0.0), (0.06, 0.9, 0.0)))
-    return Walk(place, (yaw, Term(0.5, 0.0, ((0.05, 1.8, 0.0),)), Term(0, 0, ((0.05, 0.9, 0.4),))))
+    return Walk(
+        coordinates, (yaw, Term(0.5, 0.0, ((0.05, 1.8, 0.0),)), Term(0, 0, ((0.05, 0.9, 0.4),)))
+    )
 
 
 class Truth(NamedTuple):
@@ -51,11 +53,11 @@ class Truth(NamedTuple):
 def iphone_columns(time, truth):
     """The 15 columns after the time. The phone's yaw is its own; gravity and acceleration are in G
     with iOS's sign."""
-    own = Rotation.from_euler("z", 1.1) * truth.walk.attitude(time)
-    gravity = -own.inv().apply([0.0, 0.0, 1.0])
+    phone = Rotation.from_euler("z", 1.1) * truth.walk.attitude(time)
+    gravity = -phone.inv().apply([0.0, 0.0, 1.0])
     user = -truth.walk.force(time - truth.accel_delay) / G - gravity
     magnet = truth.walk.attitude(time).inv().apply(FIELD)
-    angles, gyro = own.as_euler("ZXY")[:, [2, 1, 0]], truth.walk.rate(time) + truth.gyro_bias
+    angles, gyro = phone.as_euler("ZXY")[:, [2, 1, 0]], truth.walk.rate(time) + truth.gyro_bias
     return np.concatenate([angles, gyro, gravity, user, magnet], axis=1)
 
 
@@ -66,14 +68,14 @@ def vicon_columns(time, truth, seed=0):
     axis = np.cross(truth.up, [0.0, 0.0, 1.0])
     level = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.arccos(truth.up[2]))
     marker = level.inv() * truth.walk.attitude(time) * truth.extrinsic.inv()
-    place = level.inv().apply(truth.walk.position(time)) - marker.apply(truth.lever)
+    position = level.inv().apply(truth.walk.position(time)) - marker.apply(truth.lever)
     marker = marker * Rotation.from_rotvec(noise.normal(0, np.radians(0.03), (len(time), 3)))
-    place = place + noise.normal(0, 1e-4, place.shape)
+    position = position + noise.normal(0, 1e-4, position.shape)
     quaternion, row = marker.as_quat(), len(time) // 3
     flipped = marker[row : row + 3] * Rotation.from_euler("y", 150, degrees=True)
     quaternion[row : row + 3] = flipped.as_quat()
-    place[2 * row : 2 * row + 3] += [0.4, 0.2, 0.0]
-    return np.concatenate([place, quaternion], axis=1)
+    position[2 * row : 2 * row + 3] += [0.4, 0.2, 0.0]
+    return np.concatenate([position, quaternion], axis=1)
 
 
 def write_rows(path, time, columns, style):
@@ -106,10 +108,10 @@ def write_raw(folder, number, truth, seconds):
     stamps = [f"{stamp:.2f}" for stamp in EPOCH + time[order]]
     columns = iphone_columns(time[order], truth)
     write_rows(folder / "raw" / f"imu{number}.csv", stamps, columns, "%.6f")
-    seen = np.arange(-3.0, seconds + 2.0, 0.01)
-    seen = np.delete(seen, slice(len(seen) // 2, len(seen) // 2 + 15))
+    vicon_time = np.arange(-3.0, seconds + 2.0, 0.01)
+    vicon_time = np.delete(vicon_time, slice(len(vicon_time) // 2, len(vicon_time) // 2 + 15))
     path = folder / "raw" / f"vi{number}.csv"
-    write_vicon(path, nanoseconds(seen, truth), vicon_columns(seen, truth))
+    write_vicon(path, nanoseconds(vicon_time, truth), vicon_columns(vicon_time, truth))
 
 
 def write_syn(folder, number, truth, seconds):
@@ -141,9 +143,9 @@ def write_nexus_raw(folder, number, truth, seconds):
     table = table[np.lexsort([table[:, 1], table[:, 0]])]
     stamps = [f"{stamp:.0f}" for stamp in table[:, 0]]
     write_rows(folder / "raw" / f"imu{number}.csv", stamps, table[:, 1:], "%.9g")
-    seen = np.arange(-1.0, seconds + 1.0, 0.005)
+    vicon_time = np.arange(-1.0, seconds + 1.0, 0.005)
     path = folder / "raw" / f"vi{number}.csv"
-    write_vicon(path, nanoseconds(seen, truth), vicon_columns(seen, truth))
+    write_vicon(path, nanoseconds(vicon_time, truth), vicon_columns(vicon_time, truth))
 
 
 def write_large_scale(folder, number, truth, seconds, broken=False):
@@ -153,12 +155,12 @@ def write_large_scale(folder, number, truth, seconds, broken=False):
     stamps = [f"{stamp:.2f}" for stamp in EPOCH + time]
     columns = iphone_columns(time, truth)
     write_rows(folder / "syn" / f"imu{number}.csv", stamps, columns, "%.6f")
-    seen = np.arange(len(time) + 12) / 100 - 0.2
-    walked = (truth.walk.paced(0.83) if broken else truth.walk).position(seen)
-    place = Rotation.from_euler("z", 40, degrees=True).apply(walked)
-    place = place + np.random.default_rng(3).normal(0, 5e-4, place.shape)
-    quaternion = Rotation.random(len(seen), random_state=0).as_quat()
-    columns = np.concatenate([place, quaternion], axis=1)
+    tango_time = np.arange(len(time) + 12) / 100 - 0.2
+    walked = (truth.walk.paced(0.83) if broken else truth.walk).position(tango_time)
+    position = Rotation.from_euler("z", 40, degrees=True).apply(walked)
+    position = position + np.random.default_rng(3).normal(0, 5e-4, position.shape)
+    quaternion = Rotation.random(len(tango_time), random_state=0).as_quat()
+    columns = np.concatenate([position, quaternion], axis=1)
     columns[7::17] = columns[6::17][: len(columns[7::17])]  # held rows
-    stamps = [f"{59601 + t:.0f}" for t in seen]
+    stamps = [f"{59601 + t:.0f}" for t in tango_time]
     write_vicon(folder / "syn" / f"tango{number}.csv", stamps, columns, "%.5g")

@@ -68,16 +68,16 @@ def shell_lines():
 
 def command_lines():
     """Each `gnio …` of the pages once, in blocks and in sentences."""
-    found = {}
+    occurrences = {}
     for page, line in shell_lines():
         start = re.search(r"(^|[|] |srun )gnio ", line)
         if start:
-            found[_words(line[start.start() :].removeprefix("| "))] = (page, False)
+            occurrences[_words(line[start.start() :].removeprefix("| "))] = (page, False)
     for page in pages():
         text = FENCE.sub("", page.read_text(encoding="utf-8"))
         for match in INLINE.finditer(text):
-            found.setdefault(_words(match[1]), (page.relative_to(ROOT).as_posix(), True))
-    return [CommandLine(page, words, quoted) for words, (page, quoted) in found.items()]
+            occurrences.setdefault(_words(match[1]), (page.relative_to(ROOT).as_posix(), True))
+    return [CommandLine(page, words, quoted) for words, (page, quoted) in occurrences.items()]
 
 
 def _words(line):

@@ -36,7 +36,7 @@ class Pace(nn.Module):
         return Prediction(displacement, jnp.full_like(displacement, jnp.log(0.1)), {})
 
 
-def place(time):
+def true_position(time):
     """(n, 3) position in the world of the walk, m."""
     radius, angle = SPEED / TURN, TURN * time
     height = 3.0 * (1 - np.cos(2 * np.pi * time / 160.0))
@@ -46,7 +46,7 @@ def place(time):
 def on_map(time):
     """(n, 3) metres east, north and up of the start."""
     cosine, sine = np.cos(NORTHWARD), np.sin(NORTHWARD)
-    x, y, z = place(time).T
+    x, y, z = true_position(time).T
     return np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=1)
 
 
@@ -88,7 +88,7 @@ def magnetometer(random, time):
 
 def pressure(random, time):
     """Of the standard atmosphere at the height, with the weather's drift, Pa."""
-    height = ALTITUDE + place(time)[:, 2]
+    height = ALTITUDE + true_position(time)[:, 2]
     noise = 3.0 * random.normal(size=len(time)) + 0.05 * time
     return 101325.0 * (1 - 0.0065 * height / 288.15) ** 5.25588 + noise
 

@@ -30,7 +30,7 @@ def messages(time, gyro, accel, period=0.5, kind="sum", session="one", device="p
         sensors |= {"accelerometer": accel - gravity, "totalacceleration": accel}
     elif kind == "raw":
         sensors |= {"accelerometeruncalibrated": accel / 9.80665}
-    found = []
+    contents = []
     for number, begin in enumerate(np.arange(time[0], time[-1] + period, period)):
         rows = np.flatnonzero((time >= begin - 1e-9) & (time < begin + period - 1e-9))
         payload = [
@@ -44,8 +44,8 @@ def messages(time, gyro, accel, period=0.5, kind="sum", session="one", device="p
         ]
         if payload:
             head = {"messageId": number, "sessionId": session, "deviceId": device}
-            found.append(json.dumps({**head, "payload": payload}).encode())
-    return found
+            contents.append(json.dumps({**head, "payload": payload}).encode())
+    return contents
 
 
 def post(address, body, path="/data", **headers):
@@ -78,7 +78,7 @@ class Experiment(ThreadingHTTPServer):
             }
             outputs = [{axis: name} for axis, name in zip("xyzt", names, strict=True)]
             self.inputs.append({"source": source, "outputs": outputs})
-        self.speed, self.begin, self.elapsed, self.asked = speed, None, 0.0, []
+        self.speed, self.begin, self.elapsed, self.requests = speed, None, 0.0, []
         super().__init__(("127.0.0.1", 0), _Phyphox)
         threading.Thread(target=self.serve_forever, args=(0.05,), daemon=True).start()
 
@@ -99,13 +99,13 @@ class Experiment(ThreadingHTTPServer):
             self.elapsed, self.begin = self.now, None
         return {"result": command in ("start", "stop")}
 
-    def rows(self, name, wanted, now):
+    def rows(self, name, query, now):
         """Values with eight digits, as the app writes them."""
         stamps, values = self.columns[name]
         come = stamps <= now
-        if not wanted:
+        if not query:
             return [None if not come.any() else float(f"{values[come][-1]:.7e}")]
-        threshold, _, reference = wanted.partition("|")
+        threshold, _, reference = query.partition("|")
         limit = float(threshold)
         limit += 10 ** np.floor(np.log10(abs(limit) / 1e7)) if limit else 0.0
         reference = self.columns[reference][1]
@@ -116,7 +116,7 @@ class _Phyphox(BaseHTTPRequestHandler):
     def do_GET(self):
         path, _, query = self.path.partition("?")
         server = self.server
-        server.asked.append(unquote(self.path))
+        server.requests.append(unquote(self.path))
         pairs = parse_qsl(query, keep_blank_values=True)
         if path == "/config":
             answer = {"title": "two sensors", "inputs": server.inputs}

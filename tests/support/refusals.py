@@ -5,10 +5,10 @@ import pytest
 from gnio_jax.errors import InputError
 
 
-def refused(read, place, *words):
-    """`read()` is refused in one line that begins with `place` and holds `words`."""
+def refused(read, subject, *words):
+    """`read()` is refused in one line that begins with `subject` and holds `words`."""
     with pytest.raises(InputError) as caught:
         read()
     text = str(caught.value)
-    assert text.startswith(f"{place}: ") and "\n" not in text, text
+    assert text.startswith(f"{subject}: ") and "\n" not in text, text
     assert all(word in text for word in words), text

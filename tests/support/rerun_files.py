@@ -6,10 +6,10 @@ import pytest
 def columns_of(path):
     """{place: {column: values of all rows}} of the file, its parts one behind the other."""
     reader = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk").RrdReader(str(path))
-    found = {}
+    entities = {}
     for part in reader.stream().to_chunks():
         batch = part.to_record_batch()
-        place = found.setdefault(str(part.entity_path), {})
+        columns = entities.setdefault(str(part.entity_path), {})
         for name, values in zip(batch.schema.names, batch.columns, strict=True):
-            place.setdefault(name, []).extend(values.to_pylist())
-    return found
+            columns.setdefault(name, []).extend(values.to_pylist())
+    return entities

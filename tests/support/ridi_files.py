@@ -52,20 +52,20 @@ def write_text(root, name, poses="pose.txt", pose_time=None, seconds=walk.SECOND
     gyro_time, own_time = np.arange(-0.3, seconds, 1 / 388.0), np.arange(-0.25, seconds, 1 / 194.0)
     force_time = np.arange(-0.2, seconds, 1 / 388.0) + 5.3e-4
     pose_time = np.arange(0.0, seconds - 0.4, 1 / 30.0) if pose_time is None else pose_time
-    place, attitude = walk.position(pose_time), walk.attitude(pose_time)
+    position, attitude = walk.position(pose_time), walk.attitude(pose_time)
     if poses == "android_sensor_pose.txt":
         # ARCore's world is y-up: z of the level world is its y, y its −z.
         turn = Rotation.from_euler("x", -90, degrees=True)
-        place, attitude = turn.apply(place), turn * attitude
+        position, attitude = turn.apply(position), turn * attitude
     files = {
         "gyro.txt": (gyro_time, walk.rate(gyro_time)),
         "acce.txt": (force_time, walk.force(force_time)),
         "orientation.txt": (own_time, (GAME_YAW * walk.attitude(own_time)).as_quat()),
-        poses: (pose_time, np.concatenate([place, attitude.as_quat()], axis=1)),
+        poses: (pose_time, np.concatenate([position, attitude.as_quat()], axis=1)),
     }
     if poses != "pose.txt":  # the camera's, looking elsewhere
         camera = (attitude * Rotation.from_euler("z", 90, degrees=True)).as_quat()
-        files["pose.txt"] = (pose_time, np.concatenate([place, camera], axis=1))
+        files["pose.txt"] = (pose_time, np.concatenate([position, camera], axis=1))
     folder = root / name
     folder.mkdir(parents=True)
     for file, (time, values) in files.items():

@@ -202,8 +202,8 @@ def run(
                     now, oldest = (k + 1) * n, (k + 1 - clones) * n  # samples since the start
                     converged = converged or oldest > round(convergence / dt)
                     active = converged and (pause_end is None or now >= pause_end)
-                    since = 0 if last_success is None else now - last_success
-                    if active and since > round(success / dt):
+                    age = 0 if last_success is None else now - last_success
+                    if active and age > round(success / dt):
                         last_success, pause_end, active = None, now + round(pause / dt), False
                     if active and nis > threshold:
                         if fail_scale > 0:
@@ -217,12 +217,12 @@ def run(
                         R, v, p, bg, ba, errors, ring = state
         row["fix_nis"] = np.nan
         if k in fixes:
-            z, C, before, late = fixes[k]
+            z, C, before, time_std = fixes[k]
             H = np.zeros((len(z), len(P)))
             H[:, 6 : 6 + len(z)] = np.eye(len(z))
             H[:, 3 : 3 + len(z)] = -before * np.eye(len(z))
             r = z - (p - before * v)[: len(z)]
-            S = H @ P @ H.T + C + late**2 * np.outer(v, v)[: len(z), : len(z)]
+            S = H @ P @ H.T + C + time_std**2 * np.outer(v, v)[: len(z), : len(z)]
             row["fix_nis"] = r @ np.linalg.solve(S, r)
             if row["fix_nis"] <= chi2.ppf(0.99, len(z)):
                 state, P = update((R, v, p, bg, ba, errors, ring), P, H, r, S)

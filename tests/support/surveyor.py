@@ -55,8 +55,8 @@ def survey(seed: int, legs: int = 8, pause: float = 0.0) -> Survey:
     phase = 2.0 * np.pi * integral(time, 1.8 * speed / pace)
     gait = np.stack([0.01 * np.sin(phase), 0.015 * np.sin(phase / 2), 0.02 * np.cos(phase)], axis=1)
     turn = about_z(heading)
-    place = np.column_stack([integral(time, course), np.zeros(len(time))]) + turn.apply(gait)
-    path = make_interp_spline(time, place, k=5)
+    position = np.column_stack([integral(time, course), np.zeros(len(time))]) + turn.apply(gait)
+    path = make_interp_spline(time, position, k=5)
     aim, tilt = rng.normal(0.0, 0.05), rng.uniform(0.2, 0.7)
     held = Rotation.from_euler("ZXY", [aim - np.pi / 2, tilt, rng.normal(0.0, 0.05)])
     attitude = turn * Rotation.from_rotvec(wander(rng, time, 3, 0.05, 0.02, 0.9)) * held

@@ -33,7 +33,7 @@ CONFIGURED = TrainConfig(
 
 
 @contextlib.contextmanager
-def known(network=Tiny):
+def registry_entry(network=Tiny):
     """The registry of networks has `tiny`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(registry._MODELS, "tiny", network)
@@ -59,7 +59,7 @@ def config(root, workdir, **changes):
     experiment, or of its section `optim`."""
     of_optim = {field.name for field in dataclasses.fields(OptimConfig)}
     optim = OptimConfig(epochs=3, batch_size=16, learning_rate=1e-3, warmup_epochs=1.0)
-    found = TrainConfig(
+    experiment = TrainConfig(
         dataset="tlio",
         data_root=root and str(root),
         workdir=str(workdir),
@@ -67,8 +67,8 @@ def config(root, workdir, **changes):
         model=ModelConfig("tiny", uncertainty="calibrated"),
         optim=dataclasses.replace(optim, **{k: v for k, v in changes.items() if k in of_optim}),
     )
-    rest = {name: value for name, value in changes.items() if name not in of_optim}
-    return dataclasses.replace(found, **rest)
+    other_changes = {name: value for name, value in changes.items() if name not in of_optim}
+    return dataclasses.replace(experiment, **other_changes)
 
 
 GATHER = jax.jit(windows.gather, static_argnums=2)
@@ -124,8 +124,8 @@ def stopped_at(step, act=lambda: signal.raise_signal(signal.SIGTERM)):
     """One step a dispatch, and `act` once a run has reached this one."""
     real = loop.add_steps
 
-    def add_steps(*given):
-        at = real(*given)
+    def add_steps(*arguments):
+        at = real(*arguments)
         if at.step == step:
             act()
         return at

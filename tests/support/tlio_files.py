@@ -40,8 +40,8 @@ def write_sequence(folder, columns=COLUMNS, spoil=None):
     folder.mkdir(parents=True)
     table = np.concatenate([parts[name.split("(")[0]] for name in columns], axis=1)
     np.save(folder / "imu0_resampled.npy", table)
-    about = json.dumps({"columns_name(width)": columns, "num_rows": N})
-    (folder / "imu0_resampled_description.json").write_text(about)
+    description = json.dumps({"columns_name(width)": columns, "num_rows": N})
+    (folder / "imu0_resampled_description.json").write_text(description)
     (folder / "calibration.json").write_text("{}")
     header = "#timestamp [ns], temperature [C], w_RS_S_x [rad s^-1]"
     (folder / "imu_samples_0.csv").write_text(f"{header}\n1000000,30,0.1\n")

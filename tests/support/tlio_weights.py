@@ -6,52 +6,52 @@ import numpy as np
 
 def shapes(samples=200):
     """PyTorch's key of every array -> its shape, for windows of `samples`."""
-    found = {"input_block.0.weight": (64, 6, 7)}
+    sizes = {"input_block.0.weight": (64, 6, 7)}
 
     def norm(name, channels):
-        found.update(
+        sizes.update(
             {
                 f"{name}.{part}": (channels,)
                 for part in ("weight", "bias", "running_mean", "running_var")
             }
         )
-        found[f"{name}.num_batches_tracked"] = ()
+        sizes[f"{name}.num_batches_tracked"] = ()
 
     norm("input_block.1", 64)
     for group, (before, channels) in enumerate([(64, 64), (64, 128), (128, 256), (256, 512)]):
         for block in range(2):
             name, inputs = f"residual_groups.{group}.{block}", before if block == 0 else channels
-            found |= {
+            sizes |= {
                 f"{name}.conv1.weight": (channels, inputs, 3),
                 f"{name}.conv2.weight": (channels, channels, 3),
             }
             norm(f"{name}.bn1", channels)
             norm(f"{name}.bn2", channels)
             if inputs != channels:
-                found[f"{name}.downsample.0.weight"] = (channels, inputs, 1)
+                sizes[f"{name}.downsample.0.weight"] = (channels, inputs, 1)
                 norm(f"{name}.downsample.1", channels)
     for name in ("output_block1", "output_block2"):
-        found[f"{name}.prep1.weight"] = (128, 512, 1)
+        sizes[f"{name}.prep1.weight"] = (128, 512, 1)
         norm(f"{name}.bn1", 128)
         for layer, (outputs, inputs) in {
             "fc1": (512, 128 * (-(-samples // 32))),
             "fc2": (512, 512),
             "fc3": (3, 512),
         }.items():
-            found |= {
+            sizes |= {
                 f"{name}.{layer}.weight": (outputs, inputs),
                 f"{name}.{layer}.bias": (outputs,),
             }
-    return found
+    return sizes
 
 
 def weights(samples=200, seed=7):
     """Key -> array. The order of the draws, that of the sorted keys, and every float32 operation
     are part of the recording."""
-    rng, found = np.random.default_rng(seed), {}
+    rng, arrays = np.random.default_rng(seed), {}
     for key, shape in sorted(shapes(samples).items()):
         if key.endswith("num_batches_tracked"):
-            found[key] = np.zeros(shape, np.int64)
+            arrays[key] = np.zeros(shape, np.int64)
             continue
         drawn = rng.standard_normal(shape).astype(np.float32)
         if key.endswith("running_var"):
@@ -64,8 +64,8 @@ def weights(samples=200, seed=7):
             drawn = 0.02 * drawn
         else:
             drawn = 1 + 0.1 * drawn if key.endswith("weight") else 0.1 * drawn
-        found[key] = drawn.astype(np.float32)
+        arrays[key] = drawn.astype(np.float32)
     for name, bias in [("output_block1", [1.0, 0, 0]), ("output_block2", [-2, -2, -2.5])]:
-        found[f"{name}.fc3.weight"] *= 0.05
-        found[f"{name}.fc3.bias"] += np.array(bias, np.float32)
-    return found
+        arrays[f"{name}.fc3.weight"] *= 0.05
+        arrays[f"{name}.fc3.bias"] += np.array(bias, np.float32)
+    return arrays

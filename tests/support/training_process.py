@@ -23,8 +23,8 @@ def main(name, step, every, *arguments):
         loop.CHECKPOINT_SECONDS = 0
     registry._MODELS["tiny"] = Tiny
 
-    def interrupted(*given):
-        at = add_steps(*given)
+    def interrupted(*inputs):
+        at = add_steps(*inputs)
         if name != "never" and at.step >= int(step):
             os.kill(os.getpid(), signal.Signals[name])
         return at

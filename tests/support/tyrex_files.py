@@ -57,10 +57,14 @@ def track(seconds: float) -> dict:
     time = frame / 60.0 - (OFFSET + LAG)
     phone = walk.attitude(time)
     handle = phone * HANDLE.inv()
-    place = walk.position(time) - handle.apply(LEVER)
+    position = walk.position(time) - handle.apply(LEVER)
     matrices = handle.as_matrix().transpose(0, 2, 1).reshape(-1, 9)
-    place[LOST], matrices[LOST] = np.nan, np.nan
-    bodies = {"Name": "Handler", "Positions": (1e3 * place.T)[None], "Rotations": matrices.T[None]}
+    position[LOST], matrices[LOST] = np.nan, np.nan
+    bodies = {
+        "Name": "Handler",
+        "Positions": (1e3 * position.T)[None],
+        "Rotations": matrices.T[None],
+    }
     return {"File": "C:\\walk.qtm", "FrameRate": 60.0, "RigidBodies": bodies}
 
 

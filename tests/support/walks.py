@@ -103,15 +103,17 @@ def with_correlated_errors(runs, clones, sigma, correlation, interval):
     has correlated ones; interval: s of a clone interval."""
     rng, shape = np.random.default_rng(3), runs.velocity.shape
     share, decay = correlation.share, np.exp(-interval / correlation.seconds)
-    seen, state = np.full(shape, np.nan), rng.normal(size=shape[::2])
+    displacement, state = np.full(shape, np.nan), rng.normal(size=shape[::2])
     for k in range(shape[1]):
         state = decay * state + np.sqrt(1 - decay**2) * rng.normal(size=state.shape)
         if k >= clones:
             moved = runs.position[:, k] - runs.position[:, k - clones]
-            seen[:, k] = np.einsum("rji,rj->ri", yaw_matrix(runs.rotation[:, k - clones]), moved)
+            displacement[:, k] = np.einsum(
+                "rji,rj->ri", yaw_matrix(runs.rotation[:, k - clones]), moved
+            )
         white = np.sqrt(1 - share**2) * rng.normal(size=state.shape)
-        seen[:, k] += sigma * (share * state + white)
-    return runs._replace(displacement=seen)
+        displacement[:, k] += sigma * (share * state + white)
+    return runs._replace(displacement=displacement)
 
 
 def errors(runs, history):
@@ -119,8 +121,8 @@ def errors(runs, history):
     estimate."""
     turn = runs.rotation @ np.swapaxes(np.asarray(history.rotation), 2, 3)
     turn = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(runs.velocity.shape)
-    rest = [
+    differences = [
         getattr(runs, name) - np.asarray(getattr(history, name))
         for name in ("velocity", "position", "gyro_bias", "accel_bias")
     ]
-    return np.concatenate([turn, *rest], axis=-1)
+    return np.concatenate([turn, *differences], axis=-1)

@@ -27,11 +27,11 @@ def test_figures_of_windows_by_hand():
         {"gate": np.array([[-0.2, 0.4, 9.0], [1.0, 1.0, 9.0]]), "attention": attention},
         np.array([0, 2]),
     )
-    found = activities.by_activity(predicted)
-    assert set(found) == {"standing", "walking"}
-    wanted = {"error": 0.5, "gate": 0.3, "normalised": np.sqrt((9 + 16) / 3)}
-    assert {name: found["standing"][name] for name in wanted} == pytest.approx(wanted)
-    assert found["walking"]["length"] == pytest.approx(0.1)
+    figures = activities.by_activity(predicted)
+    assert set(figures) == {"standing", "walking"}
+    expected = {"error": 0.5, "gate": 0.3, "normalised": np.sqrt((9 + 16) / 3)}
+    assert {name: figures["standing"][name] for name in expected} == pytest.approx(expected)
+    assert figures["walking"]["length"] == pytest.approx(0.1)
     # First head certain and different, second undecided: half the entropy in a window, all of it in
     # their mean.
     assert activities.entropy(attention) == pytest.approx((0.5, 1.0))
@@ -44,9 +44,9 @@ def test_information_of_prototypes():
     attention[np.arange(4000), :, activity] = 0.65
     nothing = [np.zeros((4000, 3))] * 3
     predicted = activities.PredictedWindows(*nothing, {"attention": attention}, activity)
-    told, chance = activities.information(predicted)
+    bits, chance = activities.information(predicted)
     # Four equally frequent activities: two bits.
-    assert told == pytest.approx(2.0, abs=0.01) and chance < 0.01
+    assert bits == pytest.approx(2.0, abs=0.01) and chance < 0.01
     names, lifts = activities.attention_by_activity(predicted)
     assert names == ["standing", "slow", "walking", "running"]
     np.testing.assert_array_equal(lifts.argmax(1), [0, 1, 2, 3])
@@ -54,7 +54,7 @@ def test_information_of_prototypes():
 
 
 def test_walks_with_waypoints_have_no_true_windows(tmp_path):
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         run = tiny_run.save(tmp_path / "tiny_s0", tiny_run.CONFIGURED)
         indoor_location_files.write(tmp_path)
         recordings = activities.Recordings("indoor_location", str(tmp_path), "test")

@@ -18,16 +18,16 @@ class Flat(nn.Module):
 
     @nn.compact
     def __call__(self, windows, train=False):
-        both = linear(16, "all")(windows.reshape(windows.shape[0], -1))
-        return Prediction(both[:, :3], both[:, 3:6])
+        outputs = linear(16, "all")(windows.reshape(windows.shape[0], -1))
+        return Prediction(outputs[:, :3], outputs[:, 3:6])
 
 
 def test_cost_of_a_network_by_hand(monkeypatch):
     monkeypatch.setattr(models, "create", lambda name: Flat())
-    found = make.measure("flat", batches=(2, 1), seconds=0.01)
-    assert found.parameters == 1200 * 16 + 16
-    assert 1e9 * found.gflops == pytest.approx(2 * 1200 * 16, rel=0.01)
-    assert len(found.latency) == 2 and min(found.latency) > 0
+    complexity = make.measure("flat", batches=(2, 1), seconds=0.01)
+    assert complexity.parameters == 1200 * 16 + 16
+    assert 1e9 * complexity.gflops == pytest.approx(2 * 1200 * 16, rel=0.01)
+    assert len(complexity.latency) == 2 and min(complexity.latency) > 0
     # A compiler that counts nothing leaves the figure out.
     monkeypatch.setattr(jax.stages.Compiled, "cost_analysis", lambda self: {"bytes": 1.0})
     assert math.isnan(make.measure("flat", batches=(1,), seconds=0.01).gflops)

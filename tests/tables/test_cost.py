@@ -19,7 +19,7 @@ from tests.support.networks import count
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run of the smallest network at 50 Hz."""
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         config = dataclasses.replace(tiny_run.CONFIGURED, data=tiny_run.config(None, "x").data)
         yield tiny_run.save(tmp_path_factory.mktemp("cost") / "tiny_s0", config)
 
@@ -30,11 +30,11 @@ def test_an_interval_has_the_median_of_the_runs_over_a_walk(run, monkeypatch):
     trained, calls = read_network(run), []
     real = speed.estimate
 
-    def estimate(recordings, *rest):
+    def estimate(recordings, *arguments):
         affinity = {os.sched_getaffinity(int(name)) == {min(usable)} for name in threads()}
         calls.append((recordings[0].strides, affinity))
-        assert rest[-1].considered is None  # which is computed after the filter
-        return real(recordings, *rest)
+        assert arguments[-1].considered is None  # which is computed after the filter
+        return real(recordings, *arguments)
 
     def threads():
         return os.listdir("/proc/self/task")

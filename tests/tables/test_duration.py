@@ -33,7 +33,7 @@ def test_a_step_is_measured_on_the_recordings_themselves(tmp_path, monkeypatch):
     root = tlio_files.write_splits(tmp_path / "data")
     clock = iter([0.0, 100.0, 200.0, 206.0])  # the first step compiles
     monkeypatch.setattr(duration.time, "perf_counter", lambda: next(clock))
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         config = tiny_run.config(root, tmp_path / "run", epochs=3)
         seconds = duration.training_seconds(config)
     assert seconds == pytest.approx(6.0 / 3 * tiny_run.STEPS * 3)

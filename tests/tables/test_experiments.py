@@ -19,19 +19,19 @@ def test_rows_differ_in_the_network_alone():
     regularisation apart, only the network differs. Every checkpoint is chosen by one criterion."""
     chosen = dataclasses.replace(BASE.optim, best_by="squared_error")
     same = dataclasses.replace(BASE, optim=chosen)
-    made = [experiments.components, experiments.gates, experiments.bank_sizes]
-    tables = [make(BASE) for make in made] + [experiments.comparison(BASE, "tlio", "test")]
-    rows, seen = [row for table in tables for row in table.rows], {}
+    makers = [experiments.components, experiments.gates, experiments.bank_sizes]
+    tables = [make(BASE) for make in makers] + [experiments.comparison(BASE, "tlio", "test")]
+    rows, configs = [row for table in tables for row in table.rows], {}
     for row in rows:
-        own = row.config
-        assert models.from_config(own.model) is not None
-        assert seen.setdefault(row.name, own) == own
+        config = row.config
+        assert models.from_config(config.model) is not None
+        assert configs.setdefault(row.name, config) == config
         decay = {name: getattr(chosen, name) for name in ("clip_norm", "weight_decay")}
-        optim = dataclasses.replace(own.optim, **decay)
-        assert dataclasses.replace(own, model=BASE.model, loss=BASE.loss, optim=optim) == same
-        if own.model.name == "gnio":
-            assert (own.loss, own.optim) == (same.loss, same.optim)
-    assert len(set(map(str, seen.values()))) == len(seen) < len(rows)
+        optim = dataclasses.replace(config.optim, **decay)
+        assert dataclasses.replace(config, model=BASE.model, loss=BASE.loss, optim=optim) == same
+        if config.model.name == "gnio":
+            assert (config.loss, config.optim) == (same.loss, same.optim)
+    assert len(set(map(str, configs.values()))) == len(configs) < len(rows)
 
 
 @pytest.mark.parametrize(

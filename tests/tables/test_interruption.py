@@ -22,7 +22,7 @@ def options(tmp_path, monkeypatch):
     small_tables.patch(monkeypatch)
     file = tmp_path / "base.yaml"
     configuration.save(file, small_tables.base(50.0, epochs=2))
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         yield TablesConfig("comparison", base=str(file), calibrate=True, seeds=2, methods="tiny")
 
 

@@ -30,7 +30,7 @@ from tests.support.tlio_files import write_sequence
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def workspace(tmp_path_factory):
     """A folder with recordings, a base config and the arguments that all tables share."""
     root = tmp_path_factory.mktemp("tables")
     for name in "abc":
@@ -50,15 +50,15 @@ def made(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, capsys):
-    root, arguments = made
+def test_a_table_from_nothing_and_again_without_training(workspace, monkeypatch, capsys):
+    root, arguments = workspace
     gnio("tables", "comparison", *arguments)
     text = (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8")
     assert "2 seeds" in text and "| gnio |" in text and text in capsys.readouterr().out
     with (root / "out" / "comparison_test_integrate.csv").open(encoding="utf-8") as file:
         (line,) = (row for row in csv.DictReader(file) if row["metric"] == "ate")
-    place = "eval/tlio_test_integrate/metrics.json"
-    texts = [(root / "out" / "runs" / f"gnio_s{seed}" / place).read_text() for seed in range(2)]
+    path = "eval/tlio_test_integrate/metrics.json"
+    texts = [(root / "out" / "runs" / f"gnio_s{seed}" / path).read_text() for seed in range(2)]
     ates = [json.loads(text)["mean"]["ate"] for text in texts]
     assert float(line["mean"]) == pytest.approx(np.mean(ates)) and ates[0] != ates[1]
     assert float(line["std"]) == pytest.approx(np.std(ates, ddof=1))
@@ -92,7 +92,7 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
 
 
 @pytest.mark.slow
-def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys):
+def test_every_run_is_calibrated_before_it_is_measured(workspace, monkeypatch, capsys):
     """As `gnio calibrate` does by default, of which one unknown and two steps are enough here."""
     calibrate = calibration.calibrate
 
@@ -102,12 +102,12 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
 
     monkeypatch.setattr(calibration, "calibrate", quickly)
     monkeypatch.setattr(calibration_run, "MOST_STEPS", 2)
-    root, arguments = made
+    root, arguments = workspace
     arguments = [*arguments, "--seeds", "1", "--estimator", "ekf"]
     gnio("tables", "comparison", *arguments)
     gnio("tables", "comparison", *arguments, "--calibrate")
-    told = capsys.readouterr()
-    assert "calibrating gnio_s0" in told.err and "gnio calibrate on val;" in told.out
+    output = capsys.readouterr()
+    assert "calibrating gnio_s0" in output.err and "gnio calibrate on val;" in output.out
     figures, names = [], ("gnio_s0", "gnio_s0_calibrated")
     for ending in ("", "_calibrated"):
         text = (root / "out" / f"comparison_test_ekf{ending}.csv").read_text()
@@ -147,12 +147,12 @@ def test_rows_free_their_programs_and_the_note_names_what_is_not_calibrated(tmp_
     assert "Not calibrated" not in shown[1]
 
 
-def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys):
-    root, arguments = made
+def test_a_signal_ends_the_table_and_says_how_to_go_on(workspace, monkeypatch, capsys):
+    root, arguments = workspace
     monkeypatch.setattr(loop, "train_all", lambda *_, **__: [loop.TrainingResult(root, None, 15)])
-    with pytest.raises(SystemExit) as left:
+    with pytest.raises(SystemExit) as end:
         gnio("tables", "gates", *arguments, "--out", str(root / "elsewhere"))
-    assert left.value.code == 128 + 15 and "continues from here" in capsys.readouterr().err
+    assert end.value.code == 128 + 15 and "continues from here" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -164,17 +164,17 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
         (["--base", "configs/baselines/tlio.yaml"], "is of the network 'tlio'"),
     ],
 )
-def test_mistakes_are_named(made, more, words):
+def test_mistakes_are_named(workspace, more, words):
     with pytest.raises(InputError, match=words):
-        gnio("tables", "comparison", *made[1], *more)
+        gnio("tables", "comparison", *workspace[1], *more)
 
 
 @pytest.mark.slow
 def test_networks_that_learn_from_two_datasets_are_measured_on_one_that_is_named(
-    made, tmp_path, monkeypatch
+    workspace, tmp_path, monkeypatch
 ):
     """The second measurement trains nothing, and its files have another name."""
-    root, arguments = made
+    root, arguments = workspace
     small_tables.patch(monkeypatch)
     monkeypatch.setenv("GNIO_DATA", str(tmp_path))
     (tmp_path / "tlio").symlink_to(root / "data")
@@ -208,9 +208,9 @@ def test_networks_that_learn_from_two_datasets_are_measured_on_one_that_is_named
     assert "| gnio | walking |" in text
 
 
-def test_a_row_that_cannot_be_trained_is_refused_before_any_other_is(made, monkeypatch):
+def test_a_row_that_cannot_be_trained_is_refused_before_any_other_is(workspace, monkeypatch):
     """At 50 Hz an interval of 0.1 s has 5 samples. Of scikit-learn there is none."""
-    root, arguments = made
+    root, arguments = workspace
     monkeypatch.setattr(make, "announce", None)
     monkeypatch.setitem(sys.modules, "sklearn", None)
     out = ["--out", str(root / "refused")]

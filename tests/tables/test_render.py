@@ -25,7 +25,7 @@ def result(name, ates, published=None, groups="xyz"):
 
 
 def table_of(*results):
-    return Experiment("Title", "source", [each.row for each in results])
+    return Experiment("Title", "source", [row_result.row for row_result in results])
 
 
 def test_a_table_by_hand():
@@ -45,8 +45,8 @@ def test_a_table_by_hand():
     assert means + "| -1.50 (-5.80 to +2.80) | 1.23 | 12,345 | 1.80 | ↓ 25.0 % |" in text
     assert "| A | 3.00 ± 0.00 | 0.300 ± 0.000 | – | 2.50 |  |  | 1.23 | 12,345 | 2.40 |  |" in text
     assert "there are 3." in text and "†" not in text
-    found = [make.arrow(gain) for gain in (12.34, -5.0, 0.01, None)]
-    assert found == ["↓ 12.3 %", "↑ 5.0 %", "0 %", "–"]
+    arrows = [make.arrow(gain) for gain in (12.34, -5.0, 0.01, None)]
+    assert arrows == ["↓ 12.3 %", "↑ 5.0 %", "0 %", "–"]
 
 
 def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
@@ -63,7 +63,7 @@ def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
     assert "| C | – † 3/3 | – † 3/3 | ∞ | – | – |" in text and "| – | – ‡ |" in text
     for mark in ("† This number", "‡ Its remaining", "A difference is over"):
         assert mark in text
-    heads = [{"row": each.row.name} for each in results]
+    heads = [{"row": row_result.row.name} for row_result in results]
     tabulate.write(tmp_path / "t", text, tabulate.records(heads, figures))
     with open(tmp_path / "t.csv", newline="", encoding="utf-8") as file:
         one, two, three, four = (row for row in csv.DictReader(file) if row["metric"] == "ate")

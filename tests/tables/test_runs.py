@@ -15,10 +15,10 @@ from tests.support.reports import BASE, digest, write_run
 
 
 def test_a_calibration_is_of_the_best_weights_and_warns(tmp_path, monkeypatch, capsys):
-    run, made = tmp_path / "gnio_s0", []
+    run, configs = tmp_path / "gnio_s0", []
 
     def calibrate(config, workers):
-        made.append(config)
+        configs.append(config)
         shutil.copytree(config.network, config.out)
         return SimpleNamespace(warnings=("larger errors",))
 
@@ -28,11 +28,11 @@ def test_a_calibration_is_of_the_best_weights_and_warns(tmp_path, monkeypatch, c
         assert runs.calibrate_run(run, Lines()) == tmp_path / "gnio_s0_calibrated"
     expected = ["calibrating gnio_s0", "warning: gnio_s0_calibrated: larger errors"]
     assert capsys.readouterr().err.splitlines() == expected
-    assert made == [CalibrateConfig(str(run), out=str(tmp_path / "gnio_s0_calibrated"))]
+    assert configs == [CalibrateConfig(str(run), out=str(tmp_path / "gnio_s0_calibrated"))]
     # The run goes on and finds better weights: what was fitted to the old ones is replaced.
     write_run(run, step=9)
     runs.calibrate_run(run, Lines())
-    assert len(made) == 2 and digest(tmp_path / "gnio_s0_calibrated") == digest(run)
+    assert len(configs) == 2 and digest(tmp_path / "gnio_s0_calibrated") == digest(run)
 
 
 def test_a_run_that_cannot_be_calibrated_is_measured_as_it_is(tmp_path, monkeypatch, capsys):
@@ -66,9 +66,9 @@ def test_a_run_of_other_recordings_is_refused(tmp_path, monkeypatch):
         (tmp_path / name).mkdir()
     workdir = tmp_path / "gnio"
     config = dataclasses.replace(BASE, data_root=str(tmp_path / "A"), workdir=str(workdir))
-    (kept,) = configuration.with_seeds(config, [0])
+    (seed_config,) = configuration.with_seeds(config, [0])
     write_run(tmp_path / "gnio_s0")
-    configuration.save(tmp_path / "gnio_s0" / "config.yaml", kept)
+    configuration.save(tmp_path / "gnio_s0" / "config.yaml", seed_config)
     (tmp_path / "gnio_s0" / "metrics.jsonl").write_text("{}\n" * BASE.optim.epochs)
     monkeypatch.setattr(runs.loop, "train_all", None)
     runs.train(config, [0], Lines())

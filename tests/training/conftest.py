@@ -9,7 +9,7 @@ from tests.support.tlio_files import write_splits
 
 @pytest.fixture(scope="package", autouse=True)
 def registered():
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         yield
 
 

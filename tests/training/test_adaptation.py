@@ -45,13 +45,13 @@ def turned(vectors, angle):
 
 def test_the_consistency_is_the_cosine_where_there_is_motion():
     angle_key, dropout_key = jax.random.split(jax.random.key(3))
-    given, model = variables(2.0, 0.5), Uneven()
+    weights, model = variables(2.0, 0.5), Uneven()
     displacement = np.array([[3.0, 0, 0], [0.1, 0, 9], [0, 2, 0], [-1, 1, 0]])
     windows = Windows(WINDOWS, jnp.asarray(displacement, jnp.float32), jnp.zeros((4, 6, 3)))
-    prediction = model.apply(given, WINDOWS)
+    prediction = model.apply(weights, WINDOWS)
     keys = angle_key, dropout_key
-    found = quick(
-        lambda w: network_losses.rotation_consistency(model, given, w, prediction, keys, 1.0)
+    loss = quick(
+        lambda w: network_losses.rotation_consistency(model, weights, w, prediction, keys, 1.0)
     )(windows)
     angles = jax.random.uniform(angle_key, (4,), jnp.float32, 0.0, jnp.float32(2 * np.pi))
     factors, total = np.array([2.0, 0.5]), 0.0
@@ -60,7 +60,7 @@ def test_the_consistency_is_the_cosine_where_there_is_motion():
         one = turned(mean * factors, float(angles[number]))
         two = turned(mean, float(angles[number])) * factors
         total += one @ two / np.linalg.norm(one) / np.linalg.norm(two)
-    np.testing.assert_allclose(found, -total / 4, atol=1e-5)
+    np.testing.assert_allclose(loss, -total / 4, atol=1e-5)
 
 
 def test_a_certain_network_stays_and_a_collapsed_one_comes_back():
@@ -69,21 +69,21 @@ def test_a_certain_network_stays_and_a_collapsed_one_comes_back():
     # The same at every heading: no variance at all.
     collapsed = adaptation.adapt(model, first, variables(3.0, 3.0), WINDOWS)
     assert collapsed.decision == "restored" and collapsed.variables is first
-    given = variables(1.0, 1.6)
-    spread = np.asarray(adaptation.ensemble_variance(model, given, 1.0 * WINDOWS))
+    weights = variables(1.0, 1.6)
+    spread = np.asarray(adaptation.ensemble_variance(model, weights, 1.0 * WINDOWS))
     scale = np.sqrt(0.02 / spread.mean())
-    kept = adaptation.adapt(model, first, given, scale * WINDOWS)
+    outcome = adaptation.adapt(model, first, weights, scale * WINDOWS)
     if spread.min() * scale**2 > adaptation.LEAST_VARIANCE:
-        assert kept.decision == "kept" and kept.variables is given
+        assert outcome.decision == "kept" and outcome.variables is weights
 
 
 def test_an_uncertain_network_becomes_more_consistent_by_its_normalisations_alone():
-    model, given = Uneven(), variables(2.0, 0.5)
-    before = np.asarray(adaptation.ensemble_variance(model, given, 9 * WINDOWS))
+    model, weights = Uneven(), variables(2.0, 0.5)
+    before = np.asarray(adaptation.ensemble_variance(model, weights, 9 * WINDOWS))
     assert before.min() > adaptation.LEAST_VARIANCE
-    found = adaptation.adapt(model, given, given, 9 * WINDOWS, learning_rate=0.05)
-    assert found.decision == "adapted"
-    after = found.variables["params"]
-    np.testing.assert_array_equal(after["weight"], given["params"]["weight"])
+    outcome = adaptation.adapt(model, weights, weights, 9 * WINDOWS, learning_rate=0.05)
+    assert outcome.decision == "adapted"
+    after = outcome.variables["params"]
+    np.testing.assert_array_equal(after["weight"], weights["params"]["weight"])
     ratio = after["norm"]["scale"][0] / after["norm"]["scale"][1]
     assert 1 < ratio < 4 - 0.3

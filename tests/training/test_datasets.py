@@ -47,7 +47,7 @@ def folders(tmp_path_factory):
         yield
 
 
-def both(workdir, weights=(0.5, 1.5)):
+def experiment(workdir, weights=(0.5, 1.5)):
     of_data = DataConfig(rate=50.0, weights=weights)
     return tiny_run.config(None, workdir, dataset=BOTH, data=of_data)
 
@@ -55,13 +55,13 @@ def both(workdir, weights=(0.5, 1.5)):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     workdir = tmp_path_factory.mktemp("finished") / "run"
-    loop.train(both(workdir))
+    loop.train(experiment(workdir))
     return workdir
 
 
 def test_a_run_keeps_the_figures_of_each_dataset_and_chooses_by_their_mean(run):
     assert yaml.safe_load((run / "config.yaml").read_text())["dataset"] == list(BOTH)
-    assert configuration.load(run) == both(run)
+    assert configuration.load(run) == experiment(run)
     splits = yaml.safe_load((run / "splits.yaml").read_text())
     assert {split: list(names) for split, names in splits.items()} == {
         "train": ["tlio/a", "other/b"],
@@ -74,10 +74,10 @@ def test_a_run_keeps_the_figures_of_each_dataset_and_chooses_by_their_mean(run):
             assert row[figure] == pytest.approx(mean, rel=1e-6)
     best = min(rows, key=lambda row: row["val_loss"])
     assert read_network(run).step == best["step"]
-    each = len(range(0, 600 - 50, 5))  # windows of a walk of 12 s at 50 Hz, every 0.1 s
-    assert rows[0]["step"] == (0.5 * each + 1.5 * each) // 16
+    count = len(range(0, 600 - 50, 5))  # windows of a walk of 12 s at 50 Hz, every 0.1 s
+    assert rows[0]["step"] == (0.5 * count + 1.5 * count) // 16
     (line,) = loop.describe_epoch(
-        row | {"windows_per_second": 9.0}, True, WindowTask(Tiny(), both(""), 1)
+        row | {"windows_per_second": 9.0}, True, WindowTask(Tiny(), experiment(""), 1)
     )
     assert f"(tlio {row['val_rmse/tlio']:.4f}, other {row['val_rmse/other']:.4f})" in line
 
@@ -86,15 +86,15 @@ def test_each_dataset_is_validated_on_all_of_its_own_windows(run):
     row, latest = tiny_run.rows(run)[-1], checkpoint.load_latest(run)
     for name in BOTH:
         (walk,) = data.load(name, split="val")
-        found = tiny_run.mean_square_error(latest, walk)
-        assert row[f"val_mse/{name}"] == pytest.approx(found, rel=1e-4)
+        error = tiny_run.mean_square_error(latest, walk)
+        assert row[f"val_mse/{name}"] == pytest.approx(error, rel=1e-4)
     assert row["val_mse/other"] > 4 * row["val_mse/tlio"]
 
 
 def test_stopped_and_resumed_with_several_datasets_gives_the_same_bits(run, tmp_path):
     with tiny_run.stopped_at(4):
-        assert loop.train(both(tmp_path / "run")).stopped_by == signal.SIGTERM
-    assert loop.train(both(tmp_path / "run"), resume=True).stopped_by is None
+        assert loop.train(experiment(tmp_path / "run")).stopped_by == signal.SIGTERM
+    assert loop.train(experiment(tmp_path / "run"), resume=True).stopped_by is None
     tiny_run.assert_same_runs(tmp_path / "run", run)
 
 
@@ -158,28 +158,28 @@ def test_the_mean_is_over_the_datasets_that_have_a_figure(run):
         def calibrate_uncertainty(self, state, held_out):
             return state
 
-    task = Figures(Tiny(), both(run), 1)
+    task = Figures(Tiny(), experiment(run), 1)
     held_out = {"a": {"val_loss": 3.0}, "b": {"val_waypoint_error": 0.2}, "c": {}}
     _, row = task.validate(TrainState(jnp.int32(0), {}, None), held_out, jax.random.key(0))
     assert row["val_waypoint_error"] == 0.2 and row["val_loss"] == pytest.approx(5 / 3)
 
 
 def test_an_evaluation_says_of_which_dataset(run):
-    asked = EvaluateConfig(str(run))
+    config = EvaluateConfig(str(run))
     with pytest.raises(InputError, match=r"has learnt from tlio, other; give --dataset, e\.g\. tl"):
-        resolve(asked, both(run))
-    assert resolve(dataclasses.replace(asked, dataset="other"), both(run)).dataset == "other"
+        resolve(config, experiment(run))
+    assert resolve(dataclasses.replace(config, dataset="other"), experiment(run)).dataset == "other"
 
 
 def test_a_calibration_takes_a_folder_for_each_dataset(run, monkeypatch):
     read = []
     monkeypatch.setattr(data, "load", lambda name, root, *_: read.append((name, root)) or [])
-    asked = [predictions.FoldNetwork(read_network(run), None)]
+    networks = [predictions.FoldNetwork(read_network(run), None)]
 
     def gather(*roots):
         config = CalibrateConfig(data_root=roots)
         with pytest.raises(InputError) as refused:  # also where there is nothing to be fitted
-            predictions.predict("val", asked, config, TrainConfig().filter, lambda *_: None, 1)
+            predictions.predict("val", networks, config, TrainConfig().filter, lambda *_: None, 1)
         return str(refused.value)
 
     assert "has no recording with a reference" in gather() + gather("one", "two")

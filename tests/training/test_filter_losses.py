@@ -113,9 +113,9 @@ def test_the_relative_translation_is_kittis():
 
 def test_the_likelihood_of_innovations_is_the_mean_over_those_that_there_are():
     likelihood = np.array([np.nan, 2.0, np.nan, 5.0])
-    both = quick(jax.value_and_grad(filter_losses.innovation_nll))
-    value, slope = both(likelihood)
-    assert value == -3.5 and both(np.full(4, np.nan))[0] == 0
+    value_and_slope = quick(jax.value_and_grad(filter_losses.innovation_nll))
+    value, slope = value_and_slope(likelihood)
+    assert value == -3.5 and value_and_slope(np.full(4, np.nan))[0] == 0
     np.testing.assert_array_equal(slope, [0, -0.5, 0, -0.5])
 
 
@@ -123,25 +123,25 @@ def windows_told(estimate, truth):
     """What a network without error says: the true displacement in the filter's own yaw frame, which
     is off the true one by the yaw error."""
     psi = yaw_errors(estimate, truth)
-    own = np.arctan2(estimate.rotation[:, 1, 0], estimate.rotation[:, 0, 0])
-    told = np.full((K, 3), np.nan)
+    yaws = np.arctan2(estimate.rotation[:, 1, 0], estimate.rotation[:, 0, 0])
+    displacements = np.full((K, 3), np.nan)
     for k in range(W, K):  # row k: after interval k, at index k + 1 of a path
         i, j = k + 1 - W, k + 1
-        told[k] = Rotation.from_euler("z", psi[i] - own[i]).apply(
+        displacements[k] = Rotation.from_euler("z", psi[i] - yaws[i]).apply(
             truth.position[j] - truth.position[i]
         )
-    return told
+    return displacements
 
 
 def test_window_error():
     """The filter's frame is no part of it: no gradient turns it to make the network right."""
     estimate, truth = paths()
-    told = windows_told(estimate, truth)
-    assert window_error(told, estimate, truth, W)[0] < 1e-25
+    displacements = windows_told(estimate, truth)
+    assert window_error(displacements, estimate, truth, W)[0] < 1e-25
     off = 0.1 * np.random.default_rng(2).standard_normal((K, 3))
     off[10] = np.nan
-    found, (slope, of_frame) = window_error(told + off, estimate, truth, W)
-    np.testing.assert_allclose(found, np.nanmean(np.sum(off[W:] ** 2, 1)), rtol=1e-12)
+    error, (slope, of_frame) = window_error(displacements + off, estimate, truth, W)
+    np.testing.assert_allclose(error, np.nanmean(np.sum(off[W:] ** 2, 1)), rtol=1e-12)
     assert np.isfinite(slope).all() and slope[W:10].any()
     assert not slope[10].any() and not slope[:W].any() and not of_frame.rotation.any()
 
@@ -164,9 +164,9 @@ def test_the_sum_has_the_weights_and_the_horizons_that_fit():
     losses = quick(filter_losses.filter_losses, static_argnums=(3, 4))
     signal, nowhere = np.zeros((4 * K, 3)), np.full((4 * K, 2), np.nan)
     segment = Segment(signal, signal, truth, nowhere, jnp.bool_(False))
-    found = losses(estimate, segment, history, CONFIG, weights)
-    np.testing.assert_allclose(found.displacement, [relative(5)[0], relative(25)[0]], rtol=1e-12)
-    np.testing.assert_allclose(found.yaw, [relative(5)[1], relative(25)[1]], rtol=1e-12)
+    figures = losses(estimate, segment, history, CONFIG, weights)
+    np.testing.assert_allclose(figures.displacement, [relative(5)[0], relative(25)[0]], rtol=1e-12)
+    np.testing.assert_allclose(figures.yaw, [relative(5)[1], relative(25)[1]], rtol=1e-12)
     error = np.concatenate(
         [truth.velocity - estimate.velocity, truth.position - estimate.position], 1
     )[1:]
@@ -174,14 +174,14 @@ def test_the_sum_has_the_weights_and_the_horizons_that_fit():
         -multivariate_normal(cov=p[3:9, 3:9]).logpdf(e) - 3 * np.log(2 * np.pi)
         for e, p in zip(error, history.covariance, strict=True)
     ]
-    np.testing.assert_allclose(found.state, np.mean(nll), rtol=1e-9)
-    np.testing.assert_allclose(found.innovation, -history.log_likelihood.mean(), rtol=1e-12)
-    np.testing.assert_allclose(found.window, 0.03, rtol=1e-12)
-    total = sum(np.mean(getattr(found, name)) * value for name, value in of_each.items())
-    np.testing.assert_allclose(found.total, total, rtol=1e-12)
+    np.testing.assert_allclose(figures.state, np.mean(nll), rtol=1e-9)
+    np.testing.assert_allclose(figures.innovation, -history.log_likelihood.mean(), rtol=1e-12)
+    np.testing.assert_allclose(figures.window, 0.03, rtol=1e-12)
+    total = sum(np.mean(getattr(figures, name)) * value for name, value in of_each.items())
+    np.testing.assert_allclose(figures.total, total, rtol=1e-12)
     squares = [
         e[3:] @ np.linalg.solve(p[6:9, 6:9], e[3:])
         for e, p in zip(error, history.covariance, strict=True)
     ]
-    np.testing.assert_allclose(found.nees, np.mean(squares) / 3, rtol=1e-9)
-    assert found.nis == 2.0 and found.healthy
+    np.testing.assert_allclose(figures.nees, np.mean(squares) / 3, rtol=1e-9)
+    assert figures.nis == 2.0 and figures.healthy

@@ -62,13 +62,13 @@ def assert_kept(run):
 @pytest.mark.parametrize("size, error", [(100, OSError), (10_000, ValueError)])
 def test_a_write_that_fails_keeps_the_checkpoint(run, size, error):
     """In the metadata, which Python writes, and in the arrays, where Orbax raises ValueError."""
-    with files_of_at_most(size), pytest.raises(error) as told:
+    with files_of_at_most(size), pytest.raises(error) as failure:
         save(run, 2)
     if error is OSError:
-        assert told.value.errno == errno.EFBIG
-        assert str(run / "checkpoints" / "latest") in told.value.filename
+        assert failure.value.errno == errno.EFBIG
+        assert str(run / "checkpoints" / "latest") in failure.value.filename
     else:
-        assert f"os_error_code='{errno.EFBIG}'" in str(told.value)
+        assert f"os_error_code='{errno.EFBIG}'" in str(failure.value)
     assert_kept(run)
     wait_for_writers(run)
     save(run, 3)  # where there is room again
@@ -78,10 +78,10 @@ def test_a_write_that_fails_keeps_the_checkpoint(run, size, error):
 def test_a_disk_without_room_is_told_before_anything_is_written(run, monkeypatch, capfd):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 10**9 - 60_000, 60_000))
-    with pytest.raises(OSError) as told:
+    with pytest.raises(OSError) as failure:
         save(run, 2)
-    assert told.value.errno == errno.ENOSPC
-    assert told.value.filename == str(run / "checkpoints" / "latest")
+    assert failure.value.errno == errno.ENOSPC
+    assert failure.value.filename == str(run / "checkpoints" / "latest")
     assert [child.name for child in (run / "checkpoints" / "latest").iterdir()] == ["1"]
     assert capfd.readouterr() == ("", "")
     assert_kept(run)
@@ -90,9 +90,9 @@ def test_a_disk_without_room_is_told_before_anything_is_written(run, monkeypatch
 def test_a_log_that_cannot_be_written_names_its_place(tmp_path):
     with Log(tmp_path, 0, 0) as log:
         log.add({"epoch": 0, "step": 1, "loss": 1.0})
-        with files_of_at_most(50), pytest.raises(OSError) as told:
+        with files_of_at_most(50), pytest.raises(OSError) as failure:
             log.add({"epoch": 1, "step": 2, "loss": 1.0})
-    assert told.value.filename == str(tmp_path / "metrics.jsonl")
+    assert failure.value.filename == str(tmp_path / "metrics.jsonl")
     assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 1
 
 
@@ -101,10 +101,10 @@ def test_a_board_that_cannot_be_written_names_its_place(tmp_path, monkeypatch):
     monkeypatch.setattr(run_folder, "write_text", lambda *_: None)  # which would fail first
     many = {f"gradient_norm/{i}": 1.0 for i in range(100)}
     with Log(tmp_path, 0, 0) as log:
-        with files_of_at_most(6000), pytest.raises(OSError) as told:
+        with files_of_at_most(6000), pytest.raises(OSError) as failure:
             for step in range(20):
                 log.add({"epoch": step, "step": step, **many})
-    assert told.value.filename == str(tmp_path / "tensorboard")
+    assert failure.value.filename == str(tmp_path / "tensorboard")
 
 
 def test_arrays_that_are_cut_short_are_told(run):
@@ -115,7 +115,7 @@ def test_arrays_that_are_cut_short_are_told(run):
 
 
 def test_what_a_killed_process_left_is_removed(tmp_path):
-    rest = tmp_path / "checkpoints" / "latest" / "7.orbax-checkpoint-tmp"
-    rest.mkdir(parents=True)
+    remnant = tmp_path / "checkpoints" / "latest" / "7.orbax-checkpoint-tmp"
+    remnant.mkdir(parents=True)
     save(tmp_path, 1)
-    assert not rest.exists()
+    assert not remnant.exists()

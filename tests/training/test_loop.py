@@ -37,29 +37,29 @@ from tests.support.tiny_run import (
 def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished):
     workdir, outcome = finished
     assert configuration.load(workdir / "config.yaml") == config(recording, workdir)
-    found = rows(workdir)
-    assert [row["epoch"] for row in found] == [0, 1, 2]
+    log_rows = rows(workdir)
+    assert [row["epoch"] for row in log_rows] == [0, 1, 2]
     count = 2 * len(range(0, 600 - 50, 5))  # a window of 1 s every 0.1 s, two recordings
-    assert [row["step"] for row in found] == [count // 16 * k for k in (1, 2, 3)]
-    assert outcome.best_loss == min(row["val_loss"] for row in found)
-    assert found[-1]["loss"] < found[0]["loss"]
-    total = 100 * found[-1]["mse"] + 1e-4 * found[-1]["nll"]
-    assert found[-1]["loss"] == pytest.approx(total, rel=1e-5)
+    assert [row["step"] for row in log_rows] == [count // 16 * k for k in (1, 2, 3)]
+    assert outcome.best_loss == min(row["val_loss"] for row in log_rows)
+    assert log_rows[-1]["loss"] < log_rows[0]["loss"]
+    total = 100 * log_rows[-1]["mse"] + 1e-4 * log_rows[-1]["nll"]
+    assert log_rows[-1]["loss"] == pytest.approx(total, rel=1e-5)
     splits = yaml.safe_load((workdir / "splits.yaml").read_text())
     assert {split: list(names) for split, names in splits.items()} == {
         "train": ["a", "b"],
         "val": ["c"],
     }
     assert list((workdir / "tensorboard").glob("events*"))
-    best = min(found, key=lambda row: row["val_loss"])
+    best = min(log_rows, key=lambda row: row["val_loss"])
     assert read_network(workdir).step == best["step"]
-    assert checkpoint.load_latest(workdir).step == found[-1]["step"]
+    assert checkpoint.load_latest(workdir).step == log_rows[-1]["step"]
 
 
 def test_validation_is_the_plain_mean_over_every_window(recording, finished):
     (walk,) = data.load("tlio", recording, "val")
-    found = mean_square_error(checkpoint.load_latest(finished[0]), walk)
-    assert rows(finished[0])[-1]["val_mse"] == pytest.approx(found, rel=1e-4)
+    error = mean_square_error(checkpoint.load_latest(finished[0]), walk)
+    assert rows(finished[0])[-1]["val_mse"] == pytest.approx(error, rel=1e-4)
 
 
 def test_stopped_and_killed_and_resumed_gives_the_same_bits(
@@ -77,8 +77,8 @@ def test_stopped_and_killed_and_resumed_gives_the_same_bits(
     def kill_after(owner, name):
         """As the process dies behind the first call."""
 
-        def killed(*given):
-            real(*given)
+        def killed(*arguments):
+            real(*arguments)
             raise RuntimeError("killed")
 
         real = getattr(owner, name)
@@ -100,22 +100,24 @@ def test_seeds_are_ordinary_runs_that_share_recordings_and_programs(
 ):
     """And a signal stops the one that it meets, in whose place the command goes on."""
     jitted = task.train_steps, window_task.validate
-    programs = [each._cache_size() for each in jitted]
-    both = configuration.with_seeds(config(recording, tmp_path / "run"), (3, 0))
-    workdirs = [Path(each.workdir) for each in both]
+    programs = [function._cache_size() for function in jitted]
+    configs = configuration.with_seeds(config(recording, tmp_path / "run"), (3, 0))
+    workdirs = [Path(run.workdir) for run in configs]
     with stopped_at(STEPS + 2):
-        assert [each.stopped_by for each in loop.train_all(both)] == [signal.SIGTERM]
+        assert [outcome.stopped_by for outcome in loop.train_all(configs)] == [signal.SIGTERM]
     assert not workdirs[1].exists()
     with stopped_at(3 * STEPS):  # the first is complete, and a seed is missing
-        outcomes = loop.train_all(both, resume=True)
-    assert [each.stopped_by for each in outcomes] == [signal.SIGTERM]
+        outcomes = loop.train_all(configs, resume=True)
+    assert [outcome.stopped_by for outcome in outcomes] == [signal.SIGTERM]
     capsys.readouterr()
-    outcomes = loop.train_all(both, resume=True)
-    assert [(each.workdir, each.stopped_by) for each in outcomes] == [(w, None) for w in workdirs]
-    told = capsys.readouterr().err.splitlines()
-    assert sum(line.startswith("reading") for line in told) == 1
-    assert [each._cache_size() for each in jitted] == programs
-    assert configuration.load(workdirs[1]) == both[1]
+    outcomes = loop.train_all(configs, resume=True)
+    assert [(outcome.workdir, outcome.stopped_by) for outcome in outcomes] == [
+        (w, None) for w in workdirs
+    ]
+    lines = capsys.readouterr().err.splitlines()
+    assert sum(line.startswith("reading") for line in lines) == 1
+    assert [function._cache_size() for function in jitted] == programs
+    assert configuration.load(workdirs[1]) == configs[1]
     assert_same_runs(workdirs[1], finished[0])
     assert rows(workdirs[0])[-1]["val_loss"] != rows(workdirs[1])[-1]["val_loss"]
 
@@ -154,9 +156,9 @@ def test_refused_before_anything_is_written(recording, finished, tmp_path):
         ("none", True, {}, "none: holds no run to resume"),
         ("none", False, {"batch_size": 999}, r"optim\.batch_size: is 999, but there are only 220"),
     ):
-        given = config(recording, tmp_path / folder, **changes)
+        experiment = config(recording, tmp_path / folder, **changes)
         with pytest.raises(InputError, match=problem):
-            loop.train(given, resume=resume)
+            loop.train(experiment, resume=resume)
         assert [path.name for path in tmp_path.rglob("*")] == ["run", "config.yaml"]
 
 
@@ -196,8 +198,8 @@ def test_two_trainings_in_one_folder(recording, tmp_path):
     recordings = TrainingData(None, {}, {"train": ["a", "b"], "val": ["c"]})
 
     def begin(seed):
-        given = dataclasses.replace(first, seed=seed), recordings, {}, False
-        with run_folder.open_run(*given):
+        arguments = dataclasses.replace(first, seed=seed), recordings, {}, False
+        with run_folder.open_run(*arguments):
             pass
 
     with run_folder.open_run(first, recordings, {}, resume=False):
@@ -261,10 +263,10 @@ def test_a_step_that_is_not_finite_leaves_the_last_good_checkpoint(
     second epoch. Its loss, of about 1e38, is finite, and the norm of its gradient is not."""
     take_steps = WindowTask.take_steps
 
-    def spoiled(self, state, source, *given):
-        if int(state.step) + int(given[2]) >= 2 * STEPS:
+    def spoiled(self, state, source, *arguments):
+        if int(state.step) + int(arguments[2]) >= 2 * STEPS:
             source = source._replace(displacement=source.displacement + np.float32(5e17))
-        return take_steps(self, state, source, *given)
+        return take_steps(self, state, source, *arguments)
 
     monkeypatch.setattr(WindowTask, "take_steps", spoiled)
     problem = rf"run: the loss or its gradient is not finite at step {2 * STEPS - 1} \(epoch 1\)"
@@ -294,11 +296,11 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(task, "train_steps", spy(task.train_steps))
     monkeypatch.setattr(window_task, "validate", spy(window_task.validate))
     loss = LossConfig(nll_from_epoch=99.0)
-    given = config(recording, tmp_path / "run", epochs=1, loss=loss)
-    loop.train(given)
+    experiment = config(recording, tmp_path / "run", epochs=1, loss=loss)
+    loop.train(experiment)
     key = jax.random.split(jax.random.key(0), 3)[0]
     model = Tiny(uncertainty="calibrated")
-    start = jax.tree.map(np.asarray, fresh_state(model, given, 1, key).variables["params"])
+    start = jax.tree.map(np.asarray, fresh_state(model, experiment, 1, key).variables["params"])
     trained = arrays(tmp_path / "run")[0]["params"]
     assert same(trained["uncertainty"], start["uncertainty"])
     assert not same(trained["head"], start["head"])
@@ -313,7 +315,7 @@ def counted(recording, tmp_path, monkeypatch):
     steps count; it returns the outcome and the plateau's factors."""
 
     def train(figures, folder="run", resume=False, stop_at=0, **changes):
-        given, factors, seen = iter(figures), [], []
+        pairs, factors, calls = iter(figures), [], []
 
         def train_steps(state, source, order, first, count, factor, *_, **__):
             factors.append(float(factor))
@@ -321,10 +323,10 @@ def counted(recording, tmp_path, monkeypatch):
             return state._replace(step=state.step + count), task.DispatchSums(sums, jnp.int32(-1))
 
         def validate(*_, **__):
-            seen.append(1)
-            if len(seen) == stop_at:
+            calls.append(1)
+            if len(calls) == stop_at:
                 signal.raise_signal(signal.SIGTERM)
-            loss, mse = next(given)
+            loss, mse = next(pairs)
             one = jnp.ones(3, jnp.float32)
             means = Losses(jnp.float32(loss), jnp.float32(mse), jnp.float32(0))
             return window_task.Validation(means, one, one)
@@ -410,9 +412,9 @@ def test_what_makes_no_sense_is_warned_of(counted, recording, tmp_path, capsys):
     (tmp_path / "data" / "val_list.txt").write_text("c\nb\n")
     loss = LossConfig(log_std_from_epoch=10.0)
     counted([(1.0, 1.0)], loss=loss, data_root=str(tmp_path / "data"))
-    both, late, epoch = [
+    overlap, delay, epoch = [
         line for line in capsys.readouterr().err.splitlines() if line.startswith(("warn", "epoch"))
     ]
-    assert "b in train and in val: the best checkpoint is chosen by" in both
-    assert f"the uncertainty learns only from step {10 * STEPS} on, and the run ends at" in late
+    assert "b in train and in val: the best checkpoint is chosen by" in overlap
+    assert f"the uncertainty learns only from step {10 * STEPS} on, and the run ends at" in delay
     assert "mse 0 nll 0  val mse 1 nll 0" in epoch

@@ -46,9 +46,9 @@ def test_losses_by_hand():
         (LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0), mse + mae),
         (LossConfig(nll_from_epoch=3.0), 100 * mse),
     ):
-        found = found_losses(prediction, walked, config, epoch=2)
+        figures = found_losses(prediction, walked, config, epoch=2)
         np.testing.assert_allclose(
-            [found.mse, found.nll, found.total], [mse, nll, total], rtol=1e-6
+            [figures.mse, figures.nll, figures.total], [mse, nll, total], rtol=1e-6
         )
 
 
@@ -74,18 +74,18 @@ def test_switches_are_steps():
     """The first whole step after a fraction of an epoch; without a likelihood the uncertainty has
     nothing to learn from, unless the loss has one of its own."""
     config = LossConfig(nll_from_epoch=0.5, log_std_from_epoch=1.25)
-    own = LossConfig(name="velocity_and_covariance", nll_from_epoch=3.0)
-    for given, steps, switches in (
+    ctins_loss = LossConfig(name="velocity_and_covariance", nll_from_epoch=3.0)
+    for loss, steps, switches in (
         (config, 8, (4, 10)),
         (config, 7, (4, 9)),
         (LossConfig(nll_from_epoch=3.0), 7, (21, 21)),
-        (own, 7, (21, 0)),
+        (ctins_loss, 7, (21, 0)),
         (LossConfig(log_std_from_epoch=1e9), 300, (0, 2**31 - 1)),
     ):
-        assert losses.switches(given, steps) == switches
-    seen = [losses.loss_stage(config, step, 8) for step in range(12)]
-    assert [float(stage.nll_weight) > 0 for stage in seen] == [step >= 4 for step in range(12)]
-    assert [bool(stage.log_std_learns) for stage in seen] == [step >= 10 for step in range(12)]
+        assert losses.switches(loss, steps) == switches
+    stages = [losses.loss_stage(config, step, 8) for step in range(12)]
+    assert [float(stage.nll_weight) > 0 for stage in stages] == [step >= 4 for step in range(12)]
+    assert [bool(stage.log_std_learns) for stage in stages] == [step >= 10 for step in range(12)]
 
 
 def test_velocity_and_covariance_by_hand():
@@ -93,10 +93,10 @@ def test_velocity_and_covariance_by_hand():
     steps *= 0.1
     single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     windows = Windows(jnp.zeros((2, 5, 6), jnp.float32), single(steps.sum(1)), single(steps))
-    said = {"velocity": single(velocity), "velocity_log_std": single(log_std)}
-    said["task_log_std"] = single([[0.3, -0.4]] * 2)
-    prediction = Prediction(single(velocity.mean(1)), single(np.zeros((2, 3))), said)
-    speed = covariance = place = 0.0
+    diagnostics = {"velocity": single(velocity), "velocity_log_std": single(log_std)}
+    diagnostics["task_log_std"] = single([[0.3, -0.4]] * 2)
+    prediction = Prediction(single(velocity.mean(1)), single(np.zeros((2, 3))), diagnostics)
+    speed = covariance = displacement = 0.0
     for b in range(2):
         for t in range(5):
             for axis in range(3):
@@ -104,13 +104,17 @@ def test_velocity_and_covariance_by_hand():
                 speed += error**2 / 10
                 squared = error**2 / np.exp(2 * log_std[b, t, axis])
                 covariance += (squared / 2 + log_std[b, t, axis]) / 10
-        place += ((steps[b].sum(0) - velocity[b].mean(0)) ** 2).sum() / 2
-    expected = (speed + place) / (2 * np.exp(0.6)) + covariance / (2 * np.exp(-0.8)) + 0.3 - 0.4
+        displacement += ((steps[b].sum(0) - velocity[b].mean(0)) ** 2).sum() / 2
+    expected = (
+        (speed + displacement) / (2 * np.exp(0.6)) + covariance / (2 * np.exp(-0.8)) + 0.3 - 0.4
+    )
     config = LossConfig(name="velocity_and_covariance")
     np.testing.assert_allclose(found_losses(prediction, windows, config).total, expected, rtol=1e-5)
     with pytest.raises(ValueError, match="velocity for every sample"):
         found_losses(prediction._replace(diagnostics={}), windows, config)
-    fewer = prediction._replace(diagnostics=said | {"velocity": said["velocity"][:, :1]})
+    fewer = prediction._replace(
+        diagnostics=diagnostics | {"velocity": diagnostics["velocity"][:, :1]}
+    )
     with pytest.raises(AssertionError, match="shape"):
         found_losses(fewer, windows, config)
 
@@ -151,10 +155,10 @@ def test_ctin_with_two_axes_is_not_blamed_for_the_vertical():
     prediction = ctins([0.1, 0.2], -1.0)
     for name in ("velocity_and_covariance", "weighted_sum"):
         config = LossConfig(name=name, mae_weight=1.0)
-        both = [found_losses(prediction, each, config, axes=2) for each in (level, climbing)]
-        assert both[0] == both[1]
+        figures = [found_losses(prediction, walk, config, axes=2) for walk in (level, climbing)]
+        assert figures[0] == figures[1]
         one_more = found_losses(prediction, climbing, config, axes=3)
-        assert one_more.total > both[1].total and one_more.mse > both[1].mse
+        assert one_more.total > figures[1].total and one_more.mse > figures[1].mse
 
 
 def test_a_prediction_of_another_shape_is_refused():
@@ -227,8 +231,8 @@ def test_the_gradient_of_a_corrector_is_clipped_by_its_own_norm():
         norm = np.hypot(0.5, 1.2)  # 1.3
         whole = np.hypot(norm, 50.0)
         for name, value in gradient.items():
-            own = 50.0 if name == "corrector" else norm
-            expected = 0.1 * np.array(value) / (own if corrector else whole)
+            part_norm = 50.0 if name == "corrector" else norm
+            expected = 0.1 * np.array(value) / (part_norm if corrector else whole)
             np.testing.assert_allclose(moments[name]["w"], expected, rtol=1e-5)
 
 
@@ -253,8 +257,8 @@ def test_adam_against_numpy(clip, decay, loss):
         assert learns == (step >= 6 or loss == LossConfig())
         moving = ("encoder", "log_std") if learns else ("encoder",)
         gradient = {part: rng.standard_normal(3) * (part in moving) for part in expected}
-        given = {"params": {part: {"w": jnp.float32(g)} for part, g in gradient.items()}}
-        change, state = update(given, state, params, log_std_learns=jnp.bool_(learns))
+        gradients = {"params": {part: {"w": jnp.float32(g)} for part, g in gradient.items()}}
+        change, state = update(gradients, state, params, log_std_learns=jnp.bool_(learns))
         params = optax.apply_updates(params, optax.tree.scale(-rate(step), change))
         norm = np.linalg.norm(np.concatenate(list(gradient.values())))
         for part in moving:

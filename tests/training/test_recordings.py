@@ -46,28 +46,28 @@ def read(monkeypatch, walks, run, workers=1):
     monkeypatch.setattr(loading, "read_split", lambda *_: iter(walks))
     config, samples = experiment(run), {}
     poses = waypoint_poses.load_pose_network(config, Lines())
-    given = config, "synthetic", "train", Lines(), workers, samples, poses
-    found = list(recordings.read_split(*given))
-    assert samples == {each.name: len(each.time) for each in found}
-    return found
+    arguments = config, "synthetic", "train", Lines(), workers, samples, poses
+    sequences = list(recordings.read_split(*arguments))
+    assert samples == {sequence.name: len(sequence.time) for sequence in sequences}
+    return sequences
 
 
 @pytest.fixture
 def smoothed(earlier, monkeypatch):
     """A smoother that is known: it moves each interpolated position a metre up, and knows nothing
     of the last three seconds. The walks that it was asked for."""
-    asked, run = [], read_network(earlier)
+    walk_names, run = [], read_network(earlier)
     network = Network.of(run.model, run.variables)
-    wanted = filtering.make_filter(run.config.data, run.config.filter)
+    expected_filter = filtering.make_filter(run.config.data, run.config.filter)
 
     def smooth(walk, predict, ekf):
-        asked.append(walk.name)
+        walk_names.append(walk.name)
         assert jnp.ones(()).dtype == np.float64
-        if len(asked) == 1:
+        if len(walk_names) == 1:
             expected = network.apply(network.variables, jnp.float32(WINDOW))
-            found = predict(jnp.float32(WINDOW))
-            np.testing.assert_array_equal(found.displacement, expected.displacement)
-            assert ekf == wanted and ekf.raw_gyro_bias == 0.03
+            prediction = predict(jnp.float32(WINDOW))
+            np.testing.assert_array_equal(prediction.displacement, expected.displacement)
+            assert ekf == expected_filter and ekf.raw_gyro_bias == 0.03
         if walk.name == "survey 1":
             raise InputError(walk.name, "the filter fails on it")
         poses = data.with_poses(walk)
@@ -81,7 +81,7 @@ def smoothed(earlier, monkeypatch):
         return filtering.WaypointPoses(poses, None, None)
 
     monkeypatch.setattr(filtering, "waypoint_poses", smooth)
-    return asked
+    return walk_names
 
 
 def tapped(seed):
@@ -96,12 +96,12 @@ def test_smooth_poses_come_from_the_run_and_then_from_the_cache(
     walks = tapped(0), tapped(1), survey(3).truth, tapped(2)
     first, _, posed, last = walks
     with jax.enable_x64(False):
-        found = read(monkeypatch, walks, earlier)
-    assert [each.name for each in found] == ["survey 0", "survey 3", "survey 2"]
+        sequences = read(monkeypatch, walks, earlier)
+    assert [sequence.name for sequence in sequences] == ["survey 0", "survey 3", "survey 2"]
     assert smoothed == ["survey 0", "survey 1", "survey 2"]
-    told = capsys.readouterr().err
-    assert "warning: survey 1: the filter fails on it" in told and "not calibrated" not in told
-    for walk, poses in zip((first, last), (found[0], found[2]), strict=True):
+    text = capsys.readouterr().err
+    assert "warning: survey 1: the filter fails on it" in text and "not calibrated" not in text
+    for walk, poses in zip((first, last), (sequences[0], sequences[2]), strict=True):
         # On the legs of the interpolation, as far as the smoother knows.
         inside = data.with_poses(walk).valid & (walk.time < walk.time[-1] - 3.0)
         inside = np.interp(poses.time, walk.time, inside) > 0.5
@@ -109,14 +109,14 @@ def test_smooth_poses_come_from_the_run_and_then_from_the_cache(
         np.testing.assert_allclose(poses.position[poses.valid][:, 2], 1.0)
         for part in (poses.position, poses.orientation, poses.velocity):
             assert np.isnan(part[~poses.valid]).all() and np.isfinite(part[poses.valid]).all()
-        known = np.interp(poses.time, walk.time, walk.accel[:, 2])
-        np.testing.assert_allclose(poses.accel[5:-5, 2], known[5:-5], atol=0.05)
-    np.testing.assert_array_equal(found[1].position, posed.position)
+        expected = np.interp(poses.time, walk.time, walk.accel[:, 2])
+        np.testing.assert_allclose(poses.accel[5:-5, 2], expected[5:-5], atol=0.05)
+    np.testing.assert_array_equal(sequences[1].position, posed.position)
 
     again = read(monkeypatch, walks, earlier)
     assert len(smoothed) == 3
     assert "warning: survey 1: the filter fails on it" in capsys.readouterr().err
-    for one, other in zip(found, again, strict=True):
+    for one, other in zip(sequences, again, strict=True):
         np.testing.assert_array_equal(one.position, other.position)
         np.testing.assert_array_equal(one.valid, other.valid)
 
@@ -130,16 +130,16 @@ def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypat
     digest = waypoint_poses.digest_network(run)
     by = waypoint_poses.PoseNetwork(str(earlier), digest)
     assert walk.waypoints is not None
-    time, place = walk.waypoints
+    time, position = walk.waypoints
     others = [
         walk._replace(name="other"),
         walk._replace(attributes=walk.attributes | {"imu_compensated": "no"}),
         walk._replace(gyro=walk.gyro + 1e-9),
         walk._replace(accel=walk.accel + 1e-9),
         walk._replace(imu_valid=np.arange(len(walk.time)) > 5),
-        walk._replace(waypoints=Waypoints(time, place + 1e-9)),
+        walk._replace(waypoints=Waypoints(time, position + 1e-9)),
     ]
-    entries = {waypoint_poses._cache_entry(each, by) for each in [walk, *others]}
+    entries = {waypoint_poses._cache_entry(sequence, by) for sequence in [walk, *others]}
     entries.add(waypoint_poses._cache_entry(walk, by._replace(digest="other")))
     assert len(entries) == len(others) + 2
     names = {"/".join(path.parts[-2:]) for path in sources[0]}
@@ -150,8 +150,8 @@ def test_what_the_poses_depend_on_is_what_they_are_kept_under(earlier, monkeypat
     changed_weights = jax.tree.map(lambda leaf: leaf + 1e-6, run.variables)
     moved = run._replace(config=dataclasses.replace(run.config, workdir="elsewhere"))
     assert waypoint_poses.digest_network(moved) == digest
-    for each in (other, run._replace(variables=changed_weights)):
-        assert waypoint_poses.digest_network(each) != digest
+    for network in (other, run._replace(variables=changed_weights)):
+        assert waypoint_poses.digest_network(network) != digest
 
 
 def test_a_run_that_changes_at_its_place_makes_its_own_poses(earlier, smoothed, monkeypatch):
@@ -198,14 +198,14 @@ def test_a_resumed_run_takes_the_same_poses_from_another_place(
 
     def opened(run, resume=True):
         config = experiment(run, tmp_path / "run")
-        task, found = recordings.set_up(WindowTask, config, Silence())
+        task, training_data = recordings.set_up(WindowTask, config, Silence())
         assert task.config.data.poses_by is None
-        with run_folder.open_run(config, found, {}, resume):
+        with run_folder.open_run(config, training_data, {}, resume):
             return yaml.safe_load((tmp_path / "run" / "splits.yaml").read_text())
 
-    kept = opened(earlier, resume=False)
-    assert kept["data.poses_by"] == [waypoint_poses.digest_network(read_network(earlier))]
-    assert opened(shutil.copytree(earlier, tmp_path / "moved")) == kept
+    splits = opened(earlier, resume=False)
+    assert splits["data.poses_by"] == [waypoint_poses.digest_network(read_network(earlier))]
+    assert opened(shutil.copytree(earlier, tmp_path / "moved")) == splits
     other = tiny_run.save(tmp_path / "other", read_network(earlier).config, size=0.3)
     with pytest.raises(InputError, match=r"begun with other recordings in split 'data\.poses_by'"):
         opened(other)

@@ -246,14 +246,14 @@ def test_the_axes_of_a_phone_at_rest_stay():
     sequence, grid = walk(), SegmentGrid(N, 20, W, RATE, "body_axes")
     source = jax.device_put(walk_source([sequence], experiment(None, "unused"), training=False))
     row, at_rest = source.earliest[:1], dataclasses.replace(OFF, rest_share=1.0)
-    plain, rest = (
+    plain, standstill = (
         jax.device_get(draw_walks(jax.random.key(2), source, row, grid, augment))
         for augment in (OFF, at_rest)
     )
     assert np.abs(plain.signals[0, -1, 6:] - plain.signals[0, 0, 6:]).max() > 0.1
     expected = np.concatenate([np.float32([0, 0, 9.81, 0, 0, 0]), plain.signals[0, 0, 6:]])
-    np.testing.assert_array_equal(rest.signals[0], np.tile(expected, (20 * N, 1)))
-    assert not rest.displacement.any() and not rest.moved.any()
+    np.testing.assert_array_equal(standstill.signals[0], np.tile(expected, (20 * N, 1)))
+    assert not standstill.displacement.any() and not standstill.moved.any()
 
 
 def test_the_axes_of_the_body_are_hidden_in_a_share_of_the_segments():
@@ -342,8 +342,8 @@ def test_time_is_stretched_and_yaw_and_rest_are_drawn():
         ends = start + 15 * np.arange(grid.intervals + 1)
         moved = sequence.position[ends[W:]] - sequence.position[ends[:-W]]
         lengths = np.linalg.norm(moved[:, :2], axis=1)
-        found = np.linalg.norm(segments.displacement[0, :, :2], axis=1)
-        np.testing.assert_allclose(found, lengths, atol=1e-4)
+        norms = np.linalg.norm(segments.displacement[0, :, :2], axis=1)
+        np.testing.assert_allclose(norms, lengths, atol=1e-4)
         # The second sample is half a sample beyond the first one after the start.
         force = np.einsum(
             "tij,tj->ti",
@@ -371,8 +371,8 @@ def test_the_horizon_error_is_its_loop():
                     squares.append(total @ total / (moved[b, rows].sum() ** 2 + 1))
         terms.append(np.mean(squares))
     with jax.enable_x64(True):
-        found = horizon_error(jnp.asarray(error), jnp.asarray(moved), window)
-    assert float(found) == pytest.approx(np.mean(terms), rel=1e-9)
+        value = horizon_error(jnp.asarray(error), jnp.asarray(moved), window)
+    assert float(value) == pytest.approx(np.mean(terms), rel=1e-9)
     assert float(horizon_error(jnp.ones((2, 9, 3)), jnp.ones((2, 9)), 3)) == 0
 
 
@@ -477,5 +477,5 @@ def test_settings_that_do_not_fit_are_refused(root, tmp_path):
             "segments' are for networks whose windows have no context",
         ),
     ):
-        with tiny_run.known(), pytest.raises(InputError, match=problem):
+        with tiny_run.registry_entry(), pytest.raises(InputError, match=problem):
             loop.train(experiment(root, tmp_path / "x", **changes), reporter=Silence())

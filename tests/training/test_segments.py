@@ -21,9 +21,9 @@ def sequence(length, seed=0, invalid=()):
     valid[list(invalid)] = False
     orientation = Rotation.random(length, random_state=seed).as_quat(scalar_first=True)
     time = np.arange(length) / 50
-    found = Sequence("s", time, draw(3), draw(3), orientation, draw(3), draw(3), valid)
+    walk = Sequence("s", time, draw(3), draw(3), orientation, draw(3), draw(3), valid)
     lost = np.where(valid[:, None], 0.0, np.nan)
-    return found._replace(position=found.position + lost, orientation=orientation + lost)
+    return walk._replace(position=walk.position + lost, orientation=orientation + lost)
 
 
 def test_segments_lie_in_trusted_stretches_and_cover_them_over_epochs():
@@ -34,9 +34,9 @@ def test_segments_lie_in_trusted_stretches_and_cover_them_over_epochs():
     assert len(source.earliest) == 2 + 3 + 1 + 0 + 1
     # A gap of the IMU is as little trusted.
     holed = sequence(150)._replace(imu_valid=broken.valid)
-    alike = [segments.segment_source([each], SAMPLES) for each in (holed, broken)]
-    np.testing.assert_array_equal(*(each.earliest for each in alike))
-    np.testing.assert_array_equal(*(each.latest for each in alike))
+    alike = [segments.segment_source([part], SAMPLES) for part in (holed, broken)]
+    np.testing.assert_array_equal(*(twin.earliest for twin in alike))
+    np.testing.assert_array_equal(*(twin.latest for twin in alike))
 
     keys = jax.vmap(jax.random.key)(jnp.arange(400))
     starts = jax.vmap(segments.random_starts, in_axes=(0, None))(keys, source)
@@ -70,14 +70,16 @@ def test_a_segment_holds_its_samples_and_the_truth_at_its_clones():
 def test_a_turn_segment_is_the_same_walk_in_a_turned_world():
     source = segments.segment_source([sequence(150, seed=2)], SAMPLES)
     segment = segments.cut_segment(source, jnp.int32(7), 5, 4)
-    found = jax.jit(segments.turn_segment)(segment, jnp.float64(0.7))
+    turned_segment = jax.jit(segments.turn_segment)(segment, jnp.float64(0.7))
     turn = Rotation.from_euler("z", 0.7).as_matrix()
-    np.testing.assert_array_equal(found.gyro, segment.gyro)
-    np.testing.assert_array_equal(found.accel, segment.accel)
-    np.testing.assert_allclose(found.truth.rotation, turn @ segment.truth.rotation, atol=1e-12)
+    np.testing.assert_array_equal(turned_segment.gyro, segment.gyro)
+    np.testing.assert_array_equal(turned_segment.accel, segment.accel)
+    np.testing.assert_allclose(
+        turned_segment.truth.rotation, turn @ segment.truth.rotation, atol=1e-12
+    )
     for name in ("velocity", "position"):
         expected = np.asarray(getattr(segment.truth, name)) @ turn.T
-        np.testing.assert_allclose(getattr(found.truth, name), expected, atol=1e-12)
+        np.testing.assert_allclose(getattr(turned_segment.truth, name), expected, atol=1e-12)
 
 
 def test_a_low_passed_segment_has_smaller_high_frequencies_and_the_same_truth():
@@ -90,29 +92,32 @@ def test_a_low_passed_segment_has_smaller_high_frequencies_and_the_same_truth():
     one = segments.cut_segment(source, jnp.int32(0), 10, samples // 10)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 60), one)
     half = AugmentConfig(low_pass_share=0.5, low_pass_hertz=(4.0, 4.0))
-    found = segments.low_pass_segments(jax.random.key(2), batch, half, rate)
-    assert found.gyro.dtype == found.accel.dtype == np.float64
-    others = (each._replace(gyro=0, accel=0) for each in (batch, found))
+    smoothed_batch = segments.low_pass_segments(jax.random.key(2), batch, half, rate)
+    assert smoothed_batch.gyro.dtype == smoothed_batch.accel.dtype == np.float64
+    others = (group._replace(gyro=0, accel=0) for group in (batch, smoothed_batch))
     jax.tree.map(np.testing.assert_array_equal, *others)
-    one, found = jax.device_get((one, found))
+    one, smoothed_batch = jax.device_get((one, smoothed_batch))
     inner = slice(25, -25)
-    sizes = np.einsum("bnc,nc->b", found.gyro[:, inner], one.gyro[inner])
+    sizes = np.einsum("bnc,nc->b", smoothed_batch.gyro[:, inner], one.gyro[inner])
     sizes = sizes / np.sum(one.gyro[inner] ** 2)
     of_orders = 1 / (1 + (5.0 / 4.0) ** (2 * np.array([0, 1, 2, 3])))
     of_orders[0] = 1.0  # not low-passed
     which = np.abs(sizes[:, None] - of_orders).argmin(axis=1)
     np.testing.assert_allclose(sizes, of_orders[which], atol=0.01)
     assert np.mean(which == 0) == pytest.approx(0.5, abs=0.2) and set(which) == {0, 1, 2, 3}
-    for signal, whole in ((found.gyro, one.gyro), (found.accel - 9.81, one.accel - 9.81)):
-        wanted = sizes[:, None, None] * whole[None, inner]
-        np.testing.assert_allclose(signal[:, inner], wanted, atol=0.03)
+    for signal, whole in (
+        (smoothed_batch.gyro, one.gyro),
+        (smoothed_batch.accel - 9.81, one.accel - 9.81),
+    ):
+        expected = sizes[:, None, None] * whole[None, inner]
+        np.testing.assert_allclose(signal[:, inner], expected, atol=0.03)
     assert segments.low_pass_segments(jax.random.key(2), batch, AugmentConfig(), rate) is batch
 
     ramp = np.linspace(-1.0, 1.0, samples)[:, None] * np.ones(3)  # the ends are no neighbours
     batch = batch._replace(gyro=batch.gyro * 0 + ramp[None], accel=batch.accel * 0 + 9.81)
-    found = segments.low_pass_segments(jax.random.key(2), batch, half, rate)
-    np.testing.assert_allclose(found.accel, 9.81, atol=1e-9)
-    np.testing.assert_allclose(found.gyro, np.tile(ramp, (60, 1, 1)), atol=0.1)
+    smoothed_batch = segments.low_pass_segments(jax.random.key(2), batch, half, rate)
+    np.testing.assert_allclose(smoothed_batch.accel, 9.81, atol=1e-9)
+    np.testing.assert_allclose(smoothed_batch.gyro, np.tile(ramp, (60, 1, 1)), atol=0.1)
 
 
 def test_a_start_is_off_the_truth_by_the_priors_deviations():
@@ -124,11 +129,11 @@ def test_a_start_is_off_the_truth_by_the_priors_deviations():
     rotation, velocity, position, gyro_bias, accel_bias = map(np.asarray, draw(keys))
     error = Rotation.from_matrix(rotation @ np.asarray(truth.rotation[0]).T).as_rotvec()
     np.testing.assert_allclose(error.std(0), [0.002, 0.002, 0.004], rtol=0.03)
-    for found, centre, value in (
+    for samples, centre, value in (
         (velocity, truth.velocity[0], 0.3),
         (position, truth.position[0], 0.4),
         (gyro_bias, np.zeros(3), 0.5),
         (accel_bias, np.zeros(3), 0.6),
     ):
-        np.testing.assert_allclose(found.std(0), 3 * [2 * value], rtol=0.03)
-        np.testing.assert_allclose(found.mean(0), centre, atol=0.06)
+        np.testing.assert_allclose(samples.std(0), 3 * [2 * value], rtol=0.03)
+        np.testing.assert_allclose(samples.mean(0), centre, atol=0.06)

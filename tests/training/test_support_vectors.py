@@ -34,11 +34,11 @@ def windows_of(count, names=("hand", "leg", "bag")):
 
 def test_features_are_the_smoothed_samples_without_gravity():
     windows = RNG.standard_normal((2, 30, 6)).astype(np.float32)
-    wanted = windows.astype(float)
-    wanted[..., 2] -= 9.81
-    wanted = gaussian_filter1d(wanted, 2.0, axis=1, mode="nearest", truncate=4.0)
-    found = ridi.features(jnp.asarray(windows))
-    np.testing.assert_allclose(found, wanted.reshape(2, -1), atol=1e-5)
+    expected = windows.astype(float)
+    expected[..., 2] -= 9.81
+    expected = gaussian_filter1d(expected, 2.0, axis=1, mode="nearest", truncate=4.0)
+    features = ridi.features(jnp.asarray(windows))
+    np.testing.assert_allclose(features, expected.reshape(2, -1), atol=1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -46,7 +46,7 @@ def test_predictions_are_those_of_scikit_learn(count):
     svm = pytest.importorskip("sklearn.svm")
     data, held_out = (windows_of(90, ("hand", "leg", "bag")[:count]) for _ in range(2))
     network = support_vectors.fit(data, held_out, CONFIG)
-    found = jax.jit(network.model.apply)(network.variables, jnp.asarray(held_out.windows))
+    prediction = jax.jit(network.model.apply)(network.variables, jnp.asarray(held_out.windows))
     smooth = jax.jit(ridi.features)  # to the bit, because the fits stop at a tolerance
     x, other = (np.asarray(smooth(jnp.asarray(d.windows)), float) for d in (data, held_out))
     names, gamma = sorted(set(data.placement)), 1 / 60
@@ -54,18 +54,18 @@ def test_predictions_are_those_of_scikit_learn(count):
     classes = np.zeros(90, int)
     if count > 1:
         classes = svm.SVC(C=10.0, gamma=gamma).fit(x, labels).predict(other)
-    np.testing.assert_array_equal(np.argmax(found.diagnostics["placement"], axis=1), classes)
-    wanted, grid = np.zeros((90, 3)), [(c, e) for c in (1.0, 10.0) for e in (0.001, 0.01)]
+    np.testing.assert_array_equal(np.argmax(prediction.diagnostics["placement"], axis=1), classes)
+    expected, grid = np.zeros((90, 3)), [(c, e) for c in (1.0, 10.0) for e in (0.001, 0.01)]
     for k in range(count):
         rows = labels == k
         for axis, y in enumerate(data.displacement[rows].T):
             machines = [svm.SVR(C=c, epsilon=e, gamma=gamma) for c, e in grid]
             scores = [score(machine, x[rows], y) for machine in machines]
             machine = machines[int(np.argmax(scores))].fit(x[rows], y)
-            wanted[classes == k, axis] = machine.predict(other)[classes == k]
-    np.testing.assert_allclose(found.displacement, wanted, atol=1e-4)
-    rms = np.sqrt(np.mean((held_out.displacement - wanted[:, :2]) ** 2, axis=0))
-    np.testing.assert_allclose(np.exp(found.log_std[0, :2]), rms, rtol=1e-3)
+            expected[classes == k, axis] = machine.predict(other)[classes == k]
+    np.testing.assert_allclose(prediction.displacement, expected, atol=1e-4)
+    rms = np.sqrt(np.mean((held_out.displacement - expected[:, :2]) ** 2, axis=0))
+    np.testing.assert_allclose(np.exp(prediction.log_std[0, :2]), rms, rtol=1e-3)
     assert rms.max() < 0.3 * held_out.displacement.std()  # it has learnt
 
 
@@ -95,8 +95,8 @@ def test_a_machine_learns_from_a_share_of_many_windows_drawn_by_the_seed(monkeyp
     weights = [np.asarray(n.variables["params"]["weight"]) for n in (first, again, other)]
     np.testing.assert_array_equal(weights[0], weights[1])
     assert weights[0].shape != weights[2].shape or np.any(weights[0] != weights[2])
-    found = first.model.apply(first.variables, jnp.asarray(rare.windows))
-    assert np.argmax(found.diagnostics["placement"], axis=1).tolist() == [0] * len(bags)
+    prediction = first.model.apply(first.variables, jnp.asarray(rare.windows))
+    assert np.argmax(prediction.diagnostics["placement"], axis=1).tolist() == [0] * len(bags)
 
 
 def test_rows_are_drawn_once_each_and_keep_their_order():
@@ -109,19 +109,19 @@ def test_rows_are_drawn_once_each_and_keep_their_order():
 
 
 @pytest.mark.parametrize(
-    "wanted, fitted, refused",
+    "options, fitted, refused",
     [
         ({}, {"placements": 9, "supports": 40}, False),
         ({"placements": 2}, {"placements": 9}, True),
         ({}, {"output_dim": 9}, True),
     ],
 )
-def test_options_that_the_training_sets_are_no_other_settings(wanted, fitted, refused, tmp_path):
+def test_options_that_the_training_sets_are_no_other_settings(options, fitted, refused, tmp_path):
     """Unless the configuration gives them another value."""
     run = dataclasses.replace(CONFIG, model=ModelConfig("ridi", options=fitted))
     configuration.save(tmp_path / "config.yaml", run)
     config = dataclasses.replace(
-        CONFIG, model=ModelConfig("ridi", options=wanted), workdir=str(tmp_path)
+        CONFIG, model=ModelConfig("ridi", options=options), workdir=str(tmp_path)
     )
     if not refused:
         assert run_folder.refuse_other_run(config, resume=True) == tmp_path

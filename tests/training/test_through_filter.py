@@ -95,10 +95,10 @@ def finished(recording, tmp_path_factory):
 
 
 def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished):
-    found = rows(finished)
+    log_rows = rows(finished)
     # 12 s have five segments of 2 s, since the sample at the end of each is needed; two walks.
-    assert [(row["epoch"], row["step"]) for row in found] == [(0, 5), (1, 10)]
-    for row in found:
+    assert [(row["epoch"], row["step"]) for row in log_rows] == [(0, 5), (1, 10)]
+    for row in log_rows:
         parts = ("displacement", "yaw", "innovation", "state", "mse")
         assert row["loss"] == pytest.approx(sum(row[part] for part in parts), rel=1e-6)
         assert row["skipped"] == 0
@@ -121,9 +121,12 @@ def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
         assert same(parameters, after.variables["params"][module]) == (module != "head"), module
     statistics = after.variables["batch_stats"]
     assert same(before.variables["batch_stats"]["norm"], statistics["norm"])
-    given, found = configuration.flatten(OPTIONS), configuration.flatten(after.config.filter)
-    moved = {name for name in given if given[name] != found[name]}
-    numbers = {name for name in given if name.startswith(("noise.", "start."))}
+    settings, trained_settings = (
+        configuration.flatten(OPTIONS),
+        configuration.flatten(after.config.filter),
+    )
+    moved = {name for name in settings if settings[name] != trained_settings[name]}
+    numbers = {name for name in settings if name.startswith(("noise.", "start."))}
     assert moved == numbers - {"start.tilt"}  # which is 0
     assert configuration.load(finished / "config.yaml").filter == OPTIONS
     evaluated = resolve(EvaluateConfig(str(finished)), after.config)
@@ -149,16 +152,16 @@ def test_a_copy_with_other_options_has_them(finished, tmp_path):
     )
     config = dataclasses.replace(run.config, filter=options)
     write_network(tmp_path, run._replace(config=config))
-    found = read_network(tmp_path)
-    assert found.config.filter == options and same(found.variables, run.variables)
-    assert (found.step, found.epoch) == (run.step, run.epoch)
+    network = read_network(tmp_path)
+    assert network.config.filter == options and same(network.variables, run.variables)
+    assert (network.step, network.epoch) == (run.step, run.epoch)
 
 
 @pytest.fixture(scope="module")
 def training(recording):
     with jax.enable_x64(True):
-        found, recordings = set_up(FilterTask, tiny(recording, "unused"), Silence())
-    return found, recordings.source
+        filter_training, recordings = set_up(FilterTask, tiny(recording, "unused"), Silence())
+    return filter_training, recordings.source
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +217,7 @@ def test_wild_steps_are_skipped_and_counted(training, start):
         assert int(state.step) == 1 and int(progress.failed_step) == -1
         assert same(before, (state.variables, state.opt_state))
         assert progress.sums.pop("skipped") == 1
-        assert len(progress.sums) > 6 and all(each == 0 for each in progress.sums.values())
+        assert len(progress.sums) > 6 and all(figure == 0 for figure in progress.sums.values())
     assert loop.mean_figures({"loss": 6.0, "skipped": 2.0}, 5) == {"loss": 2.0, "skipped": 2}
 
 
@@ -223,13 +226,13 @@ def test_a_step_is_skipped_where_the_filter_diverged_or_the_loss_is_infinite(
 ):
     training, source = training
 
-    def found(trained, variables, batch, step, task_):
+    def gradient_of(trained, variables, batch, step, task_):
         loss = jnp.where(step == 2, jnp.inf, jnp.float64(1))
         figures = dict.fromkeys(FilterTask.figures, jnp.float64(0)) | {"loss": loss}
         gradient = jax.tree.map(jnp.ones_like, trained)
         return gradient, task.BatchLosses(figures, variables["batch_stats"], step != 1)
 
-    monkeypatch.setattr(task, "gradient_of", found)
+    monkeypatch.setattr(task, "gradient_of", gradient_of)
     optim = dataclasses.replace(training.config.optim, epochs=100)  # compiled for itself
     other = dataclasses.replace(training, config=dataclasses.replace(training.config, optim=optim))
     for number, skipped in ((0, 0), (1, 1), (2, 1)):
@@ -250,8 +253,8 @@ def test_a_skipped_step_does_not_shift_the_schedule(training, start):
     lost = source._replace(accel=source.accel.at[:].set(np.nan))
     skipped, _ = take(training, other, lost, 0)
     state = state._replace(step=jnp.int32(1))
-    taken = [take(training, each, source, 1)[0] for each in (state, skipped)]
-    assert same(taken[0].variables, taken[1].variables)
+    states = [take(training, origin, source, 1)[0] for origin in (state, skipped)]
+    assert same(states[0].variables, states[1].variables)
 
 
 def test_training_segments_are_turned_by_any_yaw_and_low_passed(training):
@@ -268,14 +271,14 @@ def test_training_segments_are_turned_by_any_yaw_and_low_passed(training):
     )
     np.testing.assert_array_equal(as_walked[0].gyro, turned[0].gyro)
     np.testing.assert_array_equal(as_walked[1][3], turned[1][3])  # the gyro's first bias
-    before, after = (np.asarray(found[0].truth.velocity[:, 0]) for found in (as_walked, turned))
+    before, after = (np.asarray(sample[0].truth.velocity[:, 0]) for sample in (as_walked, turned))
     np.testing.assert_allclose(np.linalg.norm(after, axis=1), np.linalg.norm(before, axis=1))
     assert (before == before[0]).all()
     angle = np.arctan2(after[:, 1], after[:, 0])
     assert abs(np.exp(1j * angle).mean()) < 0.4  # all round the circle
 
     half, untouched = changed_task(low_pass_share=0.5), []
-    draws = [jax.jit(each.draw) for each in (training, half)]
+    draws = [jax.jit(variant.draw) for variant in (training, half)]
     for number in (0, 1):
         (plain, starts), (passed, same_starts) = (
             draw(jax.random.key(number), source, rows) for draw in draws
@@ -288,21 +291,21 @@ def test_training_segments_are_turned_by_any_yaw_and_low_passed(training):
     assert (untouched[0] != untouched[1]).any()
     # Those of validation never pass it.
     every = changed_task(low_pass_share=1.0)
-    found = (jax.jit(each.segments, static_argnums=3) for each in (training, every))
-    jax.tree.map(np.testing.assert_array_equal, *(each(key, source, rows, False) for each in found))
+    cuts = (jax.jit(variant.segments, static_argnums=3) for variant in (training, every))
+    jax.tree.map(np.testing.assert_array_equal, *(cut(key, source, rows, False) for cut in cuts))
 
 
 def test_the_low_pass_of_segments_is_at_the_rate_of_the_data(training, monkeypatch):
     training, source = training
-    told = []
+    calls = []
 
     def noted(key, segments, augment, rate):
-        told.append((augment, rate))
+        calls.append((augment, rate))
         return segments
 
     monkeypatch.setattr(filter_task, "low_pass_segments", noted)
     jax.eval_shape(training.draw, jax.random.key(0), source, source.earliest[:1])
-    assert told == [(training.config.augment, 50.0)]
+    assert calls == [(training.config.augment, 50.0)]
 
 
 def test_the_errors_of_the_starts_do_not_depend_on_the_yaws(training):
@@ -313,15 +316,15 @@ def test_the_errors_of_the_starts_do_not_depend_on_the_yaws(training):
     velocity = np.asarray(segments.truth.velocity[:, :, 0])
     angles = np.arctan2(velocity[..., 1], velocity[..., 0])
     errors = np.asarray(starts[3]).reshape(200, -1)
-    found = stats.spearmanr(angles, errors).statistic[:16, 16:]
-    assert found.shape == (16, 48) and np.abs(found).max() < 0.4
+    correlations = stats.spearmanr(angles, errors).statistic[:16, 16:]
+    assert correlations.shape == (16, 48) and np.abs(correlations).max() < 0.4
 
 
 def test_the_error_at_waypoints_is_logged_where_walks_have_them(training, start, monkeypatch):
     training, source = training
     horizons = np.ones(3)
-    found = FilterLosses(1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.0, 0.0, 0.09, 1.0, 1.0, True)
-    monkeypatch.setattr(filter_task, "validate", lambda *_, **__: found)
+    losses = FilterLosses(1.0, horizons, horizons, 1.0, 1.0, 1.0, 0.0, 0.0, 0.09, 1.0, 1.0, True)
+    monkeypatch.setattr(filter_task, "validate", lambda *_, **__: losses)
     for tapped in (False, True):
         walks = source._replace(tapped=np.arange(len(source.tapped)) < 7 * tapped)
         row = training.figures_of(begun(training, start), walks, KEY)
@@ -346,8 +349,8 @@ def test_the_filter_in_training_has_a_slope_at_its_gate_is_cut_and_does_not_call
 ):
     """Where each core is a device, batched calls of LAPACK in the step deadlock."""
     training, source = training
-    found = training.training_filter()
-    assert (found.gate_softness, found.checkpoint_every, found.truncate_every) == (2.0, 20, 100)
+    ekf = training.training_filter()
+    assert (ekf.gate_softness, ekf.checkpoint_every, ekf.truncate_every) == (2.0, 20, 100)
     state, order = training.initial_state(KEY, start), jnp.resize(source.earliest, 10)
     numbers = jnp.int32(0), jnp.int32(1), jnp.float32(1)
     lowered = task.train_steps.trace(state, source, order, *numbers, KEY, task=training)
@@ -360,7 +363,7 @@ def test_gradient_against_differences(training, start):
     training, source = training
     begin = begun(training, start)
 
-    def taken(name="", by=0.0):
+    def shifted_step(name="", by=0.0):
         """The step with one number moved."""
 
         def moved(path, leaf):
@@ -375,14 +378,14 @@ def test_gradient_against_differences(training, start):
         assert progress.sums["skipped"] == 0
         return state, float(progress.sums["loss"])
 
-    first = taken()[0]
+    first = shifted_step()[0]
     before, after, moments = map(firsts, (begin.variables, first.variables, first.opt_state))
     moments = {name.partition("/mu/")[2]: value for name, value in moments.items()}
     names = [f"filter/{name}" for name in begin.variables["filter"]]
     assert len(names) == 15
     for name in [*names, "params/head/bias"]:
         step = 1e-3
-        expected = (taken(name, step)[1] - taken(name, -step)[1]) / (2 * step)
+        expected = (shifted_step(name, step)[1] - shifted_step(name, -step)[1]) / (2 * step)
         assert expected != 0, name
         np.testing.assert_allclose(10 * moments[name], expected, 1e-3, 1e-6, err_msg=name)
         assert (after[name] - before[name]) * expected < 0, name  # the step goes downhill
@@ -401,7 +404,7 @@ def firsts(tree):
 def test_parts_are_modules_and_options_by_name():
     modules = ("encoder", "norm", "bank", "head", "displacement", "uncertainty", "log_std")
     numbers = optimizer.filter_numbers(THROUGH_FILTER)
-    given = {"params": dict.fromkeys(modules, 0), "filter": numbers}
+    variables = {"params": dict.fromkeys(modules, 0), "filter": numbers}
     for learn, params, some in (
         ("encoder", {"encoder", "norm", "bank"}, ()),
         ("head", {"head", "displacement"}, ()),  # TLIO's name, too
@@ -410,23 +413,23 @@ def test_parts_are_modules_and_options_by_name():
         ("measurement", set(), ("noise.measurement_scale", "noise.std_factor.0")),
         ("start", set(), ("start.yaw", "start.velocity")),
     ):
-        found = optimizer.select_trained(given | {"batch_stats": {}}, (learn,))
-        assert found.get("params", {}).keys() == params
-        assert set(some) <= found.get("filter", {}).keys() and all(found.values())
-    assert optimizer.select_trained(given, ("all", "head")) == given
-    without = given | {"params": {"encoder": 0, "head": 0}}
+        selection = optimizer.select_trained(variables | {"batch_stats": {}}, (learn,))
+        assert selection.get("params", {}).keys() == params
+        assert set(some) <= selection.get("filter", {}).keys() and all(selection.values())
+    assert optimizer.select_trained(variables, ("all", "head")) == variables
+    without = variables | {"params": {"encoder": 0, "head": 0}}
     assert optimizer.select_trained(without, ("all",)) == without
     with pytest.raises(InputError, match=r"'uncertainty', but no module .* called uncertainty or"):
         optimizer.select_trained(without, ("noise", "uncertainty"))
-    assert optimizer.select_trained(given, ()) == {"params": given["params"]}
+    assert optimizer.select_trained(variables, ()) == {"params": variables["params"]}
 
 
 def test_options_survive_their_unconstrained_numbers():
     numbers = optimizer.filter_numbers(THROUGH_FILTER)
     assert "start.tilt" not in numbers and "considered.scale" not in numbers
     assert optimizer.trained_settings(OPTIONS, numbers) == OPTIONS
-    found = jax.tree.leaves(with_free_parameters(OPTIONS, numbers))
-    assert {jnp.asarray(leaf).dtype for leaf in found} == {jnp.dtype(jnp.float64)}
+    leaves = jax.tree.leaves(with_free_parameters(OPTIONS, numbers))
+    assert {jnp.asarray(leaf).dtype for leaf in leaves} == {jnp.dtype(jnp.float64)}
     # A share is never rounded to 1, which no setting may be.
     nearly = optimizer.trained_settings(OPTIONS, {"noise.correlation.share": jnp.float32(20)})
     assert nearly.noise.correlation.share == 0.9999
@@ -446,9 +449,9 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
     assert same(state.variables["params"], run.variables["params"])
     other = state.variables["filter"].pop("start.velocity")
     np.testing.assert_allclose(other, np.log(0.3), rtol=1e-6)
-    wanted = optimizer.filter_numbers(dataclasses.replace(config, filter=run.config.filter))
+    expected = optimizer.filter_numbers(dataclasses.replace(config, filter=run.config.filter))
     for name, number in state.variables["filter"].items():
-        np.testing.assert_allclose(number, wanted[name], atol=1e-4, err_msg=name)
+        np.testing.assert_allclose(number, expected[name], atol=1e-4, err_msg=name)
 
 
 def test_training_on_windows_starts_from_a_runs_weights(recording):
@@ -491,8 +494,8 @@ def test_a_network_without_displacements_is_trained_from_random_weights(recordin
     assert not {"val_rmse", "val_nis"} & last.keys() and np.isfinite(last["val_loss"])
     trained = checkpoint.load_latest(run)
     assert np.abs(trained.variables["params"]["log_std"]["kernel"]).max() > 0
-    found = trained.config.filter.measurements["nonholonomic"]
-    assert all(found[name] != number for name, number in numbers.items())
+    trained_numbers = trained.config.filter.measurements["nonholonomic"]
+    assert all(trained_numbers[name] != number for name, number in numbers.items())
     with pytest.raises(InputError, match=r"'ai_imu' is trained in the filter's loop alone; name"):
         elsewhere = str(tmp_path / "elsewhere")
         loop.train(dataclasses.replace(config, workdir=elsewhere, through_filter=ThroughFilter()))

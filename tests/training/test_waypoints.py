@@ -35,16 +35,16 @@ def tapped_path(rows=(3, 17, 30, 41)):
 def slowly(at, places):
     """The error with the best turn and shift as an optimiser finds them, and plain NumPy."""
 
-    def off(found):
-        angle, *shift = found
+    def off(motion):
+        angle, *shift = motion
         c, s = np.cos(angle), np.sin(angle)
         return at @ np.array([[c, s], [-s, c]]) + shift - places
 
-    def squares(found):
-        return np.sum(off(found) ** 2)
+    def squares(motion):
+        return np.sum(off(motion) ** 2)
 
     starts = [(a, *(places.mean(0) - at.mean(0))) for a in np.linspace(-3, 3, 7)]
-    best = min((minimize(squares, x, tol=1e-14) for x in starts), key=lambda found: found.fun)
+    best = min((minimize(squares, x, tol=1e-14) for x in starts), key=lambda fit: fit.fun)
     squared = np.sum(off(best.x) ** 2, axis=1)
     counted = 1.5**2 * np.log(1 + squared / 1.5**2)
     return counted.mean() / (np.sum(places.var(axis=0)) + 1.0)
@@ -69,9 +69,9 @@ def test_a_turned_and_shifted_path_is_right_and_one_that_never_moves_is_not():
     right[present] = at @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + [5.0, 9.0]
     assert error_and_slope(position, right)[0] < 1e-25
     still, slope = error_and_slope(np.zeros_like(position), waypoint)
-    apart = np.sum((waypoint[present] - waypoint[present].mean(axis=0)) ** 2, axis=1)
-    counted = 1.5**2 * np.log(1 + apart / 1.5**2)
-    np.testing.assert_allclose(still, counted.mean() / (apart.mean() + 1), rtol=1e-12)
+    squares = np.sum((waypoint[present] - waypoint[present].mean(axis=0)) ** 2, axis=1)
+    counted = 1.5**2 * np.log(1 + squares / 1.5**2)
+    np.testing.assert_allclose(still, counted.mean() / (squares.mean() + 1), rtol=1e-12)
     assert np.isfinite(slope).all()
 
 
@@ -104,7 +104,7 @@ def test_segments_have_the_waypoints_of_their_walk_and_turn_with_it():
     walk = with_poses(survey(0).tapped(np.zeros(9)))
     posed = survey(1).truth
     source = segments.join_segments(
-        [segments.segment_source([each], 100) for each in (walk, posed)]
+        [segments.segment_source([sequence], 100) for sequence in (walk, posed)]
     )
     assert source.tapped.sum() == len(walk.time) and source.tapped[0] and not source.tapped[-1]
     rows = np.flatnonzero(np.isfinite(source.waypoint).all(axis=1))
@@ -136,14 +136,14 @@ def test_of_a_walk_with_waypoints_the_sum_has_these_in_the_place_of_poses():
     losses = quick(filter_losses.filter_losses, static_argnums=(3, 4))
     signals = np.zeros((K * N, 3)), np.zeros((K * N, 3))
 
-    def found(tapped, interpolated):
+    def losses_of(tapped, interpolated):
         truth = path._replace(position=path.position + interpolated)
         segment = segments.Segment(*signals, truth, waypoint, jnp.bool_(tapped))
         return losses(path, segment, history, *settings)
 
     interpolated = rng.standard_normal((K + 1, 3))
-    one, other = found(True, 0.0), found(True, interpolated)
+    one, other = losses_of(True, 0.0), losses_of(True, interpolated)
     expected = 100 * one.waypoints - 0.5 * history.log_likelihood.mean()
     np.testing.assert_allclose(one.total, expected, rtol=1e-12)
     assert one.total == other.total and other.displacement.max() > one.displacement.max()
-    assert found(False, interpolated).total != other.total
+    assert losses_of(False, interpolated).total != other.total

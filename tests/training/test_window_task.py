@@ -28,9 +28,13 @@ KEY = jax.random.key(0)
 @pytest.fixture(scope="module")
 def training(recording):
     with jax.enable_x64(False):
-        given = config(recording, "")
-        found, recordings = set_up(WindowTask, given, Silence())
-        return found, recordings, drawn_state(found.model, given, found.steps_per_epoch)
+        experiment = config(recording, "")
+        window_training, recordings = set_up(WindowTask, experiment, Silence())
+        return (
+            window_training,
+            recordings,
+            drawn_state(window_training.model, experiment, window_training.steps_per_epoch),
+        )
 
 
 @pytest.mark.parametrize(
@@ -45,9 +49,9 @@ def training(recording):
 def test_changes_that_are_no_motion_are_not_for_a_corrector(change, warned, corrector):
     """Tilted by default."""
     model = ModelConfig(name="ionet", width=3, corrector=corrector)
-    given = TrainConfig(model=model, augment=AugmentConfig(**change))
+    experiment = TrainConfig(model=model, augment=AugmentConfig(**change))
     state = TrainState(jnp.int32(0), {"params": {"head": np.zeros(3)}}, None)
-    lines = list(WindowTask(Tiny(), given, 7).description(state, Path("run")))
+    lines = list(WindowTask(Tiny(), experiment, 7).description(state, Path("run")))
     says = any("from which a corrector learns" in line for line in lines)
     assert says == (warned and corrector == "airimu")
 
@@ -68,10 +72,10 @@ def test_steps_and_validation_are_compiled_once(training):
             numbers = jnp.int32(first), jnp.int32(count), jnp.float32(factor)
             state, progress = training.take_steps(state, source, order, *numbers, KEY)
             stage = loss_stage(training.config.loss, epoch, 9)
-            found = window_task.validate(state, held_out["tlio"], stage, task=training)
-            programs.append([each._cache_size() for each in jitted])
+            outcome = window_task.validate(state, held_out["tlio"], stage, task=training)
+            programs.append([function._cache_size() for function in jitted])
             if epoch < 2:
-                finite = jax.tree.leaves((progress.sums, found.losses))
+                finite = jax.tree.leaves((progress.sums, outcome.losses))
                 assert np.isfinite(finite).all() and progress.failed_step == -1
     assert programs[0] == programs[1] == programs[2]
     assert int(state.step) == 7 and progress.failed_step == 4
@@ -134,7 +138,7 @@ def test_statistics_are_means_over_batches_and_all_else_is_left_alone(training):
     factor = {"log_factor": jnp.array([0.5, -1.0, 2.0], jnp.float32)}
     other = statistics(state) | {"uncertainty": factor}
     state = state._replace(variables=state.variables | {"batch_stats": other})
-    found = estimated(training, state, source)
+    estimate = estimated(training, state, source)
     kernel = np.asarray(state.variables["params"]["encoder"]["kernel"], np.float64)
     order_key, draw_key = jax.random.split(jax.random.key(7))
     order = np.asarray(jax.random.permutation(order_key, source.visited))[:48].reshape(3, 16)
@@ -146,10 +150,12 @@ def test_statistics_are_means_over_batches_and_all_else_is_left_alone(training):
         hidden = np.asarray(imu, np.float64).mean(axis=1) @ kernel
         means.append(hidden.mean(axis=0))
         variances.append(hidden.var(axis=0))
-    norm = statistics(found)["norm"]
+    norm = statistics(estimate)["norm"]
     np.testing.assert_allclose(norm["mean"], np.mean(means, 0), rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(norm["var"], np.mean(variances, 0), rtol=1e-3)
-    np.testing.assert_array_equal(statistics(found)["uncertainty"]["log_factor"], [0.5, -1.0, 2.0])
+    np.testing.assert_array_equal(
+        statistics(estimate)["uncertainty"]["log_factor"], [0.5, -1.0, 2.0]
+    )
 
     moved = jax.tree.map(lambda x: x + 3, statistics(state))
     again = state._replace(variables=state.variables | {"batch_stats": moved}, step=jnp.int32(5))
@@ -168,8 +174,8 @@ def with_uncertainty(**constants):
 
 
 def validation(mse, normalised):
-    each = (jnp.asarray(axes, jnp.float32) for axes in (mse, normalised))
-    return Validation(Losses(*[jnp.float32(0)] * 3), *each)
+    figures = (jnp.asarray(axes, jnp.float32) for axes in (mse, normalised))
+    return Validation(Losses(*[jnp.float32(0)] * 3), *figures)
 
 
 def of_uncertainty(state, name):
@@ -179,20 +185,20 @@ def of_uncertainty(state, name):
 def test_the_uncertainty_takes_the_errors_of_the_validation():
     """A constant those of the axes. A head's factor follows errors twice and half as large as it
     announced, from whatever it was, and nothing becomes infinite; training does not see it."""
-    found = calibrate_uncertainty(
+    state = calibrate_uncertainty(
         with_uncertainty(log_std=np.zeros(3)), validation([0.04, 1.0, 4.0], [1] * 3)
     )
-    np.testing.assert_allclose(of_uncertainty(found, "log_std"), [0.2, 1, 2], rtol=1e-6)
+    np.testing.assert_allclose(of_uncertainty(state, "log_std"), [0.2, 1, 2], rtol=1e-6)
     start = with_uncertainty(log_factor=np.log([3.0, 1.0, 1.0]))
-    found = calibrate_uncertainty(start, validation([1] * 3, [4.0, 0.25, 1.0]))
-    np.testing.assert_allclose(of_uncertainty(found, "log_factor"), [6.0, 0.5, 1.0], rtol=1e-6)
+    state = calibrate_uncertainty(start, validation([1] * 3, [4.0, 0.25, 1.0]))
+    np.testing.assert_allclose(of_uncertainty(state, "log_factor"), [6.0, 0.5, 1.0], rtol=1e-6)
     lost = calibrate_uncertainty(start, validation([1] * 3, [np.inf, 0, 1]))
     assert np.isfinite(of_uncertainty(lost, "log_factor")).all()
     head, h = CalibratedUncertainty(), jnp.ones((4, 5), jnp.float32)
     variables = head.init(jax.random.key(0), h, False)
-    variables |= {"batch_stats": statistics(found)["uncertainty"]}
-    said = np.exp(head.apply(variables, h, False))
-    np.testing.assert_allclose(said, [[6.0, 0.5, 1.0]] * 4, rtol=1e-6)
+    variables |= {"batch_stats": statistics(state)["uncertainty"]}
+    std = np.exp(head.apply(variables, h, False))
+    np.testing.assert_allclose(std, [[6.0, 0.5, 1.0]] * 4, rtol=1e-6)
     np.testing.assert_array_equal(head.apply(variables, h, True), 0.0)
 
 
@@ -211,18 +217,20 @@ def test_constants_are_those_of_all_datasets_and_of_both_axes_in_a_mean_over_hea
 ):
     """Their squares are the mean square errors over the datasets, and there over the plane."""
 
-    def found(state, source, *_, **__):
+    def validate(state, source, *_, **__):
         errors = source.imu[0] * np.float32([1.0, 4.0, 9.0])
         return validation(errors, errors)
 
-    monkeypatch.setattr(window_task, "validate", found)
+    monkeypatch.setattr(window_task, "validate", validate)
     model = models.create(name, equivariance=equivariance)
     training = WindowTask(model, TrainConfig(), 7)
     fields = len(windows.WindowSource._fields)
     held_out = {str(k): windows.WindowSource(*[jnp.full(1, k)] * fields) for k in (0.5, 1.5)}
-    kept, row = training.validate(
+    calibrated_state, row = training.validate(
         with_uncertainty(log_std=np.zeros(3)), held_out, jax.random.key(0)
     )
-    wanted = [2.5, 2.5, 9.0] if averaged else [1.0, 4.0, 9.0]
-    np.testing.assert_allclose(of_uncertainty(kept, "log_std") ** 2, wanted, rtol=1e-6)
+    expected = [2.5, 2.5, 9.0] if averaged else [1.0, 4.0, 9.0]
+    np.testing.assert_allclose(
+        of_uncertainty(calibrated_state, "log_std") ** 2, expected, rtol=1e-6
+    )
     assert row["val_normalised/z"] == 9.0

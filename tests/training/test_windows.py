@@ -74,11 +74,13 @@ def test_gather_against_a_brute_force_cutter(rotation, stride, context):
     imu, target, steps = cut(sequences, rotation, stride, context)
     assert source.start.shape == (len(target),)
     order = np.random.default_rng(0).permutation(len(target)).astype(np.int32)
-    found = gather(jax.device_put(source), order, config.input_samples)
-    np.testing.assert_allclose(found.imu, imu[order], atol=1e-5)
-    np.testing.assert_allclose(found.displacement, target[order], atol=1e-5)
-    np.testing.assert_allclose(found.steps, steps[order], atol=1e-5)
-    assert found.imu.dtype == found.displacement.dtype == found.steps.dtype == jnp.float32
+    selection = gather(jax.device_put(source), order, config.input_samples)
+    np.testing.assert_allclose(selection.imu, imu[order], atol=1e-5)
+    np.testing.assert_allclose(selection.displacement, target[order], atol=1e-5)
+    np.testing.assert_allclose(selection.steps, steps[order], atol=1e-5)
+    assert (
+        selection.imu.dtype == selection.displacement.dtype == selection.steps.dtype == jnp.float32
+    )
     np.testing.assert_array_equal(source.visited, np.arange(len(target)))
 
 
@@ -89,11 +91,11 @@ def test_shifted_windows_are_those_of_the_neighbouring_samples_in_the_same_recor
     np.testing.assert_array_equal(source.start[source.visited], plain.start)
     which, start = np.tile(source.visited, 200), np.asarray(source.start)
     source, which = jax.device_put((source, which))
-    there = np.asarray(shift_windows(KEY, source, which, 3))
-    moved = start[there] - start[which]
+    neighbours = np.asarray(shift_windows(KEY, source, which, 3))
+    moved = start[neighbours] - start[which]
     assert set(moved) == set(range(-3, 4))
     recording = np.searchsorted([57, 118], start, side="right")
-    np.testing.assert_array_equal(recording[there], recording[which])
+    np.testing.assert_array_equal(recording[neighbours], recording[which])
     # The first window of all cannot begin earlier: 3 of 7 draws leave it where it is.
     first = which == 0
     assert moved[first].min() == 0 and np.mean(moved[first] == 0) == pytest.approx(4 / 7, abs=0.12)
@@ -104,10 +106,10 @@ def test_windows_have_a_pose_after_them_and_lie_across_no_gap():
     with pytest.raises(InputError, match="no window of 1 s"):
         windows.window_source([tumbling(20, 0)], CONFIG, 2)
     assert windows.window_source([tumbling(21, 0)], CONFIG, 2).start.shape == (1,)
-    there = np.ones(60, bool)
-    there[[0, 33]] = False  # of the IMU: the reference sees through it
-    source = windows.window_source([tumbling(60, 0)._replace(imu_valid=there)], CONFIG, 1)
-    starts = [i for i in range(40) if there[i : i + 20].all()]
+    imu_valid = np.ones(60, bool)
+    imu_valid[[0, 33]] = False  # of the IMU: the reference sees through it
+    source = windows.window_source([tumbling(60, 0)._replace(imu_valid=imu_valid)], CONFIG, 1)
+    starts = [i for i in range(40) if imu_valid[i : i + 20].all()]
     np.testing.assert_array_equal(source.start, starts)
     # Samples without a reference may hold NaN.
     sequence = tumbling(60, 0, invalid=range(25, 30))
@@ -115,8 +117,8 @@ def test_windows_have_a_pose_after_them_and_lie_across_no_gap():
         field[25:30] = np.nan
     source = windows.window_source([sequence], CONFIG, 2)
     which = np.arange(source.start.shape[0], dtype=np.int32)
-    found = gather(jax.device_put(source), which, 20)
-    assert all(np.isfinite(field).all() for field in found)
+    selection = gather(jax.device_put(source), which, 20)
+    assert all(np.isfinite(field).all() for field in selection)
 
 
 def batch(count=4000, length=5):
@@ -156,12 +158,12 @@ def test_bias_and_scale_are_uniform_over_windows_and_noise_has_its_deviation():
 
 def turns(before, after):
     """The rotation vectors between two sets of windows, by SciPy's solution of Wahba's problem."""
-    found = []
+    vectors = []
     for old, new in zip(before.imu, np.asarray(after.imu), strict=True):
         rotation, residual = Rotation.align_vectors(new.reshape(-1, 3), old.reshape(-1, 3))
         assert residual < 1e-4
-        found.append(rotation.as_rotvec())
-    return np.array(found)
+        vectors.append(rotation.as_rotvec())
+    return np.array(vectors)
 
 
 def test_tilt_is_about_a_horizontal_axis_and_yaw_turns_the_target_too():
@@ -302,8 +304,8 @@ def test_another_bounce_moves_a_window_as_far():
         curve = accel.mean(axis=1, keepdims=True) * np.cumsum(
             np.arange(accel.shape[1] + 1, dtype=float)
         )
-        rest = height - curve
-        return rest - rest[:, -1:] * time
+        deviation = height - curve
+        return deviation - deviation[:, -1:] * time
 
     factor = np.std(swing(after), axis=1) / np.std(swing(before), axis=1)
     np.testing.assert_allclose(swing(after), factor[:, None] * swing(before), atol=1e-3)
@@ -354,8 +356,8 @@ def test_low_pass_of_a_window_is_that_of_its_whole_recording():
     which = np.arange(len(source.start), dtype=np.int32)
     config = dataclasses.replace(OFF, low_pass_share=0.999999, low_pass_hertz=(4.0, 4.0))
     margin = windows.low_pass_margin(config, 20.0)
-    found = low_pass(KEY, gather(source, which, 20, margin), config, 20.0)
-    np.testing.assert_array_equal(found.displacement, source.displacement)
+    window_batch = low_pass(KEY, gather(source, which, 20, margin), config, 20.0)
+    np.testing.assert_array_equal(window_batch.displacement, source.displacement)
     expected = []
     for order in (1, 2, 3):
         rows = []
@@ -365,7 +367,7 @@ def test_low_pass_of_a_window_is_that_of_its_whole_recording():
             smooth = np.fft.irfft(size[:, None] * np.fft.rfft(imu, axis=0), 190, axis=0)[50:-50]
             rows += [smooth[i : i + 20] for i in range(0, 70, 2)]
         expected.append(rows)
-    error = np.abs(np.asarray(found.imu) - np.array(expected)).max(axis=(2, 3))
+    error = np.abs(np.asarray(window_batch.imu) - np.array(expected)).max(axis=(2, 3))
     assert error.min(axis=0).max() < 0.1 and len(set(error.argmin(axis=0))) == 3
 
 
@@ -380,10 +382,10 @@ def test_the_margin_of_the_low_pass_ends_where_the_reference_does():
     source = windows.window_source([phone], CONFIG, 10)
     margin = windows.low_pass_margin(AugmentConfig(low_pass_share=1.0), 20.0)
     which = np.arange(len(source.start), dtype=np.int32)
-    found = gather(jax.device_put(source), which, 20, margin)
-    assert source.start[0] == before and found.imu.shape[1] == 20 + 2 * margin
-    expected = np.broadcast_to(np.float32([0, 0, 9.81, 0, 0, 0]), found.imu.shape)
-    np.testing.assert_allclose(found.imu, expected, atol=1e-5)
+    selection = gather(jax.device_put(source), which, 20, margin)
+    assert source.start[0] == before and selection.imu.shape[1] == 20 + 2 * margin
+    expected = np.broadcast_to(np.float32([0, 0, 9.81, 0, 0, 0]), selection.imu.shape)
+    np.testing.assert_allclose(selection.imu, expected, atol=1e-5)
 
 
 def test_switched_off_augmentation_changes_nothing_and_draws_depend_on_the_key_alone():

@@ -52,18 +52,18 @@ def compressed_writer(monkeypatch, kind):
         original = rosbag1.Writer
 
         def writer(path):
-            made = original(path)
-            made.set_compression(original.CompressionFormat[mode])
-            return made
+            bag = original(path)
+            bag.set_compression(original.CompressionFormat[mode])
+            return bag
 
         monkeypatch.setattr(rosbag1, "Writer", writer)
     elif module == "rosbag2":
         original, modes = rosbag2.Writer, rosbag2.CompressionMode
 
         def writer(path, **options):
-            made = original(path, **options)
-            made.set_compression(modes[mode], rosbag2.CompressionFormat.ZSTD)
-            return made
+            bag = original(path, **options)
+            bag.set_compression(modes[mode], rosbag2.CompressionFormat.ZSTD)
+            return bag
 
         monkeypatch.setattr(rosbag2, "Writer", writer)
 

@@ -165,12 +165,12 @@ def test_signs_are_turned_when_stated_or_asked_for(tmp_path):
         assert any("assuming that the screen points up" in note for note in notes)
     time = np.arange(2800) / 200
     # Gravity on -z is a warning unless the sign is stated.
-    found = imported(path, MAPPED)
-    (warning,) = found.warnings
+    recording = imported(path, MAPPED)
+    (warning,) = recording.warnings
     assert warning.startswith("sign: gravity reads on -z in ios.csv: ")
     assert warning.endswith("compare with --accel-sign ios")
-    write_imported(tmp_path / "ios.h5", found)
-    assert read_imported(tmp_path / "ios.h5").warnings == found.warnings
+    write_imported(tmp_path / "ios.h5", recording)
+    assert read_imported(tmp_path / "ios.h5").warnings == recording.warnings
     assert imported(path, MAPPED, accel_sign="android").warnings == ()
     assert imported(path, MAPPED, accel_sign="ios").warnings == ()
     assert imported(write_native(tmp_path / "walk.csv")).warnings == ()
@@ -283,15 +283,15 @@ def test_one_file_per_sensor_is_joined_on_one_clock(tmp_path):
     values = [stamps_of(gyro_time, "ns"), *imu(gyro_time)[:, 2::-1].T]
     gyro = write(tmp_path / "gyro.csv", ["time", *axes], values)
     columns = {name: name[-1] for name in AXES} | {"time": "time", "accel_time": "t"}
-    given = {"accel_path": accelerometer(), "rate": 100.0, "name": "walk"}
-    sequence, notes = import_recording(gyro, columns, **given)
+    options = {"accel_path": accelerometer(), "rate": 100.0, "name": "walk"}
+    sequence, notes = import_recording(gyro, columns, **options)
     assert np.allclose(np.diff(sequence.time), 0.01) and sequence.name == "walk"
     # The joint clock starts where both sensors run, at a sample of the gyro.
     start = gyro_time[gyro_time >= accel_time[0]][0]
     inner = slice(20, -20)  # the low-pass towards 100 Hz mirrors at the ends
-    known = imu(sequence.time + start)
-    np.testing.assert_allclose(sequence.gyro[inner], known[inner, :3], atol=1e-3)
-    np.testing.assert_allclose(sequence.accel[inner], known[inner, 3:], atol=1e-3)
+    expected = imu(sequence.time + start)
+    np.testing.assert_allclose(sequence.gyro[inner], expected[inner, :3], atol=1e-3)
+    np.testing.assert_allclose(sequence.accel[inner], expected[inner, 3:], atol=1e-3)
     assert sequence.time[-1] == pytest.approx(SECONDS - 0.3 - start, abs=0.03)
     assert sequence.imu_valid is None
     assert sequence.attributes["start_time"] == pytest.approx(UNIX * 1e-9 + start, abs=2e-6)
@@ -299,15 +299,15 @@ def test_one_file_per_sensor_is_joined_on_one_clock(tmp_path):
 
     # In another unit, and it stops for a while: what is there of the other is no whole sample.
     accelerometer("us", rows=(accel_time < 4.0) | (accel_time > 4.5))
-    holed, _ = import_recording(gyro, columns, **given)
+    holed, _ = import_recording(gyro, columns, **options)
     early = slice(20, 350)
-    np.testing.assert_allclose(holed.accel[early], known[early, 3:], atol=1e-3)
+    np.testing.assert_allclose(holed.accel[early], expected[early, 3:], atol=1e-3)
     missing = holed.time[~holed.imu_valid] + start
     assert len(missing) == pytest.approx(50, abs=3)
     assert missing[[0, -1]] == pytest.approx([4.0, 4.5], abs=0.02)
     accelerometer(later=3600.0)
     words = r"gyro\.csv: both sensors were recorded for 0\.00 s, less than the network's w"
-    refused(gyro, words, columns, **given)
+    refused(gyro, words, columns, **options)
 
 
 def test_a_pipe_is_refused_in_one_true_line(tmp_path):
@@ -325,24 +325,24 @@ def test_a_pipe_is_refused_in_one_true_line(tmp_path):
 def test_the_reference_of_the_package_s_own_form_is_kept_unless_it_is_none(tmp_path):
     path = write_native(tmp_path / "walk.csv", velocity=True)
     (by_dataset,) = csv_files.read(path)
-    found = imported(path)
-    assert by_dataset.valid.all() and found.sequence.valid.all()
-    assert "reference from given, 100% of the time" in found.notes
+    recording = imported(path)
+    assert by_dataset.valid.all() and recording.sequence.valid.all()
+    assert "reference from given, 100% of the time" in recording.notes
     for field in ("orientation", "position", "velocity"):
         expected = getattr(by_dataset, field)
-        np.testing.assert_allclose(getattr(found.sequence, field), expected, atol=1e-6)
-    write_imported(tmp_path / "mine" / "walk.h5", found)
+        np.testing.assert_allclose(getattr(recording.sequence, field), expected, atol=1e-6)
+    write_imported(tmp_path / "mine" / "walk.h5", recording)
     (again,) = data.load("csv", tmp_path / "mine", "test")
-    np.testing.assert_array_equal(again.gyro, found.sequence.gyro)
+    np.testing.assert_array_equal(again.gyro, recording.sequence.gyro)
 
     def tilted(columns):
         columns["qw"], columns["qx"] = columns["qx"], columns["qw"]
 
-    for given, words in (
+    for changes, words in (
         ({"spoil": tilted}, "the reference given does not fit the IMU"),
         ({"drop": ("py",)}, "column 'py' is missing while 'px' is there"),
     ):
-        sequence, notes = import_recording(write_native(path, **given))
+        sequence, notes = import_recording(write_native(path, **changes))
         assert not sequence.valid.any() and sequence.attributes["truth"] == "none"
         (note,) = (note for note in notes if note.startswith("no reference is taken: "))
         assert words in note

@@ -67,14 +67,14 @@ def whole(tmp_path_factory):
     """Kind -> a path of it."""
     folder = tmp_path_factory.mktemp("whole")
     logger_files.workbooks(folder, logger_files.phyphox_sets(seconds=2.0))
-    found = {name: folder / name for name in ("walk.xlsx", "walk.xls")}
+    paths = {name: folder / name for name in ("walk.xlsx", "walk.xls")}
     members = logger_files.sensor_logger("ios", seconds=2.0)
-    found["walk.zip"] = logger_files.zipped(folder / "walk.zip", members)
+    paths["walk.zip"] = logger_files.zipped(folder / "walk.zip", members)
     for kind in ("rosbag1", "mcap", "db3"):
         (folder / kind).mkdir()
         entries = bag_files.imu(bag_files.Maker(kind), seconds=2.0)
-        found[kind] = bag_files.write(folder / kind, kind, entries)
-    return found
+        paths[kind] = bag_files.write(folder / kind, kind, entries)
+    return paths
 
 
 def damaged(data, seed):

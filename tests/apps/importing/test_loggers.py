@@ -72,11 +72,11 @@ def test_sensor_logger(tmp_path, platform, standardised, dropped, words):
     assert sequence.attributes["start_time"] - EPOCH * 1e-9 == pytest.approx(0.01, abs=1e-6)
 
 
-@pytest.mark.parametrize("late, words", [(0.0, False), (0.3, True)])
-def test_a_note_has_the_time_of_one_sensor_alone_if_it_is_worth_telling(tmp_path, late, words):
+@pytest.mark.parametrize("delay, words", [(0.0, False), (0.3, True)])
+def test_a_note_has_the_time_of_one_sensor_alone_if_it_is_worth_telling(tmp_path, delay, words):
     members = sensor_logger()
     header, *rows = members["TotalAcceleration.csv"].splitlines()
-    rows = rows[round(100 * late) :]
+    rows = rows[round(100 * delay) :]
     members["TotalAcceleration.csv"] = "\n".join([header, *rows]) + "\n"
     _, notes = import_recording(zipped(tmp_path / "walk.zip", members))
     (note,) = (note for note in notes if "different stamps" in note)
@@ -155,8 +155,8 @@ def test_degrees_where_the_format_says_radians_are_refused(tmp_path):
 
 def test_a_zip_cut_short_or_with_a_member_that_lies_about_its_size_is_one_line(tmp_path):
     whole = zipped(tmp_path / "walk.zip", sensor_logger()).read_bytes()
-    for kept in (0.02, 0.5, 0.99):
-        (tmp_path / "walk.zip").write_bytes(whole[: int(kept * len(whole))])
+    for fraction in (0.02, 0.5, 0.99):
+        (tmp_path / "walk.zip").write_bytes(whole[: int(fraction * len(whole))])
         refused(tmp_path / "walk.zip", "walk.zip: cannot be read as a zip, it may be cut short")
     path = tmp_path / "bomb.zip"
     path.write_bytes(lying_zip(sensor_logger(), "Gyroscope.csv", 3 * 2**30))
@@ -204,7 +204,7 @@ def test_phyphox_as_a_workbook(tmp_path, monkeypatch):
 
 def test_a_workbook_that_unpacks_to_more_than_a_logger_writes_is_refused(tmp_path, monkeypatch):
     """A cell far out makes all cells before it, and a row far down all rows."""
-    for place, words in (
+    for cell, words in (
         ("XFD2", "sheet 'far' has a cell in column 16384 of row 2, which is too far out; export"),
         ("A1048577", "sheet 'far' has a cell in column 1 of row 1048577, which is too far out"),
     ):
@@ -216,10 +216,10 @@ def test_a_workbook_that_unpacks_to_more_than_a_logger_writes_is_refused(tmp_pat
         with zipfile.ZipFile(tmp_path / "near.xlsx") as near:
             members = {name: near.read(name).decode() for name in near.namelist()}
         name = "xl/worksheets/sheet2.xml"
-        row = place.lstrip("ABCDEFGHIJKLMNOPQRSTUVWXYZ")
+        row = cell.lstrip("ABCDEFGHIJKLMNOPQRSTUVWXYZ")
         assert '<row r="2"><c r="A2"' in members[name]
         members[name] = members[name].replace(
-            '<row r="2"><c r="A2"', f'<row r="{row}"><c r="{place}"'
+            '<row r="2"><c r="A2"', f'<row r="{row}"><c r="{cell}"'
         )
         refused(zipped(tmp_path / "far.xlsx", members), f"far.xlsx: {words}")
     workbooks(tmp_path, phyphox_sets())

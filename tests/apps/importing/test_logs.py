@@ -45,18 +45,18 @@ def put(folder, content, name="walk.csv", encoding="utf-8"):
 def check(path, words="", atol=2e-3, options=None, inner=slice(None)):
     """The file is the known walk to `atol` (and its values have no more than 3 digits of error
     elsewhere), from its first sample on, and a note or warning has the `words`."""
-    found = imported(path, **(options or {}))
-    text = " | ".join([*found.notes, *found.warnings])
+    recording = imported(path, **(options or {}))
+    text = " | ".join([*recording.notes, *recording.warnings])
     assert re.search(words, text), text
     compare_imu(
-        found.sequence._replace(
-            time=found.sequence.time[inner],
-            gyro=found.sequence.gyro[inner],
-            accel=found.sequence.accel[inner],
+        recording.sequence._replace(
+            time=recording.sequence.time[inner],
+            gyro=recording.sequence.gyro[inner],
+            accel=recording.sequence.accel[inner],
         ),
         atol=atol,
     )
-    return found.sequence
+    return recording.sequence
 
 
 # --- preamble, header, units, rows
@@ -214,8 +214,8 @@ def test_a_few_damaged_rows_are_left_out_and_named(tmp_path, name):
 def test_rows_of_other_times_are_left_out(tmp_path):
     """The first stamp before the clock was set; what was buffered before the start."""
     first = [0, *(NS // 10**6)[1:].tolist()]
-    found = imported(put(tmp_path, table(first)))
-    np.testing.assert_allclose(found.sequence.gyro, WALK[1:, :3], atol=1e-5)
+    recording = imported(put(tmp_path, table(first)))
+    np.testing.assert_allclose(recording.sequence.gyro, WALK[1:, :3], atol=1e-5)
     buffered = np.where(ROWS < 5, TIME - 100.0, TIME)
     path = put(tmp_path, table([f"{stamp + 200:.3f}" for stamp in buffered]))
     sequence, notes = import_recording(path)
@@ -343,10 +343,10 @@ def test_a_title_over_a_column_that_is_written_twice_is_no_sensor(tmp_path):
 def test_sensors_of_two_boards_under_the_same_names_are_refused(tmp_path):
     _, others = rows(table(ROWS * 10))
     cells = [row.split(",") for row in others]
-    both = [",".join([*c, *(f"{2 * float(x):.6f}" for x in c[1:])]) for c in cells]
+    board_rows = [",".join([*c, *(f"{2 * float(x):.6f}" for x in c[1:])]) for c in cells]
     upper = "Time" + 2 * ",Gyro,,,Acc,,"
     refused(
-        put(tmp_path, lines(upper, "ms" + 4 * ",x,y,z", *both)),
+        put(tmp_path, lines(upper, "ms" + 4 * ",x,y,z", *board_rows)),
         "'Gyro x' is there 2 times; leave one",
     )
 
@@ -359,12 +359,14 @@ def test_columns_without_a_name_do_not_matter(tmp_path):
 
 def test_stamps_of_robots(tmp_path):
     """Those of the header are taken, in one column or two, and not those of the arrival."""
-    late = NS + 40_000_000 + np.random.default_rng(3).integers(0, 10**6, COUNT)
+    arrivals = NS + 40_000_000 + np.random.default_rng(3).integers(0, 10**6, COUNT)
     one = ("%time", "field.header.seq", "field.header.stamp", *(f"field.{n}" for n in ROS))
-    stamps = [f"{a},{n},{b}" for n, (a, b) in enumerate(zip(late, NS, strict=True))]
+    stamps = [f"{a},{n},{b}" for n, (a, b) in enumerate(zip(arrivals, NS, strict=True))]
     check(put(tmp_path, table(stamps, one)), "time=field.header.stamp")
     two = ("Time", "header.stamp.secs", "header.stamp.nsecs", "header.frame_id", *ROS)
-    stamps = [f"{a / 1e9:.6f},{b // 10**9},{b % 10**9},imu" for a, b in zip(late, NS, strict=True)]
+    stamps = [
+        f"{a / 1e9:.6f},{b // 10**9},{b % 10**9},imu" for a, b in zip(arrivals, NS, strict=True)
+    ]
     sequence = check(put(tmp_path, table(stamps, two)), r"time=header\.stamp\.secs\+header")
     assert sequence.attributes["start_time"] == pytest.approx(NS[0] / 1e9, abs=1e-6)
     names = {"time": "header.stamp.secs+header.stamp.nsecs"}
@@ -481,9 +483,9 @@ def test_bursts_and_shared_stamps_are_spread_evenly(tmp_path):
 
 
 def test_a_burst_before_a_hole_is_not_spread_over_it(tmp_path):
-    rest = (TIME < 5.0 - 1e-9) | (TIME > 5.8 - 1e-9)
-    stamps = [f"{stamp:.3f}" for stamp in (ROWS // 4 * 4 / 100)[rest]]
-    sequence, notes = import_recording(put(tmp_path, table(stamps, values=WALK[rest])))
+    remaining_rows = (TIME < 5.0 - 1e-9) | (TIME > 5.8 - 1e-9)
+    stamps = [f"{stamp:.3f}" for stamp in (ROWS // 4 * 4 / 100)[remaining_rows]]
+    sequence, notes = import_recording(put(tmp_path, table(stamps, values=WALK[remaining_rows])))
     assert any("gyro lacks samples 1 times, for up to 0.79 s" in note for note in notes)
     before = np.round(sequence.time * 100).astype(int)[:500]
     np.testing.assert_allclose(sequence.accel[:500], WALK[before, 3:], atol=0.5)
@@ -525,7 +527,8 @@ def test_lost_samples_are_told(tmp_path):
     check(third, r"75\.04 samples a second, but its usual step is that of 100 Hz", 0.2)
     lasting = np.random.default_rng(1).random(COUNT) < 0.75
     path = put(
-        tmp_path, lines(header, *(r for r, here in zip(others, lasting, strict=True) if here))
+        tmp_path,
+        lines(header, *(r for r, presence in zip(others, lasting, strict=True) if presence)),
     )
     sequence = check(path, r"7\d\.\d+ samples a second, but its usual step is that of 100 Hz", 0.2)
     assert sequence.time[-1] == pytest.approx(TIME[-1], abs=0.05)
@@ -557,10 +560,10 @@ def test_a_clock_that_starts_again_is_never_mixed_in(tmp_path):
         )
 
     for first in (COUNT - 4, COUNT - 100):
-        found = imported(again(first))
-        np.testing.assert_allclose(found.sequence.gyro, WALK[:first, :3], atol=1e-5)
+        recording = imported(again(first))
+        np.testing.assert_allclose(recording.sequence.gyro, WALK[:first, :3], atol=1e-5)
         lost = COUNT - first
-        target = found.notes if lost < 15 else found.warnings
+        target = recording.notes if lost < 15 else recording.warnings
         assert any(
             f"starts again or was set back near row {first + 2}: {lost} rows" in t for t in target
         )
@@ -692,16 +695,16 @@ def test_names_that_a_board_prints_before_its_numbers(tmp_path):
         boot = "ets Jul 29 2019 12:21:46"
         words = r"row 701 .*1 such rows are left out.* serial console.*time=t gyro_x=gx"
         check(put(tmp_path, lines(*named[:700], boot, *named[700:])), words)
-        rest = [
+        console_lines = [
             before + row.split(separator, 1)[1] for before, row in zip(texts, named, strict=True)
         ]
-        check(put(tmp_path, lines(*rest)), "time=console_time gyro_x=gx")
+        check(put(tmp_path, lines(*console_lines)), "time=console_time gyro_x=gx")
 
 
 def test_a_clock_that_the_board_prints_comes_before_that_of_the_console(tmp_path):
     """Whatever it is called; the console's stamps are those of the arrival."""
-    late = 33_302_250 + ROWS * 10 + np.random.default_rng(1).integers(0, 9, COUNT)
-    texts = clock_text(np.sort(late), "{h:02d}:{m:02d}:{s:02d}.{ms:03d} -> ")
+    arrivals = 33_302_250 + ROWS * 10 + np.random.default_rng(1).integers(0, 9, COUNT)
+    texts = clock_text(np.sort(arrivals), "{h:02d}:{m:02d}:{s:02d}.{ms:03d} -> ")
     for clock in ("time", "t", "millis"):
         names = (clock, *AXES)
         named = [
@@ -710,8 +713,8 @@ def test_a_clock_that_the_board_prints_comes_before_that_of_the_console(tmp_path
         ]
         whole = [before + row for before, row in zip(texts, named, strict=True)]
         whole[500] = named[500]  # a line without its stamp is no row, nor is it cut
-        found = check(put(tmp_path, lines(*whole)), "row 501 .*1 such rows are left out")
-        assert len(found.time) == COUNT
+        sequence = check(put(tmp_path, lines(*whole)), "row 501 .*1 such rows are left out")
+        assert len(sequence.time) == COUNT
 
 
 def test_no_number_without_a_name_is_lost(tmp_path):
@@ -720,16 +723,16 @@ def test_no_number_without_a_name_is_lost(tmp_path):
     named = [" ".join(["T:", c[0], "G:", *c[1:4], "A:", *c[4:]]) for c in cells]
     places = ("1", "3", "4", "5", "7", "8", "9")
     path = put(tmp_path, lines(*named))
-    found, _ = import_recording(path, dict(zip(("time", *AXES), places, strict=True)))
-    compare_imu(found, atol=2e-3)
+    sequence, _ = import_recording(path, dict(zip(("time", *AXES), places, strict=True)))
+    compare_imu(sequence, atol=2e-3)
     names = ("gx", "gy", "gz", "ax", "ay", "az")
     for first in ("{}", "T:12:00:{}"):  # the time would be lost, or be the hour
-        rest = [
+        timed_lines = [
             " ".join([first.format(c[0]), *(f"{n}:{v}" for n, v in zip(names, c[1:], strict=True))])
             for c in cells
         ]
         with pytest.raises(InputError):
-            imported(put(tmp_path, lines(*rest)), sample_rate=100.0)
+            imported(put(tmp_path, lines(*timed_lines)), sample_rate=100.0)
     forms = [f"t={{}}, {', '.join(f'{n}={{}} rad/s' for n in names[:3])}"]
     forms += [f"{n}={{}} m/s^2" for n in names[3:]]
     with_units = [", ".join(forms).format(*c) for c in cells]
@@ -766,9 +769,9 @@ def test_units_of_a_header_and_counts(tmp_path):
     check(path, options={"accel_unit": "16384/g"})
     path = put(tmp_path, table(gyro=DEGREES * 131, accel=16384 / G, digits=0))
     refused(path, "raw counts. 16384 per g is the scale of ±2 g: --accel-unit 16384/g$")
-    both = {"accel_unit": "16384/g", "gyro_unit": "131/deg/s"}
-    check(path, options=both, atol=5e-3)
-    check(path, options=both | {"accel_unit": "0.06103515625*mg"}, atol=5e-3)
+    count_units = {"accel_unit": "16384/g", "gyro_unit": "131/deg/s"}
+    check(path, options=count_units, atol=5e-3)
+    check(path, options=count_units | {"accel_unit": "0.06103515625*mg"}, atol=5e-3)
     path = put(tmp_path, table(gyro=DEGREES * 1e3))
     refused(path, "beyond any gyro's range in rad/s and deg/s; state its unit: mdps, or raw counts")
     path = put(tmp_path, table(accel=100.0))
@@ -802,23 +805,28 @@ def test_rows_that_name_their_sensor(tmp_path):
     stamps = [(f"{t + 0.001:.3f}", f"{3600 + t:.3f}") for t in TIME]
     header = "% ACCE;AppTimestamp(s);SensorTimestamp(s);Acc_X(m/s^2);Acc_Y(m/s^2);Acc_Z(m/s^2)"
     accel, gyro = WALK[:, 3:], WALK[:, :3]
-    both = interleaved(by_sensor("ACCE", stamps, accel, ";"), by_sensor("GYRO", stamps, gyro, ";"))
-    both[100:100] = ["WIFI;0.500;1.0;SSID;aa:bb;-70;2412;3"]
-    check(put(tmp_path, lines("% LogFile", header, *both), "ipin.txt"))
+    sensor_rows = interleaved(
+        by_sensor("ACCE", stamps, accel, ";"), by_sensor("GYRO", stamps, gyro, ";")
+    )
+    sensor_rows[100:100] = ["WIFI;0.500;1.0;SSID;aa:bb;-70;2412;3"]
+    check(put(tmp_path, lines("% LogFile", header, *sensor_rows), "ipin.txt"))
     stamps = [(str(n // 10**6), str(n)) for n in NS]
     header = [
         f"# Uncal{n},utcTimeMillis,elapsedRealtimeNanos,Uncal{n}X{u},Uncal{n}Y{u},Uncal{n}Z{u}"
         for n, u in (("Accel", "Mps2"), ("Gyro", "RadPerSec"))
     ]
-    both = interleaved(by_sensor("UncalAccel", stamps, accel), by_sensor("UncalGyro", stamps, gyro))
+    sensor_rows = interleaved(
+        by_sensor("UncalAccel", stamps, accel), by_sensor("UncalGyro", stamps, gyro)
+    )
     check(
-        put(tmp_path, lines("# Version: v3", "# Raw,a,b", *header, *both), "gnss.txt"), "elapsedR"
+        put(tmp_path, lines("# Version: v3", "# Raw,a,b", *header, *sensor_rows), "gnss.txt"),
+        "elapsedR",
     )
     stamps = [(f"{t:.3f}",) for t in TIME]
-    both = interleaved(
+    sensor_rows = interleaved(
         by_sensor("accelerometer", stamps, accel), by_sensor("gyroscope", stamps, gyro)
     )
-    cells = [row.split(",") for row in both]
+    cells = [row.split(",") for row in sensor_rows]
     swapped = [",".join([c[1], c[0], *c[2:]]) for c in cells]
     check(put(tmp_path, lines("time,sensor,x,y,z", *swapped)))
     check(put(tmp_path, lines("time,x,y,z,sensor", *(",".join([*c[1:], c[0]]) for c in cells))))
@@ -875,7 +883,7 @@ def test_rows_of_two_imus_are_chosen_by_a_column(tmp_path):
 )
 def test_gravity_tells_signs_and_axes(tmp_path, turn, words):
     sign = [-1 if turn[0] == "-" else 1] * 3 + [1] * 3
-    order = [place for place in turn if place != "-"]
+    order = [column for column in turn if column != "-"]
     path = put(tmp_path, table(values=(WALK * sign)[:, order]))
     if words:
         refused(path, words)
@@ -919,8 +927,8 @@ def test_dead_sensors_are_refused(tmp_path):
         ),
     ):
         refused(put(tmp_path, table(values=values)), words)
-    found = imported(put(tmp_path, table(values=WALK * [1, 0, 1, 1, 1, 1])))
-    assert any("gyro_y reads 0 throughout: this axis is dead" in w for w in found.warnings)
+    recording = imported(put(tmp_path, table(values=WALK * [1, 0, 1, 1, 1, 1])))
+    assert any("gyro_y reads 0 throughout: this axis is dead" in w for w in recording.warnings)
 
 
 def test_rows_that_a_hung_sensor_repeats_are_missing_samples(tmp_path):
@@ -931,14 +939,14 @@ def test_rows_that_a_hung_sensor_repeats_are_missing_samples(tmp_path):
         values[first:last, axes] = noisy[first, axes]
         return put(tmp_path, table(values=values))
 
-    found = imported(stuck(1200, COUNT))
-    assert found.sequence.time[-1] == pytest.approx(12.0)
-    assert any("gyro repeats the same values in 199 of 1400 rows" in w for w in found.warnings)
+    recording = imported(stuck(1200, COUNT))
+    assert recording.sequence.time[-1] == pytest.approx(12.0)
+    assert any("gyro repeats the same values in 199 of 1400 rows" in w for w in recording.warnings)
     for axes in (slice(0, 6), slice(3, 6)):
-        found = imported(stuck(600, 660, axes))
-        valid = found.sequence.imu_valid
+        recording = imported(stuck(600, 660, axes))
+        valid = recording.sequence.imu_valid
         assert valid is not None and not valid[610:650].any() and valid[:600].all()
-        assert any("accel repeats the same values in 59 of 1400" in w for w in found.warnings)
+        assert any("accel repeats the same values in 59 of 1400" in w for w in recording.warnings)
     refused(stuck(400, 700), "repeats the same values for 3.00 s after 4.00 s: it was stuck; cut")
 
 
@@ -954,13 +962,15 @@ def test_a_gyro_may_read_zero_at_rest(tmp_path):
         1,
         1,
     ]
-    found = imported(put(tmp_path, table(values=values)), gyro_unit="rad/s")
-    assert found.sequence.imu_valid is None and not any("repeats" in w for w in found.warnings)
+    recording = imported(put(tmp_path, table(values=values)), gyro_unit="rad/s")
+    assert recording.sequence.imu_valid is None and not any(
+        "repeats" in w for w in recording.warnings
+    )
     values = WALK + noise
     values[600:660, :3] = 0.0  # while it is shaken, a gyro that reads 0 hangs
-    found = imported(put(tmp_path, table(values=values)), gyro_unit="rad/s")
-    assert any("gyro repeats the same values in 59 of 1400 rows" in w for w in found.warnings)
-    valid = found.sequence.imu_valid
+    recording = imported(put(tmp_path, table(values=values)), gyro_unit="rad/s")
+    assert any("gyro repeats the same values in 59 of 1400 rows" in w for w in recording.warnings)
+    valid = recording.sequence.imu_valid
     assert valid is not None and not valid[610:650].any() and valid[:600].all()
 
 

@@ -21,7 +21,7 @@ def pressure(time):
     return 101325.0 - 12.0 * known_walk.position(time)[:, 2]
 
 
-def place(time):
+def coordinates(time):
     return 45.0 + 1e-5 * time, 6.0 + 2e-5 * time, 300.0 + 0.1 * time
 
 
@@ -35,7 +35,7 @@ def logger_table(time, **columns):
 
 
 def location(time, accuracy=4.0, **changes):
-    latitude, longitude, altitude = place(time)
+    latitude, longitude, altitude = coordinates(time)
     columns = {
         "verticalAccuracy": 0 * time + 6.0,
         "horizontalAccuracy": 0 * time + accuracy,
@@ -72,7 +72,7 @@ def compare(recording, shift=0.01, sensors=("barometer", "gnss", "magnetometer")
         elif sensor == "barometer":
             np.testing.assert_allclose(values[:, 0], pressure(time), atol=1e-3)
         else:
-            np.testing.assert_allclose(values, np.stack(place(time), axis=1), atol=1e-6)
+            np.testing.assert_allclose(values, np.stack(coordinates(time), axis=1), atol=1e-6)
             np.testing.assert_allclose(std, np.tile([4.0, 4.0, 6.0], (len(time), 1)))
         if sensor != "magnetometer":
             np.testing.assert_allclose(time, SLOW, atol=1e-6)
@@ -93,7 +93,7 @@ def test_sensor_logger_has_field_pressure_and_place(tmp_path):
 
 def test_phyphox_has_field_pressure_and_place_by_units_in_any_language(tmp_path):
     time = logger_files.clock()
-    latitude, longitude, altitude = place(SLOW)
+    latitude, longitude, altitude = coordinates(SLOW)
     of_place = [latitude, longitude, altitude, 1 + 0 * SLOW, 2 + 0 * SLOW]
     of_place += [4 + 0 * SLOW, 6 + 0 * SLOW]
     names = ["Breite (°)", "Länge (°)", "Höhe (m)", "Geschw. (m/s)", "Richtung (°)"]
@@ -113,7 +113,7 @@ def test_a_table_of_any_names_has_them_beside_the_imu_in_rows_of_their_own(tmp_p
     """Receiver and barometer have a value in every hundredth row, and are empty in the others."""
     time = np.arange(800) / 100
     rows = np.isin(np.round(time, 2), np.round(SLOW, 2))
-    latitude, longitude, altitude = place(time)
+    latitude, longitude, altitude = coordinates(time)
     columns = {
         "Timestamp": time,
         **{f"Gyr_{axis}": known_walk.rate(time)[:, k] for k, axis in enumerate("XYZ")},
@@ -143,7 +143,7 @@ def test_a_folder_of_tables_has_the_place_in_a_table_of_its_own(tmp_path):
         table = np.column_stack([time, values])
         text = {"header": "time,x,y,z", "comments": "", "delimiter": ","}
         np.savetxt(tmp_path / f"{name}.csv", table, **text)
-    table = np.column_stack([SLOW, *place(SLOW), 4 + 0 * SLOW, 6 + 0 * SLOW])
+    table = np.column_stack([SLOW, *coordinates(SLOW), 4 + 0 * SLOW, 6 + 0 * SLOW])
     header = "time,lat,lng,height,accuracy,vertical_accuracy"
     np.savetxt(tmp_path / "gps.csv", table, header=header, comments="", delimiter=",")
     compare(imported(tmp_path, gyro_unit="rad/s"), 0.0, ("gnss",))
@@ -169,7 +169,7 @@ def test_a_bag_has_them_as_messages_and_a_field_in_the_axes_of_the_imu(tmp_path,
     def fix(time):
         status = make.new("sensor_msgs/msg/NavSatStatus", 0 if time < 5 else -1, 1)
         spread = np.diag([16.0, 16.0, 36.0]).ravel()
-        header, values = make.header(time, "gps"), map(float, place(time))
+        header, values = make.header(time, "gps"), map(float, coordinates(time))
         return make.new(names["NavSatFix"], header, status, *values, spread, 2)
 
     entries = bag_files.imu(make, seconds=8.0)
@@ -183,8 +183,8 @@ def test_a_bag_has_them_as_messages_and_a_field_in_the_axes_of_the_imu(tmp_path,
     assert len(readings["gnss"].time) == 5  # those with a fix
     without_fix = dict(readings)
     del without_fix["gnss"]
-    kept = recording._replace(sequence=recording.sequence._replace(readings=without_fix))
-    compare(kept, 0.0, ("barometer", "magnetometer"))
+    remainder = recording._replace(sequence=recording.sequence._replace(readings=without_fix))
+    compare(remainder, 0.0, ("barometer", "magnetometer"))
     np.testing.assert_allclose(readings["gnss"].std[0], [4.0, 4.0, 6.0])
 
 
@@ -229,7 +229,7 @@ def test_a_sensor_that_cannot_be_used_is_left_out_with_a_remedy(tmp_path, change
 def test_missing_late_repeated_and_damaged_rows_are_left_out_and_counted(tmp_path):
     """A receiver repeats its last fix, writes zeros before its first one, loses the height once,
     and a row comes late."""
-    latitude, longitude, altitude = (np.array(x) for x in place(SLOW))
+    latitude, longitude, altitude = (np.array(x) for x in coordinates(SLOW))
     time = np.concatenate([SLOW, SLOW[5:6] + 0.5, [0.01]])
     rows = [0, 1, 2, 4, 3, 5, 6, 7]  # two of them exchanged
 

@@ -51,8 +51,8 @@ def test_every_kind_of_reference(tmp_path, kind):
     sequence, notes = import_recording(write(tmp_path, "mcap", entries))
     if kind == "Pose":  # without a header: stamped by the bag
         assert sequence.valid[100:-100].all()
-        late = known_walk.position(sequence.time[100:-100] - LOGGED * 1e-9)
-        np.testing.assert_allclose(sequence.position[100:-100], late, atol=2e-3)
+        expected = known_walk.position(sequence.time[100:-100] - LOGGED * 1e-9)
+        np.testing.assert_allclose(sequence.position[100:-100], expected, atol=2e-3)
     else:
         compare_reference(sequence, INNER, 2e-2 if slow else 2e-3)
     text = " | ".join(notes)
@@ -66,9 +66,9 @@ def test_a_reference_is_moved_along_static_transforms(tmp_path):
     joins nothing. Empty headers leave the bag's stamps."""
     make = Maker(headers=False)
     half = Rotation.from_euler("x", 0.7)
-    rest = half.inv() * MOUNT[0], half.inv().apply(MOUNT[1] - [0.1, 0.0, 0.0])
+    remainder = half.inv() * MOUNT[0], half.inv().apply(MOUNT[1] - [0.1, 0.0, 0.0])
     first = ("/plate", "base_link", half.inv(), half.inv().apply([-0.1, 0.0, 0.0]))
-    static = [make.static(*first), make.static("plate", "imu_link", *rest)]
+    static = [make.static(*first), make.static("plate", "imu_link", *remainder)]
     static.append(make.static("base_link", "imu_link", half, [9.0, 9.0, 9.0]))
     static[-1].transforms[0].transform.rotation = make.new("geometry_msgs/msg/Quaternion", *ZERO)
     entries = imu(make) + poses(make, "Odometry", MOUNT)
@@ -99,8 +99,8 @@ def test_topics_are_chosen_and_named(tmp_path):
     entries += poses(make, "PoseStamped", ONE, topic="/a", child="")
     entries += poses(make, "PoseStamped", ONE, topic="/b", child="")
     path = write(tmp_path, "rosbag2", entries)
-    both = r"/imu/data \(sensor_msgs/Imu\), /camera/imu \(sensor_msgs/Imu\)"
-    refused(path, f"walk: has 2 IMU topics; choose one by --imu-topic: {both}")
+    topics = r"/imu/data \(sensor_msgs/Imu\), /camera/imu \(sensor_msgs/Imu\)"
+    refused(path, f"walk: has 2 IMU topics; choose one by --imu-topic: {topics}")
     refused(path, r"walk: has no topic '/imu'; its topics: .*/chatter", imu_topic="/imu")
     refused(path, "topic /a is geometry_msgs/msg/PoseStamped, no IMU", imu_topic="/a")
     sequence, notes = import_recording(path, imu_topic="/camera/imu")
@@ -108,9 +108,9 @@ def test_topics_are_chosen_and_named(tmp_path):
     assert any("no reference is taken; --reference-topic may be /a (" in note for note in notes)
     compare_imu(sequence)
     assert len(sequence.time) == 1200 and not sequence.valid.any()
-    given = {"imu_topic": "/imu/data", "reference_topic": "/chatter"}
-    refused(path, "/chatter is std_msgs/msg/String, no pose; pose topics: /a", **given)
-    compare_reference(import_recording(path, **given | {"reference_topic": "/b"})[0], INNER, 2e-3)
+    options = {"imu_topic": "/imu/data", "reference_topic": "/chatter"}
+    refused(path, "/chatter is std_msgs/msg/String, no pose; pose topics: /a", **options)
+    compare_reference(import_recording(path, **options | {"reference_topic": "/b"})[0], INNER, 2e-3)
 
 
 def test_gyro_and_accelerometer_of_two_topics(tmp_path):
@@ -135,7 +135,7 @@ def test_a_reference_that_is_none_is_left_out_unless_it_was_named(tmp_path):
     """Too few poses, those of another time, those of a world that lies on its side."""
     make = Maker()
     on_its_side = Rotation.from_euler("x", 90, degrees=True), np.zeros(3)
-    for given, words in (
+    for reference, words in (
         ((ONE, 1.0, 0.0), "topic /pose: holds 6 poses; name another"),
         (
             (ONE, 50.0, 100.0),
@@ -143,7 +143,7 @@ def test_a_reference_that_is_none_is_left_out_unless_it_was_named(tmp_path):
         ),
         ((on_its_side, 50.0, 0.0), "the reference /pose does not fit the IMU .mean of R·accel is"),
     ):
-        mount, rate, start = given
+        mount, rate, start = reference
         entries = imu(make) + poses(make, "PoseStamped", mount, rate=rate, start=start)
         path = write(tmp_path, "mcap", entries)
         refused(path, words, reference_topic="/pose")
@@ -159,8 +159,8 @@ def test_only_what_a_library_cannot_read_is_called_damage(tmp_path, monkeypatch,
     of an index. An error of ours is none."""
     path = write(tmp_path, kind, imu(Maker(kind), seconds=2.0))
     whole = path.read_bytes()
-    for kept in (0.1, 0.99):
-        path.write_bytes(whole[: int(kept * len(whole))])
+    for fraction in (0.1, 0.99):
+        path.write_bytes(whole[: int(fraction * len(whole))])
         refused(path, f"{path.name}: (cannot be read as a ROS . bag, it may be|is) cut short")
     if kind == "rosbag1":
         data = bytearray(whole)
@@ -183,35 +183,39 @@ def test_headers_that_do_not_run_as_the_bag_are_not_used(tmp_path):
     """Twice as fast, not at all, and a twentieth too fast; a delay that varies is none of these."""
     for pace, words in ((2.0, "run 2 times as"), (0.0, "run 0 times as"), (1.05, "run 1.05 times")):
         make = Maker()
-        make.header = lambda time, frame, own=make.header, pace=pace: own(time * pace, frame)
+        make.header = lambda time, frame, header=make.header, pace=pace: header(time * pace, frame)
         path = write(tmp_path, "mcap", imu(make))
-        found = imported(path)
-        compare_imu(found.sequence)
-        assert any(f"the headers of /imu/data {words}" in warning for warning in found.warnings)
-        assert found.sequence.attributes["start_time"] == pytest.approx(
+        recording = imported(path)
+        compare_imu(recording.sequence)
+        assert any(f"the headers of /imu/data {words}" in warning for warning in recording.warnings)
+        assert recording.sequence.attributes["start_time"] == pytest.approx(
             (EPOCH + LOGGED) * 1e-9, abs=1e-6
         )
     make = Maker()  # a few messages without a stamp
-    make.header = lambda time, frame, own=make.header: own(time if time > 0.025 else -1.6e9, frame)
-    found = imported(write(tmp_path, "mcap", imu(make)))
-    compare_imu(found.sequence._replace(time=found.sequence.time + 0.03))
-    assert any("rows of gyro are left out, whose stamps are far" in note for note in found.notes)
-    late = np.random.default_rng(0).integers(0, 2 * LOGGED, 600)
+    make.header = lambda time, frame, header=make.header: header(
+        time if time > 0.025 else -1.6e9, frame
+    )
+    recording = imported(write(tmp_path, "mcap", imu(make)))
+    compare_imu(recording.sequence._replace(time=recording.sequence.time + 0.03))
+    assert any(
+        "rows of gyro are left out, whose stamps are far" in note for note in recording.notes
+    )
+    delays = np.random.default_rng(0).integers(0, 2 * LOGGED, 600)
     entries = [
         (*row[:2], row[2] + int(delay), row[3])
-        for row, delay in zip(imu(Maker()), late, strict=True)
+        for row, delay in zip(imu(Maker()), delays, strict=True)
     ]
-    found = imported(write(tmp_path, "mcap", entries))
-    compare_imu(found.sequence)
-    assert found.warnings == ()
+    recording = imported(write(tmp_path, "mcap", entries))
+    compare_imu(recording.sequence)
+    assert recording.warnings == ()
 
 
 def test_a_bag_without_an_index_and_a_name_for_another_file_have_a_remedy(tmp_path):
     path = write(tmp_path, "rosbag1", imu(Maker("rosbag1"), seconds=2.0))
     content = bytearray(path.read_bytes())
-    place = content.index(b"index_pos=") + 10
-    end = int.from_bytes(content[place : place + 8], "little")
-    content[place : place + 8] = bytes(8)  # as rosbag leaves it when it is killed
+    offset = content.index(b"index_pos=") + 10
+    end = int.from_bytes(content[offset : offset + 8], "little")
+    content[offset : offset + 8] = bytes(8)  # as rosbag leaves it when it is killed
     path.write_bytes(content[:end])
     refused(path, r"walk\.bag: has no index, .*; make one: rosbag reindex walk\.bag$")
     path = write(tmp_path, "db3", imu(Maker("db3"), seconds=2.0))

@@ -31,7 +31,7 @@ def run(tmp_path_factory):
     config = TrainConfig(
         data=DataConfig(rate=RATE), model=ModelConfig(name="tiny"), filter=SETTINGS
     )
-    with tiny_run.known():
+    with tiny_run.registry_entry():
         yield tiny_run.save(tmp_path_factory.mktemp("home") / "run", config)
 
 

@@ -41,15 +41,15 @@ def test_the_rate_is_measured_over_the_first_second(rate):
 )
 def test_a_rate_that_no_imu_has_is_refused(second, problem):
     """Stamps in minutes and days: the first second of a day would be held for a day."""
-    taken = []
+    reads = []
     lines = (f"{k / 100 / second!r},{STILL}" for k in range(10**6))
     stage = with_measured_rate(
-        of_lines(taken.append(0) or line for line in lines), Nature("udp:5"), print
+        of_lines(reads.append(0) or line for line in lines), Nature("udp:5"), print
     )
     with pytest.raises(InputError, match=rf"udp:5: its samples come at {problem}.*10 to 2000 Hz"):
         with unchecked():
             list(stage)
-    assert len(taken) <= checks.MOST_HELD
+    assert len(reads) <= checks.MOST_HELD
 
 
 def test_until_the_rate_is_measured_it_says_what_it_waits_for():
@@ -74,12 +74,12 @@ def test_an_accelerometer_that_reads_no_gravity_is_refused(size, remedy):
 
 def test_samples_pass_as_they_come():
     """Those of the first second at its end, later ones at once."""
-    taken = []
+    reads = []
     lines = [f"{k / 50},{STILL}" for k in range(150)]
     stage = with_measured_rate(
-        of_lines(taken.append(0) or one for one in lines), Nature("udp:5"), print
+        of_lines(reads.append(0) or one for one in lines), Nature("udp:5"), print
     )
-    counts = [len(taken) for arrival in stage if arrival.sample]
+    counts = [len(reads) for arrival in stage if arrival.sample]
     assert counts == [51] * 51 + list(range(52, 151))
 
 
@@ -122,14 +122,14 @@ FLIP = np.array([-1.0, 1.0, 1.0])
 def test_sensors_that_contradict_each_other_end_the_stream(change, problem):
     """Nine seconds after its begin, or with the next look at it, as a recording is refused."""
     stage = with_measured_rate(of_lines(walk(change)), Nature("udp:5"), print)
-    seen = []
+    times = []
     with pytest.raises(InputError, match=rf"udp:5: .*{problem}"):
-        seen += (arrival.sample.time for arrival in stage if arrival.sample)
-        raise AssertionError(f"followed for {len(seen) / 100} s")
+        times += (arrival.sample.time for arrival in stage if arrival.sample)
+        raise AssertionError(f"followed for {len(times) / 100} s")
 
 
 @pytest.mark.parametrize(
-    ("remedy", "wanted"),
+    ("remedy", "ending"),
     [
         ("the clock is wrong: give --time-unit (s per stamp) or --sample-rate (Hz)", "in seconds"),
         ("state the unit of the gyro, as by --gyro-unit 131/deg/s", "or send it in rad/s"),
@@ -137,8 +137,8 @@ def test_sensors_that_contradict_each_other_end_the_stream(change, problem):
         ("give both sensors the same axes, as by --columns gyro_x=gyro_y", "the same axes"),
     ],
 )
-def test_a_remedy_names_no_option_that_a_stream_lacks(remedy, wanted):
-    assert checks._for_streams(remedy).endswith(wanted)
+def test_a_remedy_names_no_option_that_a_stream_lacks(remedy, ending):
+    assert checks._for_streams(remedy).endswith(ending)
 
 
 def test_the_walk_as_it_is_passes_without_a_word():
@@ -152,10 +152,10 @@ def test_the_sign_of_ios_is_named_or_warned_of(sign, platform):
     negative = -1.0 if platform == "ios" else 1.0
     lines = walk(lambda gyro, accel: (gyro, negative * accel), seconds=3)
     stage = list(with_measured_rate(of_lines(lines), Nature("udp:5", None, sign), print))
-    wanted = WALK.accel[:300]
+    expected = WALK.accel[:300]
     right = sign == "detect" or (sign or "android") == platform
-    found = np.array([sample.accel for sample in samples_of(stage)])
-    np.testing.assert_allclose(found, wanted if right else -wanted)
+    forces = np.array([sample.accel for sample in samples_of(stage)])
+    np.testing.assert_allclose(forces, expected if right else -expected)
     warned = any("iOS's sign and the path is wrong: compare with --accel-sign ios" in text
                  for text in texts_of(stage))  # fmt: skip
     assert warned == (sign is None and platform == "ios")
@@ -167,8 +167,10 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_said():
     with pytest.raises(InputError, match=r"udp:5: its gyro looks like deg/s.*state the unit"):
         rate_of(lines)
     parsed = [samples.parse_line(line, samples.Units("deg/s")) for line in lines]
-    found = samples_of(with_measured_rate(arrivals(parsed), Nature("udp:5"), print))
-    np.testing.assert_allclose([s.gyro for s in found], known_walk.rate(time), atol=1e-9)
+    converted_samples = samples_of(with_measured_rate(arrivals(parsed), Nature("udp:5"), print))
+    np.testing.assert_allclose(
+        [s.gyro for s in converted_samples], known_walk.rate(time), atol=1e-9
+    )
 
 
 def ride_and_walk():

@@ -29,13 +29,13 @@ def test_a_clock_that_is_set_is_a_gap_of_the_time_that_passed(by, passed):
     """Of two intervals at least; it is said before the samples go on, and none is lost."""
     set_stamps = np.concatenate([STAMPS[:100], STAMPS[100:] + by])
     clocks = np.concatenate([STAMPS[:100], STAMPS[100:] + passed - 0.01])
-    found = clocked(set_stamps, clocks)
-    (notice,) = texts_of(found)
+    stage = clocked(set_stamps, clocks)
+    (notice,) = texts_of(stage)
     way = "back" if by < 0 else "forward"
     assert f"was set {way} by" in notice and "it goes on with a gap" in notice
-    assert texts_of(found[: found.index(next(a for a in found if a.notice)) + 1]) == [notice]
-    stamps = times(found)
-    assert len(stamps) == 300 and texts_of(found, "refusal") == []
+    assert texts_of(stage[: stage.index(next(a for a in stage if a.notice)) + 1]) == [notice]
+    stamps = times(stage)
+    assert len(stamps) == 300 and texts_of(stage, "refusal") == []
     steps = np.diff(stamps)
     assert steps[99] == pytest.approx(max(passed, 0.02), abs=1e-6)
     np.testing.assert_allclose(np.delete(steps, 99), 0.01, atol=1e-6)
@@ -62,28 +62,28 @@ def test_a_pause_of_the_phone_is_a_gap_and_its_stamps_stay():
 def test_some_wrong_stamps_cost_their_samples_alone(wrong, by):
     stamps = STAMPS.copy()
     stamps[100 : 100 + wrong] += by
-    found = clocked(stamps, STAMPS)
-    np.testing.assert_allclose(times(found), np.delete(STAMPS, np.s_[100 : 100 + wrong]))
-    refusals = texts_of(found, "refusal")
+    stage = clocked(stamps, STAMPS)
+    np.testing.assert_allclose(times(stage), np.delete(STAMPS, np.s_[100 : 100 + wrong]))
+    refusals = texts_of(stage, "refusal")
     assert len(refusals) == wrong and all("time: must increase" in text for text in refusals)
-    assert texts_of(found) == []
+    assert texts_of(stage) == []
 
 
 @pytest.mark.parametrize("first", [[0.0], [4.3e6], [0.0, 0.0], [9e9, 3.0]])
 def test_the_first_stamps_may_be_wrong(first):
     """A sender whose first packet has no stamp yet: neither memory nor samples are lost for it."""
     uptime = 4.2e6 + STAMPS
-    found = clocked(np.concatenate([first, uptime]))
-    np.testing.assert_array_equal(times(found), uptime)
-    refusals = texts_of(found, "refusal")
+    stage = clocked(np.concatenate([first, uptime]))
+    np.testing.assert_array_equal(times(stage), uptime)
+    refusals = texts_of(stage, "refusal")
     assert len(refusals) == len(first) and refusals[0].endswith(", far from the next stamps")
 
 
 def test_two_senders_at_one_address_do_not_stop_each_other():
     mixed = np.stack([STAMPS, STAMPS + 1000.0], axis=1).reshape(-1)
     mixed = np.concatenate([STAMPS[:50], np.delete(mixed, np.s_[:100])])
-    found = clocked(mixed)
-    np.testing.assert_array_equal(times(found), STAMPS)
+    stage = clocked(mixed)
+    np.testing.assert_array_equal(times(stage), STAMPS)
 
 
 def test_samples_a_little_late_are_not_refused_here():

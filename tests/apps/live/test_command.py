@@ -41,11 +41,11 @@ def test_a_stream_gives_the_trackers_poses(follow, run, recorded, monkeypatch, t
     out, lines = tmp_path / "live.txt", as_lines(recorded)
     # A header, noise on the line and a repeated sample are refused and counted.
     lines = ["time,gx,gy,gz,ax,ay,az", *lines[:70], "\udcff\udcfe", lines[69], *lines[70:]]
-    told = follow(lines, "--out", out, *shown)
+    output = follow(lines, "--out", out, *shown)
     assert {path.name for path in tmp_path.iterdir()} == {"live.txt", *(["live.rrd"] * bool(shown))}
-    assert "\x1b" not in told and "warning: 3 lines refused, the first: is not a sample" in told
+    assert "\x1b" not in output and "warning: 3 lines refused, the first: is not a sample" in output
     # A line a second, the last one repeated at the end.
-    assert sum(line.lstrip()[0].isdigit() for line in told.splitlines()) == 6
+    assert sum(line.lstrip()[0].isdigit() for line in output.splitlines()) == 6
 
     tracker, expected = create_tracker(networks.load(run), RATE), []
     for sample in zip(*recorded, strict=True):
@@ -56,24 +56,24 @@ def test_a_stream_gives_the_trackers_poses(follow, run, recorded, monkeypatch, t
     np.testing.assert_allclose(path.position, [p.position for p in expected], atol=1e-8)
     if not shown:
         return
-    found = columns_of(tmp_path / "live.rrd")
-    moved = np.array(found["/live/pose"]["Transform3D:translation"])[:, 0]
+    columns = columns_of(tmp_path / "live.rrd")
+    moved = np.array(columns["/live/pose"]["Transform3D:translation"])[:, 0]
     np.testing.assert_allclose(moved, path.position, atol=1e-5)
-    seconds = [each.total_seconds() for each in found["/live/pose"]["time"]]
+    seconds = [stamp.total_seconds() for stamp in columns["/live/pose"]["time"]]
     np.testing.assert_allclose(seconds, path.time - path.time[0], atol=1e-6)
     pieces = [
-        found[f"/live/estimate/{number:04d}"]["LineStrips3D:strips"][-1][0] for number in range(5)
+        columns[f"/live/estimate/{number:04d}"]["LineStrips3D:strips"][-1][0] for number in range(5)
     ]
     # Each begins where the one before ended.
     line = np.concatenate([pieces[0], *(piece[1:] for piece in pieces[1:])])
     np.testing.assert_allclose(line, path.position, atol=1e-5)
-    assert len(found["/live/ellipsoid"]["Ellipsoids3D:half_sizes"]) == len(path.time)
+    assert len(columns["/live/ellipsoid"]["Ellipsoids3D:half_sizes"]) == len(path.time)
 
 
 def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monkeypatch):
     options = changed(considered={"scale": 0.1, "heading": np.pi / 2})
-    found = networks.load(run)
-    calibrated = found._replace(config=dataclasses.replace(found.config, filter=options))
+    network = networks.load(run)
+    calibrated = network._replace(config=dataclasses.replace(network.config, filter=options))
     passed = []
 
     def noted(_, ekf, **__):
@@ -82,7 +82,7 @@ def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monk
 
     monkeypatch.setattr(tracking, "Tracker", noted)
     create_tracker(calibrated, RATE)
-    create_tracker(found, RATE)
+    create_tracker(network, RATE)
     assert passed == [ConsideredStd(0.0, 0.1, np.pi / 2, 0.0), None]
 
 
@@ -90,20 +90,26 @@ def test_gaps_are_said_and_a_stamp_in_the_future_costs_its_sample_alone(follow, 
     """Also rows that are empty are missing; before the start none is missed."""
     lines = as_lines(recorded)
     empty = [f"{line.split(',')[0]},,,,,," for line in lines[100:115]]
-    told = follow([*lines[:20], *lines[50:100], *empty, *lines[115:150], *lines[151:]])
-    assert "warning: gaps: 1, the longest of 0.32 s: samples are missing" in told
-    assert told.index("warning: start: it moved while it should lie still") < told.index("0.0 s  x")
+    output = follow([*lines[:20], *lines[50:100], *empty, *lines[115:150], *lines[151:]])
+    assert "warning: gaps: 1, the longest of 0.32 s: samples are missing" in output
+    assert output.index("warning: start: it moved while it should lie still") < output.index(
+        "0.0 s  x"
+    )
     time, values = lines[150].split(",", 1)
     whole = follow(lines)
-    told = follow([*lines[:150], f"{float(time) + 30},{values}", *lines[151:]])
-    assert "gaps" not in told and "warning: 1 lines refused" in told and "it moved" not in told
-    assert told.splitlines()[-1].split()[0] == whole.splitlines()[-1].split()[0]  # s
+    output = follow([*lines[:150], f"{float(time) + 30},{values}", *lines[151:]])
+    assert (
+        "gaps" not in output and "warning: 1 lines refused" in output and "it moved" not in output
+    )
+    assert output.splitlines()[-1].split()[0] == whole.splitlines()[-1].split()[0]  # s
     gyro, accel = np.degrees(recorded[1]), recorded[2] / 9.80665
     units = ("--gyro-unit", "deg/s", "--accel-unit", "g")
     assert follow(as_lines((recorded[0], gyro, accel)), *units) == whole
     opposite = as_lines((recorded[0], recorded[1], -recorded[2]))
-    told = follow(opposite, "--accel-sign", "ios")
-    assert "accel negated (iOS's sign)" in told and told.splitlines()[-1] == whole.splitlines()[-1]
+    output = follow(opposite, "--accel-sign", "ios")
+    assert (
+        "accel negated (iOS's sign)" in output and output.splitlines()[-1] == whole.splitlines()[-1]
+    )
 
 
 @pytest.mark.parametrize("spoilt", ["late", "lost", "set back", "wrong first"])
@@ -123,27 +129,30 @@ def test_streams_that_networks_and_clocks_spoil_are_followed(follow, recorded, t
     else:
         lines.insert(0, "0,0,0,0,0,0,9.81".replace("0", "4000000", 1))
         words = ["warning: 1 lines refused, the first: time: must increase"]
-    told = follow(lines, "--out", tmp_path / "spoilt.txt")
-    assert all(text in told for text in words) and ("refused" in told) == (spoilt == "wrong first")
+    output = follow(lines, "--out", tmp_path / "spoilt.txt")
+    assert all(text in output for text in words) and ("refused" in output) == (
+        spoilt == "wrong first"
+    )
     follow(as_lines(recorded), "--out", tmp_path / "whole.txt")
-    found, wanted = read_tum(tmp_path / "spoilt.txt"), read_tum(tmp_path / "whole.txt")
+    path, expected = read_tum(tmp_path / "spoilt.txt"), read_tum(tmp_path / "whole.txt")
     assert (
-        abs(found.time[0] - wanted.time[0]) < 0.21 and abs(found.time[-1] - wanted.time[-1]) < 0.11
+        abs(path.time[0] - expected.time[0]) < 0.21
+        and abs(path.time[-1] - expected.time[-1]) < 0.11
     )
     if spoilt in ("late", "wrong first"):
-        np.testing.assert_allclose(found.position, wanted.position, atol=1e-9)
+        np.testing.assert_allclose(path.position, expected.position, atol=1e-9)
 
 
 def test_a_stream_slower_than_the_network_is_followed(follow, tmp_path):
     """Its poses are those of the same walk at the network's own rate, as far as lines can be."""
-    found = {}
+    paths = {}
     for rate in (25, 50):
-        told = follow(as_lines(walked(rate)), "--out", tmp_path / "live.txt")
-        assert f"samples come at {rate} Hz" in told
-        assert ("trained at 50 Hz" in told) == (rate < 50)
-        found[rate] = read_tum(tmp_path / "live.txt")
-    rows = np.searchsorted(found[50].time, found[25].time - 1e-3)
-    error = found[25].position - found[50].position[rows]
+        output = follow(as_lines(walked(rate)), "--out", tmp_path / "live.txt")
+        assert f"samples come at {rate} Hz" in output
+        assert ("trained at 50 Hz" in output) == (rate < 50)
+        paths[rate] = read_tum(tmp_path / "live.txt")
+    rows = np.searchsorted(paths[50].time, paths[25].time - 1e-3)
+    error = paths[25].position - paths[50].position[rows]
     assert len(rows) > 35 and np.abs(error).max() < 0.3
 
 
@@ -174,8 +183,8 @@ SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 9]
 def test_mistakes_are_one_line(mistake, run, monkeypatch, tmp_path, lines, arguments, problem):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
-    told = mistake("live", *arguments, "--network", run, lines=lines)
-    assert problem in told and ("standard input" in told) == (not arguments)
+    message = mistake("live", *arguments, "--network", run, lines=lines)
+    assert problem in message and ("standard input" in message) == (not arguments)
 
 
 def test_a_standard_input_that_is_closed_is_one_line(run, monkeypatch, capsys):
@@ -199,29 +208,30 @@ def test_a_recording_played_gives_the_track_of_it(
     rows = np.delete(rows, np.s_[150:175], axis=0)
     header = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
     np.savetxt(walk, rows, delimiter=",", header=header, comments="", fmt="%.12f")
-    given = ("--gyro-unit", "rad/s")
-    told = follow([], walk, "--speed", "0", "--out", tmp_path / "live.txt", *given)
+    units = ("--gyro-unit", "rad/s")
+    output = follow([], walk, "--speed", "0", "--out", tmp_path / "live.txt", *units)
     monkeypatch.chdir(tmp_path)
-    gnio("track", walk, "--out", "track", "--network", run, *given)
+    gnio("track", walk, "--out", "track", "--network", run, *units)
     followed, tracked = read_tum(tmp_path / "live.txt"), read_tum(tmp_path / "track/trajectory.txt")
-    assert told.startswith(f"following {walk} with run") and "walked" in told
-    assert "lacks samples 1 times" in told and "in the quietest second" in told
-    assert "warning: gaps: 1, the longest of 0.52 s" in told
+    assert output.startswith(f"following {walk} with run") and "walked" in output
+    assert "lacks samples 1 times" in output and "in the quietest second" in output
+    assert "warning: gaps: 1, the longest of 0.52 s" in output
     rows = np.searchsorted(tracked.time, followed.time - 1e-4)
     assert rows[0] == round(1.0 / 0.1) and (np.diff(rows[:-1]) == 1).all()
-    both = rows < len(tracked.time)  # a track ends with the stamp of its last sample
-    assert (~both).sum() <= 1 and both.sum() > 35
+    overlap = rows < len(tracked.time)  # a track ends with the stamp of its last sample
+    assert (~overlap).sum() <= 1 and overlap.sum() > 35
     for name in ("position", "orientation"):
-        found, wanted = getattr(followed, name)[both], getattr(tracked, name)[rows[both]]
-        np.testing.assert_allclose(found, wanted, atol=1e-7)
+        values, expected = getattr(followed, name)[overlap], getattr(tracked, name)[rows[overlap]]
+        np.testing.assert_allclose(values, expected, atol=1e-7)
     assert np.ptp(tracked.position, axis=0).max() > 0.3
 
 
 @pytest.mark.parametrize(
-    ("number", "status", "said"), [(signal.SIGTERM, 143, ""), (signal.SIGINT, 130, "interrupted\n")]
+    ("number", "status", "message"),
+    [(signal.SIGTERM, 143, ""), (signal.SIGINT, 130, "interrupted\n")],
 )
 def test_a_signal_ends_the_stream_and_nothing_is_lost(
-    request, capsys, run, recorded, monkeypatch, tmp_path, number, status, said
+    request, capsys, run, recorded, monkeypatch, tmp_path, number, status, message
 ):
     content, out = "\n".join(as_lines(recorded)).encode(), tmp_path / "live.txt"
     # A shell starts background jobs with Ctrl-C ignored; this one is to hear it.
@@ -244,7 +254,7 @@ def test_a_signal_ends_the_stream_and_nothing_is_lost(
         monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
         with pytest.raises(SystemExit, match=str(status)):
             console.run(lambda: app.main(["live", "--network", str(run), "--out", str(out)]))
-        assert capsys.readouterr().err == said
+        assert capsys.readouterr().err == message
     # 31 whole intervals of 0.1 s; the first pose is that of the end of the rest.
     time = read_tum(out).time
     np.testing.assert_allclose(time, np.arange(10, 32) / 10, atol=1e-6)
@@ -266,16 +276,16 @@ class Diverging:
         self.time += 1
         zero, healthy = np.zeros(3), self.time < self.first
         covariance = np.eye(15) * (1.0 if healthy else -1.0)
-        place = np.array([self.time, 0.0, 0.0])
-        poses = (np.eye(3), zero, place, zero, zero, covariance, 1.0, 1.0, healthy)
+        position = np.array([self.time, 0.0, 0.0])
+        poses = (np.eye(3), zero, position, zero, zero, covariance, 1.0, 1.0, healthy)
         return Pose(float(self.time), *poses, "" if healthy else "a speed of 700 m/s")
 
 
 @pytest.mark.filterwarnings("error")
 def test_what_a_diverged_filter_says_is_not_kept(follow, recorded, monkeypatch, tmp_path):
     monkeypatch.setattr(tracking, "create_tracker", lambda *_, **__: Diverging())
-    told = follow(as_lines(recorded)[:9], "--out", tmp_path / "live.txt")
-    assert "THE FILTER DIVERGED" in told and "nan" not in told
+    output = follow(as_lines(recorded)[:9], "--out", tmp_path / "live.txt")
+    assert "THE FILTER DIVERGED" in output and "nan" not in output
     np.testing.assert_allclose(read_tum(tmp_path / "live.txt").position[:, 0], np.arange(1, 6))
 
 
@@ -286,10 +296,10 @@ def test_a_filter_that_diverges_at_once_is_one_line(
     words = ("live", "--network", run, "--out", tmp_path / "live.txt")
     with pytest.raises(SystemExit, match="2"):
         gnio(*words, lines=as_lines(recorded)[:90])
-    told = capsys.readouterr()
-    assert told.err.count("\n") == 1
-    assert "standard input: the filter diverged at once (a speed of 700 m/s); hold" in told.err
-    assert "THE FILTER DIVERGED (a speed" in told.out and list(tmp_path.iterdir()) == []
+    output = capsys.readouterr()
+    assert output.err.count("\n") == 1
+    assert "standard input: the filter diverged at once (a speed of 700 m/s); hold" in output.err
+    assert "THE FILTER DIVERGED (a speed" in output.out and list(tmp_path.iterdir()) == []
 
 
 def test_a_diverged_filter_is_not_shown(tmp_path, monkeypatch):
@@ -301,10 +311,10 @@ def test_a_diverged_filter_is_not_shown(tmp_path, monkeypatch):
     with rerun.streaming("viewer") as stream:
         for _ in range(9):
             stream.add(tracker.push(None, None, None))
-    found = columns_of(path)
-    moved = found["/live/pose"]["Transform3D:translation"]
+    columns = columns_of(path)
+    moved = columns["/live/pose"]["Transform3D:translation"]
     np.testing.assert_allclose(np.array(moved)[:, 0, 0], np.arange(1, 6))
-    drawn = found["/live/estimate/0000"]["LineStrips3D:strips"][-1][0]
+    drawn = columns["/live/estimate/0000"]["LineStrips3D:strips"][-1][0]
     np.testing.assert_allclose(np.array(drawn)[:, 0], np.arange(1, 6))
 
 
@@ -335,28 +345,28 @@ def test_what_is_sent_while_it_compiles_is_not_lost(follow, monkeypatch, tmp_pat
     create = tracking.create_tracker
     lines = [f"{k / RATE},0,0,0,0,0,9.81".encode() for k in range(round(2 * RATE))]
 
-    def meanwhile(*given, **options):
+    def meanwhile(*arguments, **options):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             for line in lines:
                 sender.sendto(line, ("127.0.0.1", port))
         time.sleep(0.1)
-        return create(*given, **options)
+        return create(*arguments, **options)
 
     monkeypatch.setattr(tracking, "create_tracker", meanwhile)
-    told = follow([], f"udp:{port}", "--silence", "0.5", "--out", tmp_path / "live.txt")
-    assert "ready: hold still now, for 1 s" in told
+    output = follow([], f"udp:{port}", "--silence", "0.5", "--out", tmp_path / "live.txt")
+    assert "ready: hold still now, for 1 s" in output
     assert read_tum(tmp_path / "live.txt").time[0] == pytest.approx(1.0, abs=1.5 / RATE)
 
 
 @pytest.mark.parametrize("holds", [True, False])
 def test_a_filter_that_does_not_hold_the_rest_says_so(run, follow, recorded, monkeypatch, holds):
     """Its poses say that the device is quiet nevertheless."""
-    found = networks.load(run)
-    config = dataclasses.replace(found.config, filter=FilterSettings())
-    trained = found if holds else found._replace(config=config)
+    network = networks.load(run)
+    config = dataclasses.replace(network.config, filter=FilterSettings())
+    trained = network if holds else network._replace(config=config)
     monkeypatch.setattr(networks, "load", lambda _: trained)
-    told = follow(as_lines(recorded))
-    assert ("does not hold the position while the device rests" in told) != holds
+    output = follow(as_lines(recorded))
+    assert ("does not hold the position while the device rests" in output) != holds
     result, tracker = Followed(), create_tracker(trained, RATE)
     still = [f"{k / RATE},0,0,0,0,0,9.81" for k in range(150)]
     nature = Nature("udp:5")

@@ -22,10 +22,10 @@ def test_messages_keep_their_order_and_end_with_the_silence():
         assert inbox.put(message, len(message))
     inbox.put(b"\xff\xfe", 2)
     begin = time.monotonic()
-    found = list(inbox.arrivals(parse_lines, 0.3))
+    arrivals = list(inbox.arrivals(parse_lines, 0.3))
     assert 0.25 < time.monotonic() - begin < 5
-    assert [sample.time for sample in samples_of(found)] == [0, 1, 2, 3, 4, 5]
-    assert texts_of(found, "refusal") == [NO_SAMPLE]
+    assert [sample.time for sample in samples_of(arrivals)] == [0, 1, 2, 3, 4, 5]
+    assert texts_of(arrivals, "refusal") == [NO_SAMPLE]
 
 
 def test_without_messages_time_passes_and_nothing_ends():
@@ -38,12 +38,12 @@ def test_without_messages_time_passes_and_nothing_ends():
 def test_what_waits_is_bounded_and_what_is_lost_is_said(monkeypatch, bound):
     monkeypatch.setattr(inboxes, bound, 5 if bound == "MOST_MESSAGES" else 100)
     inbox, line = Inbox("udp:5", "datagrams"), f"1,{STILL}".encode()
-    kept = sum(inbox.put(line, 20) for _ in range(12))
+    count = sum(inbox.put(line, 20) for _ in range(12))
     stage = inbox.arrivals(parse_lines, 0.05)
-    assert kept == 5
+    assert count == 5
     assert next(stage).notice.startswith("7 datagrams are lost: they came faster than")
-    rest = list(stage)
-    assert len(samples_of(rest)) == 5 and texts_of(rest, "notice") == []  # it is said once
+    arrivals = list(stage)
+    assert len(samples_of(arrivals)) == 5 and texts_of(arrivals, "notice") == []  # it is said once
     assert inbox.put(line, 20)  # what was read makes place
 
 
@@ -67,10 +67,10 @@ def test_datagrams_are_received_before_they_are_read(port):
             sender.sendto(f"{k},{STILL}\n".encode(), ("127.0.0.1", port))
     time.sleep(0.2)
     read = time.monotonic()
-    found = list(source.arrivals)
+    arrivals = list(source.arrivals)
     source.close()
-    assert [sample.time for sample in samples_of(found)] == list(range(50))
-    assert all(arrival.clock < read for arrival in found if arrival.sample)
+    assert [sample.time for sample in samples_of(arrivals)] == list(range(50))
+    assert all(arrival.clock < read for arrival in arrivals if arrival.sample)
 
 
 def lines_of(content):
@@ -80,18 +80,18 @@ def lines_of(content):
 def test_a_stream_is_read_line_by_line():
     """Its last line needs no end, empty ones do not count, and chunks cut nothing."""
     content = "".join(f"{k / 100},{STILL}\r\n\n" for k in range(20_000)).encode()
-    found = lines_of(content + f"200,{STILL}".encode())
-    assert [sample.time for sample in samples_of(found)] == [k / 100 for k in range(20_001)]
-    assert texts_of(found, "refusal") == []
+    arrivals = lines_of(content + f"200,{STILL}".encode())
+    assert [sample.time for sample in samples_of(arrivals)] == [k / 100 for k in range(20_001)]
+    assert texts_of(arrivals, "refusal") == []
 
 
 def test_a_line_without_an_end_is_refused_again_and_again():
     """And its memory is bounded; the line after it is read."""
     number = 40
     content = bytes(number * inboxes.CHUNK) + f"\n1,{STILL}\n".encode()
-    found = lines_of(content)
-    assert number <= len(texts_of(found, "refusal")) <= number + 2
-    assert [sample.time for sample in samples_of(found)] == [1.0]
+    arrivals = lines_of(content)
+    assert number <= len(texts_of(arrivals, "refusal")) <= number + 2
+    assert [sample.time for sample in samples_of(arrivals)] == [1.0]
 
 
 def test_a_stream_that_is_silent_says_so(monkeypatch):

@@ -26,8 +26,8 @@ def paired(rows):
     return [None if arrival.refusal else arrival.sample for arrival in stage]
 
 
-def whole(found):
-    return [row for row in found if row and all(map(math.isfinite, (*row.gyro, *row.accel)))]
+def whole(rows):
+    return [row for row in rows if row and all(map(math.isfinite, (*row.gyro, *row.accel)))]
 
 
 def at_100_hz(seconds=3.0):
@@ -40,9 +40,9 @@ def at_100_hz(seconds=3.0):
 def test_samples_that_come_a_little_late_lose_nothing(kind):
     """Every 60th pair swapped, or each late by up to 45 ms: 1.7 % and 90 % out of order."""
     rows = [Sample(k / 100, SPIN, PULL) for k in range(600)]
-    late = np.random.default_rng(0).uniform(0, 0.045, len(rows)) * (kind == "random")
-    late[::60] += 0.0101 * (kind == "neighbours")
-    order = np.argsort([row.time + delay for row, delay in zip(rows, late, strict=True)])
+    delays = np.random.default_rng(0).uniform(0, 0.045, len(rows)) * (kind == "random")
+    delays[::60] += 0.0101 * (kind == "neighbours")
+    order = np.argsort([row.time + delay for row, delay in zip(rows, delays, strict=True)])
     assert (np.diff(order) < 0).sum() >= 10
     assert paired([rows[k] for k in order]) == rows
 
@@ -52,15 +52,15 @@ def test_a_sample_that_comes_twice_or_too_late_is_refused():
     stage = in_order(arrivals([*rows[:50], rows[49], rows[30], *rows[50:]]))
     stage = list(stage)
     assert samples_of(stage) == rows
-    twice, late = texts_of(stage, "refusal")
-    assert twice.endswith("it came twice") and late.endswith("0.19 s late")
+    twice, delay_refusal = texts_of(stage, "refusal")
+    assert twice.endswith("it came twice") and delay_refusal.endswith("0.19 s late")
 
 
 def test_samples_wait_no_longer_than_the_disorder():
-    taken = []
+    inputs = []
     rows = [Sample(k / 100, SPIN, PULL) for k in range(100)]
-    for arrival in in_order(arrivals(taken.append(row) or row for row in rows)):
-        assert taken[-1].time - arrival.sample.time < DISORDER + 0.011 or taken[-1] is rows[-1]
+    for arrival in in_order(arrivals(inputs.append(row) or row for row in rows)):
+        assert inputs[-1].time - arrival.sample.time < DISORDER + 0.011 or inputs[-1] is rows[-1]
 
 
 @pytest.mark.parametrize(("start", "rate"), [(0.0, 60), (1.7e9, 10)])
@@ -71,12 +71,12 @@ def test_the_accelerometer_is_interpolated_at_the_stamps_of_the_gyro(start, rate
     forces = random.normal(size=(len(pulled), 3))
     rows = [gyro(t, (t, 0.0, -t)) for t in turned]
     rows += [accel(t, tuple(f)) for t, f in zip(pulled, forces.tolist(), strict=True)]
-    found = whole(paired(by_stamp(rows)))
-    assert [sample.time for sample in found] == list(turned)
-    assert [sample.gyro for sample in found] == [(t, 0.0, -t) for t in turned]
+    samples = whole(paired(by_stamp(rows)))
+    assert [sample.time for sample in samples] == list(turned)
+    assert [sample.gyro for sample in samples] == [(t, 0.0, -t) for t in turned]
     for axis in range(3):
-        wanted = np.interp(turned, pulled, forces[:, axis])
-        np.testing.assert_allclose([sample.accel[axis] for sample in found], wanted, atol=1e-6)
+        expected = np.interp(turned, pulled, forces[:, axis])
+        np.testing.assert_allclose([sample.accel[axis] for sample in samples], expected, atol=1e-6)
 
 
 def test_other_arrivals_pass_at_once():
@@ -95,49 +95,49 @@ def test_other_arrivals_pass_at_once():
 def test_few_rows_by_hand(rows, samples):
     """Readings that are far apart enclose nothing, and one at the same stamp needs no other."""
     for gyro_first in (True, False):
-        both = by_stamp(map(gyro, rows[1]), map(accel, rows[0]))
-        both.sort(key=lambda row: (row.time, math.isnan(row.gyro[0]) == gyro_first))
-        found = [(row.time, row.accel) for row in paired(both) if row.gyro == SPIN]
-        assert repr(found) == repr(samples)  # NaN is not NaN
+        readings = by_stamp(map(gyro, rows[1]), map(accel, rows[0]))
+        readings.sort(key=lambda row: (row.time, math.isnan(row.gyro[0]) == gyro_first))
+        pairs = [(row.time, row.accel) for row in paired(readings) if row.gyro == SPIN]
+        assert repr(pairs) == repr(samples)  # NaN is not NaN
 
 
 def test_without_the_accelerometer_the_gyro_waits_no_longer_than_it_must():
     """Its samples then are a gap."""
     rows = [gyro(0.02 * k) for k in range(10)]
-    seen = []
-    given = in_order(arrivals(seen.append(row) or row for row in rows))
-    assert next(given).sample == rows[0] and seen[-1].time <= 2 * LONGEST_WAIT
-    assert [arrival.sample.time for arrival in given] == [row.time for row in rows[1:]]
+    inputs = []
+    stage = in_order(arrivals(inputs.append(row) or row for row in rows))
+    assert next(stage).sample == rows[0] and inputs[-1].time <= 2 * LONGEST_WAIT
+    assert [arrival.sample.time for arrival in stage] == [row.time for row in rows[1:]]
 
 
-@pytest.mark.parametrize("late", [0.0, 0.09, -0.006, -0.09])
+@pytest.mark.parametrize("delay", [0.0, 0.09, -0.006, -0.09])
 @pytest.mark.parametrize("between", [None, 0.02])
-def test_either_sensor_may_come_late(late, between):
-    """In the order of arrival, the gyro `late` s after the accelerometer: where rows of it are
+def test_either_sensor_may_come_late(delay, between):
+    """In the order of arrival, the gyro `delay` s after the accelerometer: where rows of it are
     missing, and where empty ones come between, as of a third sensor, none is overtaken."""
     pulled, turned = at_100_hz()
     turned = [*turned[:200], *turned[203:]]
-    rows = [(row.time, row) for row in pulled] + [(row.time + late, row) for row in turned]
+    rows = [(row.time, row) for row in pulled] + [(row.time + delay, row) for row in turned]
     if between:
         times = np.arange(1.001, 3.0, between)  # once the gyro has rows of its own
         rows += [(time, Sample(time, MISSING, MISSING)) for time in times]
     arrived = [row for _, row in sorted(rows, key=lambda pair: pair[0])]
-    found = paired(arrived)
-    times = [row.time for row in found if row]
-    assert times == sorted(set(times)) and None not in found
-    assert [row.time for row in whole(found)] == [row.time for row in turned[:-1]]
+    samples = paired(arrived)
+    times = [row.time for row in samples if row]
+    assert times == sorted(set(times)) and None not in samples
+    assert [row.time for row in whole(samples)] == [row.time for row in turned[:-1]]
 
 
 def test_where_the_gyro_falls_silent_time_passes():
     pulled, turned = at_100_hz(2.0)
-    found = paired(by_stamp(pulled, turned[:100]))
-    silent = found[-1]
+    samples = paired(by_stamp(pulled, turned[:100]))
+    silent = samples[-1]
     assert silent.time == pytest.approx(1.99) and math.isnan(silent.gyro[0])
-    assert len(found) == pytest.approx(100 + 90, abs=2)
+    assert len(samples) == pytest.approx(100 + 90, abs=2)
     assert len(paired(pulled)) == pytest.approx(190, abs=2)
 
 
 def test_rows_without_values_pass_where_both_sensors_share_rows():
     lines = [f"{k / 100},{'0,0,0,0,0,9.8' if k % 10 else ',,,,,'}" for k in range(100)]
-    found = samples_of(in_order(of_lines(lines)))
-    assert len(found) == 100 and sum(row.whole for row in found) == 90
+    samples = samples_of(in_order(of_lines(lines)))
+    assert len(samples) == 100 and sum(row.whole for row in samples) == 90

@@ -19,12 +19,12 @@ from tests.support.phones import EPOCH, Experiment, messages
 
 def read(bodies, stated=SI, sign="android"):
     """(samples, refusals) of some messages."""
-    phone, found = SensorLogger("http:8000", stated, sign), []
+    phone, items = SensorLogger("http:8000", stated, sign), []
     for body in bodies:
-        found += phone.decode(body)
+        items += phone.decode(body)
     return (
-        [one for one in found if isinstance(one, Sample)],
-        [one for one in found if isinstance(one, str)],
+        [one for one in items if isinstance(one, Sample)],
+        [one for one in items if isinstance(one, str)],
     )
 
 
@@ -32,8 +32,8 @@ def assert_walk(samples, recorded, atol=1e-9, missing=0):
     stamps, gyro, accel = recorded
     count = len(stamps) - missing
     assert len(samples) == count
-    found = np.array([sample.time for sample in samples])
-    np.testing.assert_allclose(found - found[0], stamps[:count] - stamps[0], atol=1e-6)
+    times = np.array([sample.time for sample in samples])
+    np.testing.assert_allclose(times - times[0], stamps[:count] - stamps[0], atol=1e-6)
     np.testing.assert_allclose([s.gyro for s in samples], gyro[:count], atol=atol)
     np.testing.assert_allclose([s.accel for s in samples], accel[:count], atol=atol)
 
@@ -62,8 +62,8 @@ def test_a_lost_message_is_waited_for_and_then_a_gap():
     stamps, gyro, accel = recorded = walked()
     bodies = messages(*recorded, period=0.2)
     samples, refusals = read([*bodies[:5], *bodies[6:], bodies[5]])
-    kept = (stamps < 0.999) | (stamps > 1.199)
-    assert_walk(samples, (stamps[kept], gyro[kept], accel[kept]))
+    received_rows = (stamps < 0.999) | (stamps > 1.199)
+    assert_walk(samples, (stamps[received_rows], gyro[received_rows], accel[received_rows]))
     assert len(refusals) == 1
 
 
@@ -153,15 +153,15 @@ def test_a_sensor_that_is_missing_or_falls_silent_is_missing_in_the_samples():
     """Time passes nevertheless, and memory is bounded."""
     row = lambda t: (t, (0.0, 0.0, 1.0))  # noqa: E731
     for kind, other in (("gyro", "accel"), ("accel", "gyro")):
-        batches, found = Batches(), []
+        batches, samples = Batches(), []
         for second in range(10):
             stamps = second + np.arange(100) / 100
             batches.add(kind, [row(t) for t in stamps.tolist()])
             if second < 5:
                 batches.add(other, [row(t) for t in stamps.tolist()])
-            found += batches.samples()
-        assert all(isinstance(one, Sample) for one in found)
-        assert sum(one.whole for one in found) == 500 and found[-1].time > 7.9
+            samples += batches.samples()
+        assert all(isinstance(one, Sample) for one in samples)
+        assert sum(one.whole for one in samples) == 500 and samples[-1].time > 7.9
         assert sum(map(len, batches._rows.values())) < 300
 
 
@@ -173,18 +173,18 @@ def test_rows_with_far_stamps_are_left_out():
     batches.add("accel", [(0.0, (0.0, 0.0, 1.0))])
     count = len(list(batches.samples()))
     batches.add("accel", [(0.01, (0.0, 0.0, 1.0))])
-    found = list(batches.samples())
-    assert count == 301 and found == []  # one came twice, and none comes again
+    samples = list(batches.samples())
+    assert count == 301 and samples == []  # one came twice, and none comes again
 
 
 def test_a_clock_that_is_set_back_begins_anew():
-    batches, found = Batches(), []
+    batches, rows = Batches(), []
     for begin in (100.0, 101.0, 50.0, 51.0):
         for kind in ("accel", "gyro"):
             stamps = (begin + np.arange(100) / 100).tolist()
             batches.add(kind, [(t, (0.0, 0.0, 1.0)) for t in stamps])
-        found += batches.samples()
-    assert [one.time for one in found[::100]] == [100.0, 101.0, 50.0, 51.0] and len(found) == 400
+        rows += batches.samples()
+    assert [one.time for one in rows[::100]] == [100.0, 101.0, 50.0, 51.0] and len(rows) == 400
 
 
 # --- phyphox
@@ -194,16 +194,16 @@ def polled(experiment, seconds, act=lambda now: None):
     """(samples, notices) of an experiment that is asked for some seconds."""
     inbox, phone = Inbox("phyphox"), Phyphox(experiment.address, "phyphox")
     phone.run(inbox)
-    found, begin, decode = [], time.monotonic(), PhyphoxRows(SI).decode
+    arrivals, begin, decode = [], time.monotonic(), PhyphoxRows(SI).decode
     for arrival in inbox.arrivals(decode):
         act(time.monotonic() - begin)
-        found.append(arrival)
+        arrivals.append(arrival)
         if time.monotonic() - begin > seconds:
             break
     phone.close()
-    assert not any(arrival.refusal for arrival in found)
-    notices = [arrival.notice for arrival in found if arrival.notice]
-    return [arrival.sample for arrival in found if arrival.sample], notices
+    assert not any(arrival.refusal for arrival in arrivals)
+    notices = [arrival.notice for arrival in arrivals if arrival.notice]
+    return [arrival.sample for arrival in arrivals if arrival.sample], notices
 
 
 @pytest.mark.parametrize("sources", [("accelerometer", "gyroscope"),
@@ -213,7 +213,7 @@ def test_an_experiment_of_phyphox_is_started_and_read(sources):
     recorded = walked(seconds=5.0)
     experiment = Experiment(*recorded, speed=10, sources=sources)
     samples, notices = polled(experiment, 1.5)
-    assert "/control?cmd=start" in experiment.asked
+    assert "/control?cmd=start" in experiment.requests
     assert experiment.begin is None  # it is stopped at the end
     assert_walk(samples, [field[1:] for field in recorded], atol=1e-5)
     assert notices == []
@@ -225,7 +225,7 @@ def test_an_experiment_that_runs_is_neither_started_nor_read_from_its_begin():
     experiment.control("start")
     time.sleep(1.0)
     samples, _ = polled(experiment, 1.0)
-    assert not any("control" in path for path in experiment.asked)
+    assert not any("control" in path for path in experiment.requests)
     assert samples[0].time > 1.9 and experiment.begin is not None
     steps = np.diff([sample.time for sample in samples])
     np.testing.assert_allclose(steps, 0.02, atol=1e-5)

@@ -25,10 +25,10 @@ def test_a_sample_may_be_written_in_several_ways(line):
 
 def test_a_missing_value_is_nan():
     for line in ("2,,0,0,1,1,nan", '{"time": 2, "gyro": [null, 0, 0], "accel": [1, 1, null]}'):
-        found = parse_line(line)
-        assert found is not None and math.isnan(found.gyro[0]) and math.isnan(found.accel[2])
-    found = parse_line('{"time": 0, "accel": [0, 0, 9]}')
-    assert found is not None and math.isnan(found.gyro[0]) and found.accel == (0, 0, 9)
+        sample = parse_line(line)
+        assert sample is not None and math.isnan(sample.gyro[0]) and math.isnan(sample.accel[2])
+    sample = parse_line('{"time": 0, "accel": [0, 0, 9]}')
+    assert sample is not None and math.isnan(sample.gyro[0]) and sample.accel == (0, 0, 9)
 
 
 @pytest.mark.parametrize(
@@ -60,11 +60,11 @@ def test_a_line_that_is_no_sample(line):
 def test_no_text_at_all_is_an_error():
     random, signs = np.random.default_rng(0), [*'0123456789.,;:+-eE{}[]" \t\x00\xff\u20ac', *KEYS]
     for length in random.integers(0, 20, 3000):
-        found = parse_line("".join(random.choice(signs, length)))
-        assert found is None or math.isfinite(found.time)
+        sample = parse_line("".join(random.choice(signs, length)))
+        assert sample is None or math.isfinite(sample.time)
 
 
 def test_empty_lines_do_not_count():
     message = b"\n" * 1000 + b" \r\n1,0,0,0,0,0,1\nx\n\n"
-    found = list(parse_lines(message, Units("deg/s", "g")))
-    assert found == [Sample(1.0, (0, 0, 0), (0, 0, 9.80665)), NO_SAMPLE]
+    samples = list(parse_lines(message, Units("deg/s", "g")))
+    assert samples == [Sample(1.0, (0, 0, 0), (0, 0, 9.80665)), NO_SAMPLE]

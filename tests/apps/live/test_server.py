@@ -37,7 +37,7 @@ def serving():
         server.close()
 
 
-def asked(address, method="GET", path="/", **headers):
+def response(address, method="GET", path="/", **headers):
     """(status, headers, content) of a request."""
     connection = http.client.HTTPConnection(*address, timeout=20)
     try:
@@ -61,14 +61,14 @@ def raw(address, request):
 def test_the_page_and_its_state_are_all_there_is_to_see(serving):
     server, address = serving()
     server.state = lambda first: {"first": first}
-    status, headers, page = asked(address)
+    status, headers, page = response(address)
     assert status == 200 and page == server.page and b"gnio live" in page
     policy = headers["Content-Security-Policy"]
     assert "default-src 'none'" in policy and "unsafe" not in policy
     assert "frame-ancestors 'none'" in policy and policy.count("sha256-") == 2
     assert headers["X-Content-Type-Options"] == "nosniff" and headers["Server"] == "gnio"
     assert headers["Cache-Control"] == "no-store"
-    status, headers, content = asked(address, path="/state?from=12")
+    status, headers, content = response(address, path="/state?from=12")
     assert status == 200 and json.loads(content) == {"first": 12}
     assert headers["Content-Type"] == "application/json"
 
@@ -99,8 +99,8 @@ def test_the_page_loads_nothing_from_elsewhere(serving):
 )
 def test_other_requests_are_refused_without_their_words(serving, method, path, status):
     _, address = serving()
-    found, headers, content = asked(address, method, path)
-    assert found == status and b"script" not in content and len(content) < 40
+    code, headers, content = response(address, method, path)
+    assert code == status and b"script" not in content and len(content) < 40
     assert "default-src 'none'" in headers["Content-Security-Policy"]
 
 
@@ -113,7 +113,7 @@ def test_a_request_that_is_none_is_no_error_of_the_server(serving, request_line)
     _, address = serving()
     answer = raw(address, request_line)
     assert b"Traceback" not in answer and b"<b>" not in answer and b"xxx" not in answer
-    assert asked(address)[0] == 200
+    assert response(address)[0] == 200
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_a_request_that_is_none_is_no_error_of_the_server(serving, request_line)
 def test_only_addresses_of_this_machine_are_answered(serving, bound, host, status):
     """A page of another site whose name leads here (DNS rebinding) sees nothing."""
     _, address = serving(bound)
-    assert asked(address, Host=host.format(port=address[1]))[0] == status
+    assert response(address, Host=host.format(port=address[1]))[0] == status
 
 
 def test_messages_go_into_the_inbox(serving):
@@ -190,7 +190,7 @@ def test_connections_are_few_and_do_not_stay(serving, monkeypatch):
     end = time.monotonic() + 10
     while server._connections.total() and time.monotonic() < end:
         time.sleep(0.05)
-    assert server._connections.total() == 0 and asked(address)[0] == 200
+    assert server._connections.total() == 0 and response(address)[0] == 200
 
 
 def test_a_body_that_never_ends_is_not_waited_for(serving, monkeypatch):

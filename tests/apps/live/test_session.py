@@ -35,17 +35,17 @@ class Clocked:
         self.stamps.append(time)
 
 
-def pose_at(time, place, healthy=True, quiet=False, covariance=None):
+def pose_at(time, position, healthy=True, quiet=False, covariance=None):
     zero = np.zeros(3)
     covariance = np.eye(15) * (1.0 if healthy else -1.0) if covariance is None else covariance
-    given = (time, np.eye(3), zero, np.array(place), zero, zero, covariance, 1.0, 1.0, healthy)
-    return Pose(*given, "" if healthy else "speed", quiet)
+    fields = (time, np.eye(3), zero, np.array(position), zero, zero, covariance, 1.0, 1.0, healthy)
+    return Pose(*fields, "" if healthy else "speed", quiet)
 
 
 def followed(lines, tracker=None):
-    result, said = Followed(), []
-    follow(tracker or Clocked(), of_lines(lines), UDP, result, print, said.append)
-    return result, said
+    result, messages = Followed(), []
+    follow(tracker or Clocked(), of_lines(lines), UDP, result, print, messages.append)
+    return result, messages
 
 
 def test_a_stream_of_nonsense_or_of_one_sensor_ends_with_one_line():
@@ -78,15 +78,15 @@ def test_each_second_it_says_what_it_waits_for(monkeypatch):
     monkeypatch.setattr(session.time, "monotonic", lambda: next(clock) / 2)  # twice for a sample
     ticks = [Arrival(0.0, waiting="samples: nothing has come on udp:5555 for 0 s")] * 16
     samples = [f"{k / 50},0,0,0,0,0,9.81" for k in range(100)]
-    result, said = Followed(), []
+    result, messages = Followed(), []
     arrivals = itertools.chain(ticks, of_lines([*samples, "noise"]))
-    follow(Clocked(), arrivals, UDP, result, print, said.append)
-    assert said[0] == "waiting for samples: nothing has come on udp:5555 for 0 s"
-    rest = "waiting for a rest (samples are missing for 0.3 s)"
-    assert said[1:10] == [said[0], *[rest] * 8] and len(said) == 11
-    _, said = Followed(), []
-    follow(Clocked(), of_lines(["noise", *samples]), UDP, Followed(), print, said.append)
-    assert said[-1] == f"{rest}; 1 lines are refused, the newest is not a sample"
+    follow(Clocked(), arrivals, UDP, result, print, messages.append)
+    assert messages[0] == "waiting for samples: nothing has come on udp:5555 for 0 s"
+    notice = "waiting for a rest (samples are missing for 0.3 s)"
+    assert messages[1:10] == [messages[0], *[notice] * 8] and len(messages) == 11
+    _, messages = Followed(), []
+    follow(Clocked(), of_lines(["noise", *samples]), UDP, Followed(), print, messages.append)
+    assert messages[-1] == f"{notice}; 1 lines are refused, the newest is not a sample"
 
 
 class Walker:
@@ -104,12 +104,12 @@ def test_it_says_where_nothing_comes_in_the_middle_of_a_walk(monkeypatch):
     monkeypatch.setattr(session.time, "monotonic", lambda: next(clock))
     ticks = [Arrival(0.0)] * 10
     arrivals = itertools.chain(of_lines(lines), ticks, of_lines(lines), ticks)
-    said = []
-    follow(Walker(), arrivals, UDP, Followed(), lambda _: None, said.append)
+    messages = []
+    follow(Walker(), arrivals, UDP, Followed(), lambda _: None, messages.append)
     moved = (
         "warning: start: it moved while it should lie still, so velocity and tilt are inaccurate"
     )
-    assert said == [moved, *["nothing has come on udp:5555 for 5 s"] * 2]
+    assert messages == [moved, *["nothing has come on udp:5555 for 5 s"] * 2]
 
 
 def test_the_length_of_the_walk_is_that_of_a_track():
@@ -123,8 +123,8 @@ def test_the_length_of_the_walk_is_that_of_a_track():
         result.add(pose)
         path = result.trajectory
         if k:
-            wanted = path_length(path.position[:, :2], 0.1)
-            assert result.distance == pytest.approx(wanted, abs=1e-9)
+            expected = path_length(path.position[:, :2], 0.1)
+            assert result.distance == pytest.approx(expected, abs=1e-9)
     assert "walked 2.5 m" in line(result) and "y    +0.00" in line(result)
     del pose
     assert first() is None and len(result.trajectory.time) == 26

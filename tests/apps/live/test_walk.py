@@ -34,7 +34,7 @@ def port():
         return probe.getsockname()[1]
 
 
-def pushed_by_a_phone(port, bodies, seen):
+def pushed_by_a_phone(port, bodies, answers):
     """Push messages out of order and repeated, as soon as somebody listens, and look at the
     page."""
     order = list(range(len(bodies)))
@@ -54,42 +54,42 @@ def pushed_by_a_phone(port, bodies, seen):
             try:
                 connection = http.client.HTTPConnection(*address, timeout=20)
                 connection.request("GET", "/state?from=0")
-                seen.append(json.loads(connection.getresponse().read()))
+                answers.append(json.loads(connection.getresponse().read()))
             except (OSError, http.client.HTTPException):
                 break
             time.sleep(0.05)
-        seen.append(statuses)
+        answers.append(statuses)
 
     thread = threading.Thread(target=push, daemon=True)
     thread.start()
     return thread
 
 
-def assert_same_path(found, wanted, shift):
+def assert_same_path(path, expected, shift):
     """To a millimetre, though stamps of 1970 have steps of 0.2 µs."""
-    np.testing.assert_allclose(found.time - shift, wanted.time[: len(found.time)], atol=1e-4)
-    assert len(found.time) >= len(wanted.time) - 1
-    error = np.linalg.norm(found.position - wanted.position[: len(found.time)], axis=1)
+    np.testing.assert_allclose(path.time - shift, expected.time[: len(path.time)], atol=1e-4)
+    assert len(path.time) >= len(expected.time) - 1
+    error = np.linalg.norm(path.position - expected.position[: len(path.time)], axis=1)
     assert error.max() < 1e-3
 
 
 @pytest.mark.parametrize("kind", ["sum", "total"])
 def test_a_phone_that_pushes_gives_the_path_of_its_lines(gnio, follow, run, port, tmp_path, kind):
-    recorded, seen = walked(), []
+    recorded, answers = walked(), []
     bodies = messages(*recorded, period=0.4, kind=kind)
-    thread = pushed_by_a_phone(port, bodies, seen)
+    thread = pushed_by_a_phone(port, bodies, answers)
     sign = ("--accel-sign", "android") if kind == "sum" else ()
     words = ("--silence", "2", "--network", run, "--out", tmp_path / "http.txt", *sign)
-    told = gnio("live", f"http:{port}", *words)
+    output = gnio("live", f"http:{port}", *words)
     thread.join(60)
-    assert f"page: http://127.0.0.1:{port}/" in told and "samples come at 50 Hz" in told
-    assert "warning: 1 lines refused, the first: message 4 of Sensor Logger came twice" in told
-    *states, statuses = seen
+    assert f"page: http://127.0.0.1:{port}/" in output and "samples come at 50 Hz" in output
+    assert "warning: 1 lines refused, the first: message 4 of Sensor Logger came twice" in output
+    *states, statuses = answers
     assert set(statuses) == {200} and states[-1]["state"] in ("moving", "at rest")
     assert states[-1]["walked"] > 1.0 and len(states[-1]["points"]) > 5
     follow(as_lines(recorded), "--out", tmp_path / "lines.txt")
-    found, wanted = read_tum(tmp_path / "http.txt"), read_tum(tmp_path / "lines.txt")
-    assert_same_path(found, wanted, 1.7e9)
+    path, expected = read_tum(tmp_path / "http.txt"), read_tum(tmp_path / "lines.txt")
+    assert_same_path(path, expected, 1.7e9)
 
 
 def test_phyphox_gives_the_path_of_its_lines(gnio, follow, run, port, tmp_path):
@@ -97,27 +97,27 @@ def test_phyphox_gives_the_path_of_its_lines(gnio, follow, run, port, tmp_path):
     recorded = walked(seconds=6.0)
     experiment = Experiment(*recorded, speed=2)
     words = ("--silence", "1", "--network", run, "--out", tmp_path / "phyphox.txt")
-    told = gnio("live", f"phyphox:{experiment.address}", "--page", str(port), *words)
-    assert f"page: http://127.0.0.1:{port}/" in told and "refused" not in told
+    output = gnio("live", f"phyphox:{experiment.address}", "--page", str(port), *words)
+    assert f"page: http://127.0.0.1:{port}/" in output and "refused" not in output
     lines = as_lines([field[1:] for field in recorded])
     follow(lines, "--out", tmp_path / "lines.txt")
-    found, wanted = read_tum(tmp_path / "phyphox.txt"), read_tum(tmp_path / "lines.txt")
-    assert_same_path(found, wanted, 0.0)
+    path, expected = read_tum(tmp_path / "phyphox.txt"), read_tum(tmp_path / "lines.txt")
+    assert_same_path(path, expected, 0.0)
 
 
 @pytest.mark.slow
 def test_the_example_by_a_phone_is_the_example_by_lines(gnio, port, tmp_path):
     """With the network that comes with gnio-jax; the true path goes 4.2 m away from its start."""
-    rows, seen = np.loadtxt(WALK, delimiter=",", skiprows=1)[:1500], []
+    rows, answers = np.loadtxt(WALK, delimiter=",", skiprows=1)[:1500], []
     recorded = rows[:, 0], rows[:, 1:4], rows[:, 4:]
-    thread = pushed_by_a_phone(port, messages(*recorded, period=1.0, kind="total"), seen)
+    thread = pushed_by_a_phone(port, messages(*recorded, period=1.0, kind="total"), answers)
     gnio("live", f"http:{port}", "--silence", "2", "--out", tmp_path / "http.txt")
     thread.join(60)
     lines = as_lines(recorded)
     gnio("live", "--out", tmp_path / "lines.txt", lines=lines)
-    found, wanted = read_tum(tmp_path / "http.txt"), read_tum(tmp_path / "lines.txt")
-    assert_same_path(found, wanted, 1.7e9)
-    assert 3 < np.linalg.norm(found.position[:, :2] - found.position[0, :2], axis=1).max() < 6
+    path, expected = read_tum(tmp_path / "http.txt"), read_tum(tmp_path / "lines.txt")
+    assert_same_path(path, expected, 1.7e9)
+    assert 3 < np.linalg.norm(path.position[:, :2] - path.position[0, :2], axis=1).max() < 6
 
 
 # --- what a browser shows
@@ -139,11 +139,11 @@ def walking(steps):
     result, zero = Followed(rest_seconds=0.5), np.zeros(3)
     for k in range(steps):
         angle = min(k, steps - 10) / 50
-        place = np.array([8 * np.sin(angle), 8 * (1 - np.cos(angle)), 0.1])
+        position = np.array([8 * np.sin(angle), 8 * (1 - np.cos(angle)), 0.1])
         covariance = np.eye(15)
         covariance[6:8, 6:8] = [[0.5, 0.3], [0.3, 0.4]]
         speed = np.array([1.2, 0.5, 0.0])
-        poses = (np.eye(3), speed, place, zero, zero, covariance, 1.0, 1.0, True, "")
+        poses = (np.eye(3), speed, position, zero, zero, covariance, 1.0, 1.0, True, "")
         result.add(Pose(k / 10, *poses, k > steps - 10))
     result.samples, result.waiting = steps * 10, ""
     return result

@@ -40,7 +40,7 @@ REST = round(CONFIG.data.rate)
 
 
 @pytest.fixture(scope="module")
-def found(models, walked):
+def odometry(models, walked):
     """The walk by the models, from a level start."""
     opened = driver.open_models(models[0])
     state = driver.run(opened.start, {"gyro": walked.gyro[:REST], "accel": walked.accel[:REST]})
@@ -53,18 +53,18 @@ def from_rest(ekf, walked):
     return filtering.level_state(ekf, gyro, accel)
 
 
-def test_a_minute_is_that_of_the_package(found, models, walked, package):
+def test_a_minute_is_that_of_the_package(odometry, models, walked, package):
     def start(ekf):
         return from_rest(ekf, walked)
 
     history = package(start, walked.gyro, walked.accel)
     first = round(1.0 / CONFIG.data.stride_seconds)
-    assert len(found.position) == round(SECONDS / CONFIG.data.stride_seconds)
-    assert found.displacement.shape == (len(found.position) - first, 3)
-    np.testing.assert_allclose(found.displacement, history.displacement[first:], atol=1e-5)
-    np.testing.assert_allclose(found.position, history.position, atol=1e-3)
-    np.testing.assert_allclose(found.rotation, history.rotation, atol=1e-5)
-    np.testing.assert_allclose(found.covariance, history.covariance, rtol=1e-3, atol=1e-4)
+    assert len(odometry.position) == round(SECONDS / CONFIG.data.stride_seconds)
+    assert odometry.displacement.shape == (len(odometry.position) - first, 3)
+    np.testing.assert_allclose(odometry.displacement, history.displacement[first:], atol=1e-5)
+    np.testing.assert_allclose(odometry.position, history.position, atol=1e-3)
+    np.testing.assert_allclose(odometry.rotation, history.rotation, atol=1e-5)
+    np.testing.assert_allclose(odometry.covariance, history.covariance, rtol=1e-3, atol=1e-4)
     # So does the command say, and refuses what is off.
     folder, printed = models
     measured = json.loads((folder / "export.json").read_text())["accuracy"]
@@ -74,7 +74,9 @@ def test_a_minute_is_that_of_the_package(found, models, walked, package):
     with pytest.raises(ValueError, match=r"walk: .* off by 0\.0001 m a window"):
         check(Deviation(1e-4, 1e-4, 10.0, 0.0, 1.0, 1.0), "walk")
     # The walk says something: it moves, and the network turns it from where the IMU alone leads.
-    assert np.ptp(found.position, axis=0).max() > 1 and np.abs(found.displacement).max() > 0.05
+    assert (
+        np.ptp(odometry.position, axis=0).max() > 1 and np.abs(odometry.displacement).max() > 0.05
+    )
 
 
 @pytest.mark.parametrize(
@@ -98,14 +100,14 @@ def test_a_wide_distribution_may_be_rounded_by_more(error, std, excess):
 
 def test_the_start_has_the_bias_of_a_gyro_at_rest(run, models, walked):
     """So have the starts of `gnio track` and `gnio live`, which those arrays equal."""
-    rest = {"gyro": walked.gyro[:REST], "accel": walked.accel[:REST]}
-    arrays = driver.run(driver.open_models(models[0]).start, rest)
+    resting_samples = {"gyro": walked.gyro[:REST], "accel": walked.accel[:REST]}
+    arrays = driver.run(driver.open_models(models[0]).start, resting_samples)
     loaded = read_network(run)
     ekf = filtering.make_filter(loaded.config.data, loaded.config.filter)
     network = deploy_network(Network.of(loaded.model, loaded.variables), ekf)
-    wanted = start_arrays(from_rest(ekf, walked), network, ekf)
-    assert arrays.keys() == wanted.keys()
-    for name, value in wanted.items():
+    expected = start_arrays(from_rest(ekf, walked), network, ekf)
+    assert arrays.keys() == expected.keys()
+    for name, value in expected.items():
         np.testing.assert_allclose(arrays[name], value, atol=1e-9, err_msg=name)
     np.testing.assert_allclose(arrays["state.gyro_bias"], BIAS, atol=1e-9)
     # The clones of a state that a run left are ordered by age: the models would take them for a
@@ -126,14 +128,16 @@ def test_the_filter_is_in_float64_and_every_tensor_is_described(models):
         assert described["sha256"] == hashlib.sha256(content).hexdigest()
         session = driver.open_session(folder / name)
         for kind, tensors in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
-            assert [each["name"] for each in described[kind]] == [each.name for each in tensors]
-            for each, tensor in zip(described[kind], tensors, strict=True):
-                assert each["shape"] == tensor.shape
-                onnx_type = {"float64": "double", "float32": "float"}.get(each["dtype"])
-                assert tensor.type == f"tensor({onnx_type or each['dtype']})"
+            assert [entry["name"] for entry in described[kind]] == [
+                tensor.name for tensor in tensors
+            ]
+            for entry, tensor in zip(described[kind], tensors, strict=True):
+                assert entry["shape"] == tensor.shape
+                onnx_type = {"float64": "double", "float32": "float"}.get(entry["dtype"])
+                assert tensor.type == f"tensor({onnx_type or entry['dtype']})"
                 single = {"network.onnx", "filter_window.onnx"}
-                if each["dtype"] == "float32":
-                    assert name in single and each["name"] in ("window", "displacement", "log_std")
+                if entry["dtype"] == "float32":
+                    assert name in single and entry["name"] in ("window", "displacement", "log_std")
     assert manifest["rate"] == CONFIG.data.rate and manifest["filter"]["noise"]["std_factor"][0] > 1
 
 
@@ -149,8 +153,8 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(
     run, tmp_path, monkeypatch, capsys, arguments, words
 ):
     for name in PACKAGES:  # as if they were installed, or not: none is needed so early
-        there = types.ModuleType(name) if arguments else None
-        monkeypatch.setitem(sys.modules, name, there)
+        module = types.ModuleType(name) if arguments else None
+        monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "thesis.tex").touch()
@@ -298,21 +302,21 @@ def library(folder):
     """ONNX Runtime for C++: headers of the system or of $ONNXRUNTIME_INCLUDE, and the library, of
     the system or of the Python package."""
     places = [os.environ.get("ONNXRUNTIME_INCLUDE"), "/usr/include/onnxruntime", "/usr/include"]
-    headers = [place for place in filter(None, places) if Path(place).is_dir()]
-    headers = [place for place in headers if (Path(place) / "onnxruntime_cxx_api.h").is_file()]
+    headers = [path for path in filter(None, places) if Path(path).is_dir()]
+    headers = [path for path in headers if (Path(path) / "onnxruntime_cxx_api.h").is_file()]
     if not headers or not shutil.which("cmake") or not shutil.which("c++"):
         pytest.skip("needs cmake, a compiler and ONNX Runtime's C++ headers ($ONNXRUNTIME_INCLUDE)")
     capi = Path(sysconfig.get_paths()["purelib"]) / "onnxruntime" / "capi"
-    found = sorted(capi.glob("libonnxruntime.so.*"))
-    if not found:
+    libraries = sorted(capi.glob("libonnxruntime.so.*"))
+    if not libraries:
         return headers[0], "/usr/lib/libonnxruntime.so"
     for name in ("libonnxruntime.so", "libonnxruntime.so.1"):
-        (folder / name).symlink_to(found[0])
+        (folder / name).symlink_to(libraries[0])
     return headers[0], folder / "libonnxruntime.so"
 
 
 @pytest.mark.slow
-def test_the_example_in_c(models, walked, found, tmp_path):
+def test_the_example_in_c(models, walked, odometry, tmp_path):
     headers, shared = library(tmp_path)
     build, csv, out = tmp_path / "build", tmp_path / "walk.csv", tmp_path / "positions.csv"
     definitions = [f"-DONNXRUNTIME_INCLUDE={headers}", f"-DONNXRUNTIME_LIBRARY={shared}"]
@@ -324,9 +328,9 @@ def test_the_example_in_c(models, walked, found, tmp_path):
     np.savetxt(csv, table, delimiter=",", header="time,gx,gy,gz,ax,ay,az", comments="", fmt="%.17g")
     subprocess.run([build / "track", models[0], csv, out], check=True)
     tracked = np.loadtxt(out, delimiter=",", skiprows=1)
-    np.testing.assert_allclose(tracked[:, 1:4], found.position, atol=1e-6)
+    np.testing.assert_allclose(tracked[:, 1:4], odometry.position, atol=1e-6)
     np.testing.assert_allclose(tracked[:, 0], CONFIG.data.stride_seconds * np.arange(1, 241))
-    variances = np.diagonal(found.covariance, axis1=1, axis2=2)[:, 6:9]
+    variances = np.diagonal(odometry.covariance, axis1=1, axis2=2)[:, 6:9]
     np.testing.assert_allclose(tracked[:, 4:], np.sqrt(variances), rtol=1e-6)
     wrong = subprocess.run([build / "track", tmp_path, csv, out], capture_output=True, text=True)
     assert wrong.returncode == 2 and "network.onnx" in wrong.stderr

@@ -18,15 +18,15 @@ TILT = np.array([0.02, -0.01])
 UP = np.array([*TILT, 1.0]) / np.linalg.norm([*TILT, 1.0])
 
 
-def imu(gyro_hz=100.0, accel_hz=100.0, lag=0.0, late=0.0, bias=0.0, start=-2.0, stop=42.0):
+def imu(gyro_hz=100.0, accel_hz=100.0, lag=0.0, delay=0.0, bias=0.0, start=-2.0, stop=42.0):
     """An IMU whose clock is `lag` (s) ahead of the tracker's, and whose accelerometer reports an
-    event `late` (s)."""
+    event `delay` (s) late."""
     gyro, accel = (np.arange(start, stop, 1.0 / rate) for rate in (gyro_hz, accel_hz))
     return Streams(
         "walk",
         "walk",
         Samples(gyro + lag, walk.rate(gyro) + bias, "gyro"),
-        Samples(accel + lag, walk.force(accel - late), "accel"),
+        Samples(accel + lag, walk.force(accel - delay), "accel"),
     )
 
 
@@ -44,45 +44,45 @@ def tracked(hz=100.0):
 )
 def test_a_known_mounting_is_found_on_a_late_clock(gyro_hz, accel_hz, track_hz):
     bias = np.array([0.01, -0.005, 0.02])
-    streams = imu(gyro_hz, accel_hz, lag=0.7, late=0.02, bias=bias)
+    streams = imu(gyro_hz, accel_hz, lag=0.7, delay=0.02, bias=bias)
     track = tracked(track_hz)
-    found = body.align(streams, track)
-    assert np.degrees((found.extrinsic * EXTRINSIC.inv()).magnitude()) < 0.1
-    np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
-    np.testing.assert_allclose(found.up, UP, atol=2e-3)
-    np.testing.assert_allclose(found.gyro_bias, bias, atol=1e-3)
-    np.testing.assert_allclose(found.lag, 0.7, atol=3e-3)
-    assert found.accel_delay == pytest.approx(0.02, abs=3e-3)
-    assert found.gyro_unexplained < 0.01 and found.accel_unexplained < 0.01
-    assert found.runner_up < 0.5 and np.degrees(found.turn_std) < 0.1
+    fit = body.align(streams, track)
+    assert np.degrees((fit.extrinsic * EXTRINSIC.inv()).magnitude()) < 0.1
+    np.testing.assert_allclose(fit.lever, LEVER, atol=5e-3)
+    np.testing.assert_allclose(fit.up, UP, atol=2e-3)
+    np.testing.assert_allclose(fit.gyro_bias, bias, atol=1e-3)
+    np.testing.assert_allclose(fit.lag, 0.7, atol=3e-3)
+    assert fit.accel_delay == pytest.approx(0.02, abs=3e-3)
+    assert fit.gyro_unexplained < 0.01 and fit.accel_unexplained < 0.01
+    assert fit.runner_up < 0.5 and np.degrees(fit.turn_std) < 0.1
     # The poses are those of the IMU, in a level world, on its clock.
-    poses = found.poses
+    poses = fit.poses
     assert poses.noisy and len(poses.time) == len(track.time)
     event = poses.time - 0.7
     turned = poses.attitude * walk.attitude(event).inv()
     yaw = Rotation.from_euler("z", turned.mean().as_euler("ZXY")[0])
     assert np.degrees((turned * yaw.inv()).magnitude()).max() < 0.3
-    place = poses.position + poses.attitude.apply(poses.lever)
-    np.testing.assert_allclose(place, yaw.apply(walk.position(event)), atol=0.02)
+    positions = poses.position + poses.attitude.apply(poses.lever)
+    np.testing.assert_allclose(positions, yaw.apply(walk.position(event)), atol=0.02)
 
 
 def test_jumps_and_drop_outs_and_repeated_rows_bend_nothing():
     """The poses of a jump are left out, what the IMU did not measure is no evidence, and rows may
     be out of order or there twice."""
-    streams, track, kept = imu(), tracked(), []
+    streams, track, sensors = imu(), tracked(), []
     jumped = (track.time > 22.5) & (track.time < 22.8)
     track.position[jumped] += [0.4, 0.2, 0.1]
     for sensor in (streams.gyro, streams.accel):
         rows = np.flatnonzero((sensor.time % 4.0 > 1.9) | (sensor.time < 1.0)).repeat(2)
         rows[100:120] = rows[100:120][::-1]
-        kept.append(sensor._replace(time=sensor.time[rows], values=sensor.values[rows]))
-    found = body.align(streams._replace(gyro=kept[0], accel=kept[1]), track)
-    np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
-    np.testing.assert_allclose(found.lag, 0.0, atol=3e-3)
-    assert found.gyro_unexplained < 0.001 and found.accel_unexplained < 0.001
-    kept = found.poses.time - found.lag.mean()
-    assert np.abs(kept[:, None] - [22.5, 22.8]).min() > 0.05
-    assert len(track.time) - 150 < len(kept) < len(track.time) - 20
+        sensors.append(sensor._replace(time=sensor.time[rows], values=sensor.values[rows]))
+    fit = body.align(streams._replace(gyro=sensors[0], accel=sensors[1]), track)
+    np.testing.assert_allclose(fit.lever, LEVER, atol=5e-3)
+    np.testing.assert_allclose(fit.lag, 0.0, atol=3e-3)
+    assert fit.gyro_unexplained < 0.001 and fit.accel_unexplained < 0.001
+    times = fit.poses.time - fit.lag.mean()
+    assert np.abs(times[:, None] - [22.5, 22.8]).min() > 0.05
+    assert len(track.time) - 150 < len(times) < len(track.time) - 20
     # Of a fit the worst tenth of the rows is not asked.
     error = np.full((100, 3), 0.1)
     error[:9] = 100.0
@@ -127,8 +127,8 @@ def test_poses_near_flips_and_jumps_are_dropped():
     position = np.zeros((len(time), 3))
     position[300:] += [0.0, 0.5, 0.0]
     poses = Poses(time, Rotation.from_rotvec(angles[:, None] * [0.0, 1.0, 0.0]), position)
-    kept = body.without_jumps(poses, np.radians(600.0), 10.0)
-    times = set(np.round(kept.time, 2))
+    steady_poses = body.without_jumps(poses, np.radians(600.0), 10.0)
+    times = set(np.round(steady_poses.time, 2))
     lost = set(np.round(time, 2)) - times
     assert lost == {round(0.01 * i, 2) for i in (*range(89, 114), *range(289, 311))}
     untouched = body.without_jumps(poses._replace(time=time * 100), 1e3, 1e3)
@@ -136,18 +136,18 @@ def test_poses_near_flips_and_jumps_are_dropped():
 
 
 def test_the_jacobians_are_the_differences_of_the_errors():
-    streams, seen = imu(), body._tracker_signals(tracked())
+    streams, tracker = imu(), body._tracker_signals(tracked())
     felt = body._inertial_signals(streams)
-    knots = body.uniform_knots(seen.time, 15.0)
+    knots = body.uniform_knots(tracker.time, 15.0)
     rows = slice(10, -10, 7)
-    seen, hats = seen.rows(rows), body.hat_functions(seen.time, knots)[rows]
+    tracker, hats = tracker.rows(rows), body.hat_functions(tracker.time, knots)[rows]
     lag = np.array([0.01, -0.02, 0.03, 0.0])
     turn, biases = np.array([0.1, -0.2, 0.1]), np.array([0.01, -0.02, 0.005, 0.1, 0.05, -0.08])
     x = np.concatenate([turn, biases, LEVER + 0.03, [0.2, -0.1], [0.013], lag])
-    problem = body.Problem(seen, felt, hats, EXTRINSIC)
-    found = problem.jacobians(x)
+    problem = body.Problem(tracker, felt, hats, EXTRINSIC)
+    jacobians = problem.jacobians(x)
     for column, step in enumerate(1e-5 * np.eye(len(x))):
-        pairs = zip(found, problem.errors(x + step), problem.errors(x - step), strict=True)
+        pairs = zip(jacobians, problem.errors(x + step), problem.errors(x - step), strict=True)
         for jacobian, after, before in pairs:
             expected = (after - before) / 2e-5
             tolerance = 2e-3 * np.abs(expected).max() + 1e-6

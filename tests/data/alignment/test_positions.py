@@ -15,8 +15,8 @@ def phone(seconds, lag=0.0, drift=0.0, tilt=(0.0, 0.0)):
     (rad/s)."""
     time = np.arange(0.0, seconds, 0.01)
     yaw = np.multiply.outer(-0.5 - drift * time, [0.0, 0.0, 1.0])
-    own = Rotation.from_rotvec(yaw) * Rotation.from_euler("xy", tilt)
-    device = numerics.quaternions(own * walk.attitude(time))
+    world_rotation = Rotation.from_rotvec(yaw) * Rotation.from_euler("xy", tilt)
+    device = numerics.quaternions(world_rotation * walk.attitude(time))
     gyro = walk.rate(time) + np.array([0.004, -0.002, 0.003])
     return Streams(
         "walk",
@@ -34,11 +34,11 @@ def test_clock_and_attitude_are_found_and_a_relocalisation_does_not_matter():
     position = walk.position(time)
     position[time > 53.0] += [2.0, -1.0, 0.3]  # the tracker relocalised
     streams = phone(85.0, lag=1.3, drift=0.003, tilt=(0.05, -0.03))
-    found = positions.align_positions(streams, Samples(time, position, "track"))
-    np.testing.assert_allclose(found.lag, 1.3, atol=0.01)
-    assert found.correlation > 0.95 and found.runner_up < 1.0
-    assert found.yaw_drift == pytest.approx(0.003 * 80, abs=0.1)
-    poses = found.poses
+    fit = positions.align_positions(streams, Samples(time, position, "track"))
+    np.testing.assert_allclose(fit.lag, 1.3, atol=0.01)
+    assert fit.correlation > 0.95 and fit.runner_up < 1.0
+    assert fit.yaw_drift == pytest.approx(0.003 * 80, abs=0.1)
+    poses = fit.poses
     event = poses.time - 1.3
     error = (poses.attitude * walk.attitude(event).inv()).as_rotvec()
     inner = (event > 6.0) & (event < 77.0) & (np.abs(event - 61.5) > 10.5)
@@ -62,7 +62,7 @@ def test_clock_and_attitude_are_found_and_a_relocalisation_does_not_matter():
 def test_too_little_is_refused(seconds, lag, device, gain, problem):
     time = np.arange(0.0, seconds, 0.01)
     streams = phone(seconds, lag)
-    own = streams.device._replace(time=streams.device.time + device)
+    attitude = streams.device._replace(time=streams.device.time + device)
     track = Samples(time, gain * walk.position(time), "track")
     with pytest.raises(positions.TooLittle, match=problem):
-        positions.align_positions(streams._replace(device=own), track)
+        positions.align_positions(streams._replace(device=attitude), track)

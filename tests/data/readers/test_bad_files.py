@@ -49,10 +49,10 @@ def cell(row, column, value, separator=","):
 
     def change(rows):
         entries = rows[row].split(separator)
-        place = rows[0].split(separator).index(column) if isinstance(column, str) else column
-        places = range(len(entries))[place] if isinstance(place, slice) else [place]
-        for each in places:
-            entries[each] = value
+        position = rows[0].split(separator).index(column) if isinstance(column, str) else column
+        places = range(len(entries))[position] if isinstance(position, slice) else [position]
+        for index in places:
+            entries[index] = value
         return [*rows[:row], separator.join(entries), *rows[row + 1 :]]
 
     return lines(change)
@@ -63,8 +63,8 @@ def scaled(columns, factor):
 
     def change(table):
         named = isinstance(columns, str)
-        place = list(table[0]).index(columns) if named else columns
-        table[named:, place] = table[named:, place].astype(float) * factor
+        position = list(table[0]).index(columns) if named else columns
+        table[named:, position] = table[named:, position].astype(float) * factor
         return table.astype(str)
 
     return cells(change)
@@ -97,13 +97,13 @@ def times(prefix, factor):
     return fields(change)
 
 
-def about(**changes):
+def info(**changes):
     """Entries of a JSON; `None` takes one away."""
 
     def change(whole):
-        kept = {name: value for name, value in json.loads(whole).items() if name not in changes}
-        given = {name: value for name, value in changes.items() if value is not None}
-        return json.dumps(kept | given)
+        others = {name: value for name, value in json.loads(whole).items() if name not in changes}
+        replacements = {name: value for name, value in changes.items() if value is not None}
+        return json.dumps(others | replacements)
 
     return text(change)
 
@@ -146,11 +146,11 @@ def track(change):
     """Of the struct in a MATLAB file."""
 
     def apply(_, content):
-        found = loadmat(io.BytesIO(content), simplify_cells=True)
-        name = next(name for name in found if not name.startswith("__"))
-        change(found[name])
+        variables = loadmat(io.BytesIO(content), simplify_cells=True)
+        name = next(name for name in variables if not name.startswith("__"))
+        change(variables[name])
         out = io.BytesIO()
-        savemat(out, {name: found[name]}, long_field_names=True)
+        savemat(out, {name: variables[name]}, long_field_names=True)
         return out.getvalue()
 
     return apply
@@ -232,11 +232,11 @@ BAD = {
         (".hdf5", put("synced/game_rv", 10, 0.0), "'synced/game_rv'", "not a unit quaternion"),
         (".hdf5", once("type", 0.45, token="S8"), "field 'synced/game_rv' holds"),
         (".hdf5", once("value", 0.6, 0.73, 1e9), "field 'gyro' is beyond 100 rad/s in 1 rows"),
-        (".json", about(imu_init_gyro_bias=[10**400, 0, 0]), "'imu_init_gyro_bias'"),
-        (".json", about(start_calibration=[1, 1, 0, 0]), "'start_calibration' is not a unit"),
-        (".json", about(start_frame=1400), "'start_frame' is 1400, the recording has 1400 rows"),
-        (".json", about(start_frame="late"), "'start_frame' is not a number"),
-        (".json", about(grv_ori_error=None), "'grv_ori_error' is missing"),
+        (".json", info(imu_init_gyro_bias=[10**400, 0, 0]), "'imu_init_gyro_bias'"),
+        (".json", info(start_calibration=[1, 1, 0, 0]), "'start_calibration' is not a unit"),
+        (".json", info(start_frame=1400), "'start_frame' is 1400, the recording has 1400 rows"),
+        (".json", info(start_frame="late"), "'start_frame' is not a number"),
+        (".json", info(grv_ori_error=None), "'grv_ori_error' is missing"),
     ],
     "ridi table": [
         (".csv", scaled("time", 0.0), "'time'", "only 1 different stamps"),
@@ -366,7 +366,7 @@ GOOD = {
 }
 
 
-def each(table):
+def cases_of(table):
     cases = [(layout, *entry) for layout, entries in table.items() for entry in entries]
     return pytest.mark.parametrize("case", cases, ids=lambda case: "-".join(map(str, case[::3])))
 
@@ -379,20 +379,20 @@ def changed(layout, ending, change):
     return Damage(file, "content", token=change(file, written(layout)[file])), file
 
 
-@each(BAD)
+@cases_of(BAD)
 def test_a_bad_file_is_refused_by_file_and_field(case):
     layout, ending, change, *words = case
     damage, file = changed(layout, ending, change)
-    result, said = outcome(layout, [damage])
-    assert isinstance(result, InputError) or "absent" in words[0], said
-    assert (": " in words[0] or f"{file}: " in said) and all(word in said for word in words), said
+    result, log = outcome(layout, [damage])
+    assert isinstance(result, InputError) or "absent" in words[0], log
+    assert (": " in words[0] or f"{file}: " in log) and all(word in log for word in words), log
 
 
-@each(GOOD)
+@cases_of(GOOD)
 def test_what_is_harmless_is_read(case):
     damage, _ = changed(*case)
-    result, said = check(case[0], [damage])
-    assert not isinstance(result, InputError) and len(result) == 1 and said == "", said
+    result, log = check(case[0], [damage])
+    assert not isinstance(result, InputError) and len(result) == 1 and log == "", log
 
 
 # --- what would execute when it is loaded: pickles in NumPy's files, tags of YAML
@@ -436,8 +436,8 @@ def of_yaml(bomb):
 def test_what_would_execute_is_refused_unexecuted(tmp_path, layout, ending, make):
     (file,) = (file for file in written(layout) if file.endswith(ending))
     content = make(Bomb(tmp_path / "trap"))
-    result, said = check(layout, [Damage(file, "content", token=content)])
-    assert isinstance(result, InputError) and file in said
+    result, log = check(layout, [Damage(file, "content", token=content)])
+    assert isinstance(result, InputError) and file in log
     assert not (tmp_path / "trap").exists(), "it was executed"
     if make is not of_yaml:  # were pickles loaded, this would have seen it
         loaded = np.load(io.BytesIO(content), allow_pickle=True)

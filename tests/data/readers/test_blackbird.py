@@ -19,8 +19,8 @@ def test_a_flight_comes_back_in_a_world_whose_z_points_up(tmp_path, down, text):
     # The body stays as it is; which way is up is told by the orientation.
     np.testing.assert_allclose(sequence.gyro, known_walk.rate(time) @ FLIP, atol=1e-5)
     np.testing.assert_allclose(sequence.accel, known_walk.force(time) @ FLIP, atol=1e-5)
-    known = Rotation.from_matrix(known_walk.attitude(time).as_matrix() @ FLIP)
-    assert np.degrees((rotations(sequence.orientation) * known.inv()).magnitude()).max() < 1e-3
+    attitude = Rotation.from_matrix(known_walk.attitude(time).as_matrix() @ FLIP)
+    assert np.degrees((rotations(sequence.orientation) * attitude.inv()).magnitude()).max() < 1e-3
     np.testing.assert_allclose(sequence.position, known_walk.position(time), atol=1e-6)
     np.testing.assert_allclose(
         sequence.velocity, known_walk.velocity(time), atol=1e-6 if text == 11 else 0.01

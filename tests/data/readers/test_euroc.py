@@ -87,8 +87,8 @@ def test_a_mount_that_appears_makes_another_entry_of_the_cache_and_a_truth_is_ne
     recorded(mav, seconds=3.0)
     files.write_yaml(mav / "imu0" / "sensor.yaml", files.Mount())
     (recording,) = euroc.recordings(tmp_path, "test")
-    there = [path.name for path in recording.files if path.is_file()]
-    assert there == ["data.csv", "sensor.yaml", "data.csv"]
+    names = [path.name for path in recording.files if path.is_file()]
+    assert names == ["data.csv", "sensor.yaml", "data.csv"]
     (mav / "state_groundtruth_estimate0" / "data.csv").unlink()
     refused(lambda: euroc.read(mav.parent), mav, "has no reference", "csv")
 
@@ -109,8 +109,8 @@ def test_a_noisy_tracker_is_smoothed_its_flips_are_bridged_and_its_gaps_are_not_
     turn = rotations(sequence.orientation[valid]).inv() * known_walk.attitude(time[valid])
     degrees = np.degrees(turn.magnitude())
     assert degrees.max() < 0.5 and np.median(degrees) < 0.1
-    place = np.linalg.norm(sequence.position - known_walk.position(time), axis=1)[valid]
-    assert place.max() < 0.01 and np.median(place) < 2e-3
+    distance = np.linalg.norm(sequence.position - known_walk.position(time), axis=1)[valid]
+    assert distance.max() < 0.01 and np.median(distance) < 2e-3
     speed = np.abs(sequence.velocity - known_walk.velocity(time))[valid]
     assert np.sqrt((speed**2).mean()) < 0.02  # differences of neighbours would make 0.07
     for flip in flips:  # of one pose each
@@ -125,9 +125,9 @@ def test_a_few_doubtful_poses_between_gaps_make_no_swing(tmp_path):
     def thin(stamps, values):
         time = (stamps - files.EPOCH) * 1e-9
         sparse = (time > 6.0) & (time < 7.0)
-        place = np.arange(len(time)) % 11
-        values[sparse & (place == 1), :3] += 0.03
-        keep = ~sparse | (place < 2)
+        phase = np.arange(len(time)) % 11
+        values[sparse & (phase == 1), :3] += 0.03
+        keep = ~sparse | (phase < 2)
         return stamps[keep], values[keep]
 
     folder = recorded(tmp_path / "dataset-room1_512_16" / "mav0", 14.0, spoil=thin)

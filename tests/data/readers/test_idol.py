@@ -23,8 +23,8 @@ def compare(sequence):
     time = sequence.time + (sequence.attributes["start_time"] - EPOCH)
     np.testing.assert_allclose(np.diff(sequence.time), 0.01, rtol=1e-4)  # unix seconds hold 0.2 µs
     walk.compare(sequence, time, bias=BIAS, edge=20)
-    apart = (rotations(sequence.device_orientation) * walk.attitude(time).inv()).as_rotvec()
-    np.testing.assert_allclose(apart, np.broadcast_to([0, 0, 0.9], (len(time), 3)), atol=1e-3)
+    difference = (rotations(sequence.device_orientation) * walk.attitude(time).inv()).as_rotvec()
+    np.testing.assert_allclose(difference, np.broadcast_to([0, 0, 0.9], (len(time), 3)), atol=1e-3)
     assert data.self_check(sequence).failures == ()
     return time
 
@@ -128,8 +128,8 @@ def test_smoothed_positions_or_no_core_motion_leave_no_walk_out(tmp_path):
     as a wrong time would."""
     table = frame(seconds=20.0).drop(columns=CORE_MOTION[1])
     time = table["timestamp"] - EPOCH
-    for axis, place in zip("XYZ", (0.9 * time, 0.3 * np.sin(time / 4.0), 1.0), strict=True):
-        table[f"processedPos{axis}"] = place
+    for axis, coordinate in zip("XYZ", (0.9 * time, 0.3 * np.sin(time / 4.0), 1.0), strict=True):
+        table[f"processedPos{axis}"] = coordinate
     (sequence,) = idol.read(write(tmp_path, table))
     check = check_sequence(sequence, idol.DATASET)
     assert check.failures == () and check.accel_correlation_horizontal < 0.3

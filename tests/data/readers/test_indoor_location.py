@@ -32,10 +32,10 @@ def test_a_walk_comes_back_with_its_waypoints(tmp_path):
     check_walk(sequence)
     assert not sequence.valid.any() and np.isnan(sequence.position).all()
     assert sequence.name == f"site1_F4_{NAME}"
-    about = sequence.attributes
-    assert about["start_time"] == pytest.approx(START / 1e3, abs=1e-4)
-    assert about["group"] == "site1_F4" and about["device"] == "OPPO PBCM10"
-    assert about["truth"] == "waypoints"
+    attributes = sequence.attributes
+    assert attributes["start_time"] == pytest.approx(START / 1e3, abs=1e-4)
+    assert attributes["group"] == "site1_F4" and attributes["device"] == "OPPO PBCM10"
+    assert attributes["truth"] == "waypoints"
     check = self_check(sequence)
     assert check.failures == () and np.isnan(check.accel_correlation_horizontal)
 

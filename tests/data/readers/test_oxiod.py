@@ -22,9 +22,9 @@ def dataset(tmp_path, scene, folder):
     return tmp_path / "downloaded" / "Oxford Inertial Odometry Dataset" / scene / folder
 
 
-def read_back(tmp_path, write, kind, truth, place=("handheld", "data1"), seconds=25):
+def read_back(tmp_path, write, kind, truth, session=("handheld", "data1"), seconds=25):
     """(the sequence of one walk that `write` wrote, the stamps of the known walk)."""
-    write(dataset(tmp_path, *place), 3, truth, seconds=seconds)
+    write(dataset(tmp_path, *session), 3, truth, seconds=seconds)
     (walk,) = oxiod.find_walks(tmp_path)
     (sequence,) = oxiod.build(walk, kind)
     start = sequence.attributes["start_time"] - (files.EPOCH if kind == "raw" else 0.0)
@@ -43,10 +43,10 @@ def compare(sequence, truth, time):
     # The flip and the jump of the tracker are found out.
     assert 0.97 < keep.mean() < 1.0
     gyro = sequence.gyro - truth.gyro_bias
-    for measured, known in ((gyro, walk.rate), (sequence.accel, walk.force)):
+    for measured, signal in ((gyro, walk.rate), (sequence.accel, walk.force)):
         # Stamps of 10 ms place the clock to a fraction of a millisecond only.
-        slope = np.abs(known(time + 1e-3) - known(time - 1e-3)) / 2e-3
-        assert (np.abs(measured - known(time)) < 3e-3 + 3e-3 * slope).all()
+        slope = np.abs(signal(time + 1e-3) - signal(time - 1e-3)) / 2e-3
+        assert (np.abs(measured - signal(time)) < 3e-3 + 3e-3 * slope).all()
     assert a["accel_delay_removed"] == pytest.approx(truth.accel_delay, abs=3e-3)
     lever, bias = ([a[f"{name}_{axis}"] for axis in "xyz"] for name in ("lever", "gyro_bias"))
     assert lever == pytest.approx(truth.lever, abs=0.01)
@@ -97,8 +97,8 @@ def test_raw_walk_comes_back(tmp_path):
 
 
 def test_syn_walk_comes_back(tmp_path):
-    truth, place = files.Truth(lag_rows=-12.4, accel_delay=-0.03), ("pocket", "data1")
-    sequence, time = read_back(tmp_path, files.write_syn, "syn", truth, place, 40)
+    truth, session = files.Truth(lag_rows=-12.4, accel_delay=-0.03), ("pocket", "data1")
+    sequence, time = read_back(tmp_path, files.write_syn, "syn", truth, session, 40)
     compare(sequence, truth, time)
     check_delay(tmp_path, sequence, truth, "syn")
     # Vicon's row i shows what the phone's row i + lag does.
@@ -119,8 +119,8 @@ def test_a_walk_that_repeats_its_turns_comes_back(tmp_path):
 
 def test_nexus_events_come_back(tmp_path):
     extrinsic = Rotation.from_euler("ZXY", [-173, 2, 1], degrees=True)
-    truth, place = files.Truth(accel_delay=0.0, extrinsic=extrinsic), ("multi devices", "nexus 5")
-    sequence, time = read_back(tmp_path, files.write_nexus_raw, "raw", truth, place, 40)
+    truth, session = files.Truth(accel_delay=0.0, extrinsic=extrinsic), ("multi devices", "nexus 5")
+    sequence, time = read_back(tmp_path, files.write_nexus_raw, "raw", truth, session, 40)
     compare(sequence, truth, time)
     assert sequence.device_orientation is None
     assert sequence.attributes["device"] == "nexus 5"
@@ -201,8 +201,8 @@ def test_large_scale_takes_positions_of_tango_and_attitude_of_gyro(tmp_path):
     turned = Rotation.from_euler("z", 40, degrees=True) * truth.walk.attitude(time)
     error = np.degrees((rotations(sequence.orientation) * turned.inv()).magnitude())
     assert np.median(error) < 1.5 and error.max() < 6
-    known = Rotation.from_euler("z", 40, degrees=True).apply(truth.walk.position(time))
-    assert np.median(np.linalg.norm(sequence.position - known, axis=1)) < 0.04
+    position = Rotation.from_euler("z", 40, degrees=True).apply(truth.walk.position(time))
+    assert np.median(np.linalg.norm(sequence.position - position, axis=1)) < 0.04
 
 
 def test_same_walk_twice_counts_once_and_a_ruined_raw_file_leaves_syn(tmp_path):
@@ -217,7 +217,7 @@ def test_same_walk_twice_counts_once_and_a_ruined_raw_file_leaves_syn(tmp_path):
     # Some published stamps are rounded to 1e4 s.
     path = walk.files["raw"][0]
     rows = [line.split(",", 1) for line in path.read_text().splitlines()]
-    rounded = (f"{round(float(stamp), -4):.2f},{rest}" for stamp, rest in rows)
+    rounded = (f"{round(float(stamp), -4):.2f},{cells}" for stamp, cells in rows)
     path.write_text("\n".join(rounded) + "\n")
     reading = read_recording(oxiod.recording_of(walk))
     assert reading.sequences[0].attributes["kind"] == "syn" and reading.refusals == ()

@@ -20,7 +20,7 @@ class Bounds(NamedTuple):
     gravity: float  # m/s² by which the mean of R·accel may be off
     valid: float  # share of the samples, at least
     seconds: tuple[float, float]
-    about: dict[str, tuple[float, float]] = {}
+    attributes: dict[str, tuple[float, float]] = {}
 
 
 HALL = Bounds(0.92, 1.8, (0.5, 1.2), 0.12, 0.95, (20.0, 500.0))
@@ -33,8 +33,8 @@ HELD = Bounds(0.9, 3.0, (0.2, 3.0), 0.5, 0.5, (115.0, 125.0), {"lag": (0.0, 0.05
 
 def carried(yaw: float, lever: float) -> Bounds:
     """The phone on the marker body of OxIOD."""
-    about = {"extrinsic_yaw_degrees": (yaw, 1.0), "lever_y": (lever, 0.01)}
-    return HALL._replace(about=about | {"accel_residual": (0.06, 0.06)})
+    attributes = {"extrinsic_yaw_degrees": (yaw, 1.0), "lever_y": (lever, 0.01)}
+    return HALL._replace(attributes=attributes | {"accel_residual": (0.06, 0.06)})
 
 
 REAL = {
@@ -81,10 +81,10 @@ def test_a_real_recording_is_physical(recordings, real):
         pytest.skip(f"real recordings: no {root.name}/")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = {each.name: each for each in dataset.recordings(root, split)}[walk]
+        recording = {source.name: source for source in dataset.recordings(root, split)}[walk]
         if form == "syn":
-            found = found.fallback or found  # some walks have this form alone
-        pieces = found.read()
+            recording = recording.fallback or recording  # some walks have this form alone
+        pieces = recording.read()
     checks = [check_sequence(piece, dataset) for piece in pieces]
     assert [check.failures for check in checks] == [()] * len(pieces)
     sequence, check = max(zip(pieces, checks, strict=True), key=lambda pair: pair[1].duration)
@@ -95,7 +95,7 @@ def test_a_real_recording_is_physical(recordings, real):
     assert check.accel_correlation_horizontal > bounds.correlation
     assert bounds.speed[0] < check.median_speed < bounds.speed[1]
     assert check.share_valid > bounds.valid
-    for attribute, (value, margin) in bounds.about.items():
+    for attribute, (value, margin) in bounds.attributes.items():
         assert sequence.attributes[attribute] == pytest.approx(value, abs=margin)
     valid = sequence.valid
     # A runner's hand is too fast for differences of 100 Hz, a phone's own odometry and a satellite
@@ -112,9 +112,11 @@ def test_a_real_recording_is_physical(recordings, real):
     assert slower.gyro_consistency_degrees == pytest.approx(turned, abs=0.1)
     if sequence.device_orientation is not None:
         # Delayed or mirrored truth would show here: the phone's up is that of the reference.
-        own, known = sequence.device_orientation[valid], sequence.orientation[valid]
-        up, own = (rotations(each).inv().apply([0.0, 0.0, 1.0]) for each in (known, own))
-        angle = np.degrees(np.arccos(np.clip((own * up).sum(axis=1), -1, 1)))
+        device, reference = sequence.device_orientation[valid], sequence.orientation[valid]
+        up, device_up = (
+            rotations(attitude).inv().apply([0.0, 0.0, 1.0]) for attitude in (reference, device)
+        )
+        angle = np.degrees(np.arccos(np.clip((device_up * up).sum(axis=1), -1, 1)))
         assert np.median(angle) < 4
 
 
@@ -123,8 +125,8 @@ def test_a_real_walk_with_waypoints_is_physical(recordings):
     root, dataset = recordings / "indoor_location", data.get("indoor_location")
     if not root.is_dir():
         pytest.skip("real recordings: no indoor_location/")
-    for each in dataset.recordings(root, "val")[:5]:
-        (sequence,) = each.read()
+    for recording in dataset.recordings(root, "val")[:5]:
+        (sequence,) = recording.read()
         check = check_sequence(sequence, dataset)
         assert check.failures == () and 0.3 < check.median_speed < 1.6
         assert np.linalg.norm(check.gravity_mean) == pytest.approx(9.81, abs=0.3)

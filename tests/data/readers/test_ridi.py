@@ -35,21 +35,21 @@ def test_table_comes_back(tmp_path):
     """Its columns in another order, rows late or twice."""
     time = np.arange(int(SECONDS * 202.3)) / 202.3
     rows = np.arange(len(time))
-    late = np.where(rows >= 2000, 0.5, 0.0)
+    jump = np.where(rows >= 2000, 0.5, 0.0)
     rows[[100, 101]] = rows[[101, 100]]
     rows[2000:2010] = rows[2000:2010][::-1]
     write_table(tmp_path, "dan_bag1", time, ORDER, np.insert(rows, 500, [500, 500]))
     (sequence,) = ridi.read(tmp_path / "dan_bag1")
     # A jump of the odometry is marked.
-    write_table(tmp_path, "dan_bag2", time, spoil=lambda table: table["pos_x"].__iadd__(late))
+    write_table(tmp_path, "dan_bag2", time, spoil=lambda table: table["pos_x"].__iadd__(jump))
     (jumped,) = ridi.read(tmp_path / "dan_bag2")
     off = np.abs(jumped.time - 2000 / 202.3)
     assert not jumped.valid[off < 0.08].any() and jumped.valid[off > 0.2].all()
     assert compare(sequence)[0] == pytest.approx(0.0, abs=0.02)
     assert sequence.valid.all() and sequence.name == "dan_bag1"
     a = sequence.attributes
-    about = (a["subject"], a["group"], a["placement"], a["imu_compensated"])
-    assert about == ("dan", "dan", "bag", "no")
+    labels = (a["subject"], a["group"], a["placement"], a["imu_compensated"])
+    assert labels == ("dan", "dan", "bag", "no")
     assert a["truth"] == "Tango VIO of the phone itself"
 
 

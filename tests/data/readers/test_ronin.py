@@ -51,12 +51,12 @@ def test_a_walk_comes_back_in_the_phones_frame(tmp_path, start_frame):
     # Neither the chest's attitude nor one that is laid on it at start_frame would do.
     assert attitude_error(sequence, chest(time)).min() > 30
     assert sequence.valid.all() and data.self_check(sequence).failures == ()
-    apart = rotations(sequence.device_orientation) * rotations(sequence.orientation).inv()
+    difference = rotations(sequence.device_orientation) * rotations(sequence.orientation).inv()
     expected = np.broadcast_to([0, 0, 2.1], (len(time), 3))
-    np.testing.assert_allclose(apart.as_rotvec(), expected, atol=1e-6)
+    np.testing.assert_allclose(difference.as_rotvec(), expected, atol=1e-6)
     a = sequence.attributes
-    about = a["subject"], a["group"], a["device"], a["position_of"]
-    assert about == ("a011", "a011", "asus4", "chest")
+    labels = a["subject"], a["group"], a["device"], a["position_of"]
+    assert labels == ("a011", "a011", "asus4", "chest")
     assert a["orientation_source"] == "game_rv"
     assert a["imu_compensated"] == "calibration of the recording's start"
 
@@ -81,8 +81,8 @@ def test_the_source_of_the_orientation(tmp_path, errors, ekf, chosen):
     named = {"gyro_integration": errors[0], "game_rv": errors[1], "ekf": errors[2]}
     assert sequence.attributes["orientation_error_degrees"] == named[chosen]
     # In the tests the truth has no say, and may be missing.
-    about = json.loads((folder / "info.json").read_text())
-    (folder / "info.json").write_text(json.dumps(about | {"grv_ori_error": "unknown"}))
+    info = json.loads((folder / "info.json").read_text())
+    (folder / "info.json").write_text(json.dumps(info | {"grv_ori_error": "unknown"}))
     (sequence,) = ronin.read(folder)
     assert sequence.attributes["orientation_source"] == "game_rv"
     assert "orientation_error_degrees" not in sequence.attributes

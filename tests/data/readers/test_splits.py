@@ -131,11 +131,14 @@ the names of each split, and what is said of entries of its list that the copy l
 
 
 def entries(name, kind):
-    """(name, rest) of the lines of this kind."""
+    """(name, content) of the lines of this kind."""
     lines = COPIES[name].replace("\\\n", "").strip().splitlines()
     words = (line.split(maxsplit=2) for line in lines)
     return [
-        (each, rest) for found, names, rest in words if found == kind for each in names.split(",")
+        (item, content)
+        for keyword, names, content in words
+        if keyword == kind
+        for item in names.split(",")
     ]
 
 
@@ -145,31 +148,31 @@ def copied(tmp_path):
 
     def lay(name: str) -> Path:
         for template, places in entries(name, "files"):
-            for place in places.split():
-                path = tmp_path / template.format(place)
+            for part in places.split():
+                path = tmp_path / template.format(part)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.mkdir() if template.endswith("/") else path.touch()
-        for place, text in entries(name, "text"):
-            (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / place).write_text(text.replace("|", "\n"))
+        for file, text in entries(name, "text"):
+            (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / file).write_text(text.replace("|", "\n"))
         return tmp_path
 
     return lay
 
 
 def names(name, root, split):
-    return " ".join(each.name for each in data.get(name).recordings(root, split))
+    return " ".join(recording.name for recording in data.get(name).recordings(root, split))
 
 
 @pytest.mark.parametrize("name", COPIES)
 def test_splits(copied, name):
     root, absent = copied(name), dict(entries(name, "warns"))
-    for split, wanted in entries(name, "split"):
+    for split, expected in entries(name, "split"):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            assert names(name, root, split) == wanted, split
-        said = [str(each.message) for each in caught]
-        assert len(said) == (split in absent) and all(absent[split] in each for each in said)
+            assert names(name, root, split) == expected, split
+        lines = [str(warning.message) for warning in caught]
+        assert len(lines) == (split in absent) and all(absent[split] in line for line in lines)
 
 
 HANDHELD, RUNNING = "deep/deeper/handheld", "deep/deeper/running"
@@ -194,11 +197,11 @@ WRONG = [
 @pytest.mark.parametrize(("name", "changes", "split", "problem"), WRONG)
 def test_a_split_that_is_not_there_is_refused(copied, tmp_path, name, changes, split, problem):
     root = tmp_path if changes is None else copied(name)
-    for place, text in (changes or {}).items():
+    for file, text in (changes or {}).items():
         if text is not None:
-            (root / place).write_text(text)
+            (root / file).write_text(text)
         else:
-            (root / place).unlink()
+            (root / file).unlink()
     with pytest.raises(InputError) as caught:
         next(data.load_each(name, root, split))
     assert str(caught.value).startswith(str(root)) and problem in str(caught.value)
@@ -209,16 +212,16 @@ def test_who_is_held_out_is_written_in_every_sequence(copied):
     for name, who in (("ridi", "ma"), ("idol", "subject2")):
         root = copied(name)
         for split in ("train", "val"):
-            for each in data.get(name).recordings(root, split):
-                assert each.attributes["held_out"] == who
-                assert each.slow and each.files  # what is aligned is kept in the cache
-    (about,) = (each.attributes for each in data.get("idol").recordings(root, "unseen"))
-    assert about["subject"] == about["group"] == "subject14" and about["calibration"] == "start"
+            for recording in data.get(name).recordings(root, split):
+                assert recording.attributes["held_out"] == who
+                assert recording.slow and recording.files  # what is aligned is kept in the cache
+    (labels,) = (recording.attributes for recording in data.get("idol").recordings(root, "unseen"))
+    assert labels["subject"] == labels["group"] == "subject14" and labels["calibration"] == "start"
     (root / "deep/building1/train/metadata.json").unlink()
     nameless = r"metadata\.json does not name the subject of 10 recordings, e\.g\. .*0\.feather"
     with pytest.warns(UserWarning, match=nameless):
         train = data.get("idol").recordings(root, "train")
-    assert all(each.attributes["subject"] == each.name for each in train)
+    assert all(recording.attributes["subject"] == recording.name for recording in train)
 
 
 def test_who_validates_does_not_depend_on_what_a_copy_holds(tmp_path):
@@ -232,8 +235,8 @@ def test_who_validates_does_not_depend_on_what_a_copy_holds(tmp_path):
             if n % 20 in people:
                 (folder / f"{n}.feather").touch()
         for split in ("train", "val"):
-            for each in data.get("idol").recordings(tmp_path, split):
-                assert split_of.setdefault(each.name, split) == split
+            for recording in data.get("idol").recordings(tmp_path, split):
+                assert split_of.setdefault(recording.name, split) == split
     held = [entries[name.rpartition("_")[2]] for name, split in split_of.items() if split == "val"]
     assert {entry["subjectID"] for entry in held} == {2, 13} and len(held) == 6
 
@@ -249,7 +252,7 @@ def test_of_copies_the_first_is_taken_and_links_are_followed(copied, tmp_path, m
     # The truth chooses an orientation where one trains, and nowhere else.
     monkeypatch.setattr(ronin, "read", lambda _, choose: choose)
     for split, choose in (("val", True), ("seen", False), ("unseen", False), ("test", False)):
-        assert [each.read() for each in ronin.recordings(tmp_path, split)] == [choose]
+        assert [recording.read() for recording in ronin.recordings(tmp_path, split)] == [choose]
     linked = tmp_path / "linked"
     linked.mkdir()
     (linked / "unseen").symlink_to(root)
@@ -291,24 +294,24 @@ def test_sessions_are_shared_out_whole_whatever_a_copy_holds(tmp_path):
     for scene, entries in (("handheld", "data1\ndata4"), ("trolley", "data1/imu7.csv\ndata2")):
         (tmp_path / scene).mkdir()
         (tmp_path / scene / "Train.txt").write_text(entries)
-    found = {}
+    sessions = {}
     for split in ("sessions_train", "sessions_val", "sessions_test", "train", "val"):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             whole = oxiod.select(ROOM, split, tmp_path)
             for part in (ROOM[::2], ROOM[1::2], ROOM[:7], ROOM[7:]):
-                here = oxiod.select(part, split, tmp_path)
-                assert here == [walk for walk in whole if walk in part], split
-        found[split] = {walk.session for walk in whole}
-    train, val, test = (found[f"sessions_{split}"] for split in ("train", "val", "test"))
+                selection = oxiod.select(part, split, tmp_path)
+                assert selection == [walk for walk in whole if walk in part], split
+        sessions[split] = {walk.session for walk in whole}
+    train, val, test = (sessions[f"sessions_{split}"] for split in ("train", "val", "test"))
     assert train | val | test == {walk.session for walk in ROOM}
     assert len(train) + len(val) + len(test) == len(train | val | test)
     scenes = {session.partition("/")[0] for session in train}
     assert {"handheld", "trolley", "multi users", "multi devices"} <= scenes
     assert val == {"multi users/user4", "handheld/data4"}
     assert {"multi users/user2", "multi devices/nexus 5", "trolley/data1"} < test
-    assert found["val"] == {"handheld/data4", "trolley/data1"}
-    assert found["train"] == {"handheld/data1", "trolley/data2"}
+    assert sessions["val"] == {"handheld/data4", "trolley/data1"}
+    assert sessions["train"] == {"handheld/data1", "trolley/data2"}
 
 
 def test_who_is_held_out_depends_on_the_names_alone():

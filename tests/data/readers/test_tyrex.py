@@ -17,10 +17,10 @@ RUNNING = {"subject": "Thibaud", "group": "Thibaud", "device": "iPhone 4S", "gai
 RUNNING |= {"imu_compensated": "no", "placement": "running, in the hand"}
 
 
-@pytest.mark.parametrize(("name", "about"), [(NEXUS, TEXTING), (IPHONE, RUNNING)])
-def test_a_walk_comes_back_as_the_phones(tmp_path, name, about):
+@pytest.mark.parametrize(("name", "attributes"), [(NEXUS, TEXTING), (IPHONE, RUNNING)])
+def test_a_walk_comes_back_as_the_phones(tmp_path, name, attributes):
     (sequence,) = tyrex.read(write(tmp_path, name))
-    assert about.items() <= sequence.attributes.items()
+    assert attributes.items() <= sequence.attributes.items()
     # Times of the walk: the record's.
     time = sequence.time + sequence.attributes["start_time"]
     np.testing.assert_allclose(np.diff(sequence.time), 0.01, rtol=1e-6)
@@ -31,8 +31,8 @@ def test_a_walk_comes_back_as_the_phones(tmp_path, name, about):
     assert np.sqrt((speed_error**2).sum(axis=1).mean()) < 0.05
     assert sequence.valid.mean() > 0.95 and self_check(sequence).failures == ()
     assert sequence.attributes["lag"] == pytest.approx(-LAG, abs=2e-3)
-    found = [sequence.attributes[f"gyro_bias_{axis}"] for axis in "xyz"]
-    assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(BIAS), abs=2e-3)
+    gyro_bias = [sequence.attributes[f"gyro_bias_{axis}"] for axis in "xyz"]
+    assert np.linalg.norm(gyro_bias) == pytest.approx(np.linalg.norm(BIAS), abs=2e-3)
     # A sixth of a second without a pose.
     gone = (LOST.start + np.array([2, 6])) / 60.0 - OFFSET - LAG
     assert not sequence.valid[(time > gone[0]) & (time < gone[1])].any()
@@ -42,8 +42,8 @@ def test_a_record_that_pauses_is_two_walks(tmp_path):
     folder = write(tmp_path, seconds=46.0)
     for file in ("gyroscope.txt", "accelerometer.txt"):
         rows = (folder / file).read_text().splitlines()
-        kept = (row for row in rows if not 21.0 < float(row.split(" ")[0]) < 24.5)
-        (folder / file).write_text("\n".join(kept))
+        remaining_rows = (row for row in rows if not 21.0 < float(row.split(" ")[0]) < 24.5)
+        (folder / file).write_text("\n".join(remaining_rows))
     with pytest.warns(UserWarning, match=r"'time' has gaps longer than 1 s \(1, up to 3.5 s\)"):
         pieces = tyrex.read(folder)
     assert len(pieces) == 2

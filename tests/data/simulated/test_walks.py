@@ -72,11 +72,11 @@ def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
     np.testing.assert_array_equal(once.accel, again.accel)
     assert once.attributes == again.attributes
     splits = ("train", "val", "test")
-    found = [
-        {each.read.args[1:3] for each in walks.SYNTHETIC.recordings(None, split)}
+    pair_sets = [
+        {recording.read.args[1:3] for recording in walks.SYNTHETIC.recordings(None, split)}
         for split in splits
     ]
-    for values in zip(*(map(set, zip(*pairs, strict=True)) for pairs in found), strict=True):
+    for values in zip(*(map(set, zip(*pairs, strict=True)) for pairs in pair_sets), strict=True):
         assert len(set.union(*values)) == sum(map(len, values))  # seeds, then people
 
 
