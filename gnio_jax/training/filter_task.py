@@ -52,16 +52,20 @@ CHECKPOINT_EVERY = 20
 GATE_SOFTNESS = 2.0
 """Slope of the χ² gate in training (`FilterConfig.gate_softness`); validation has the gate of
 evaluation."""
+LOSS_PARTS = ("displacement", "yaw", "innovation", "state", "translation", "waypoints")
+"""Parts of the loss that are figures of a batch (`FilterLosses`)."""
 
 
 class FilterTask(Task):
     """Training through the filter on the segments of a `SegmentSource`."""
 
     unit = "segments"
-    figures = ("loss", "mse", "displacement", "yaw", "innovation", "state", "translation")
-    figures += ("waypoints",)
     skip_above = 1000.0
     join = staticmethod(join_segments)
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        return ("loss", "mse", *LOSS_PARTS)
 
     @staticmethod
     def source_of(
@@ -105,7 +109,7 @@ class FilterTask(Task):
         """Means over the segments, and over the horizons of losses that have several."""
         chex.assert_type([batch[0].gyro, batch[0].accel], jnp.float64)
         losses = self.filter_segments(variables, *batch, self.training_filter())
-        means = {name: jnp.mean(getattr(losses, name)) for name in self.figures[2:]}
+        means = {name: jnp.mean(getattr(losses, name)) for name in LOSS_PARTS}
         figures = {"loss": jnp.mean(losses.total), "mse": jnp.mean(losses.window), **means}
         return BatchLosses(figures, variables["batch_stats"], jnp.all(losses.healthy))
 

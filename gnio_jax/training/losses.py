@@ -35,6 +35,9 @@ class Losses(NamedTuple):
     nll: Float[jax.Array, ""]
     """½ (d − d̂)ᵀ Σ̂⁻¹ (d − d̂) + ½ log det Σ̂, without its constant (paper §III-F), with the bounds
     that `LossConfig` gives."""
+    preintegration: Float[jax.Array, ""] | None = None
+    """The loss from which a corrector learns (`models.airimu`), without its weight; None for a
+    network without one."""
 
 
 class Stage(NamedTuple):
@@ -123,8 +126,9 @@ def losses(
         if not has_corrector:
             problem = "needs a network with a corrector, e.g. model.corrector: airimu"
             raise InputError("loss.preintegration_weight", problem, "or set it to 0")
-        corrected = preintegration_loss(prediction, windows.imu, windows.steps, dt)
-        total = total + config.preintegration_weight * corrected
+        preintegration = preintegration_loss(prediction, windows.imu, windows.steps, dt)
+        total = total + config.preintegration_weight * preintegration
+        return Losses(total, mse, nll, preintegration)
     return Losses(total, mse, nll)
 
 

@@ -54,9 +54,12 @@ class SegmentTask(Task):
     """Training on the segments of a `WalkSource`."""
 
     unit = "segments"
-    figures = ("loss", "mse", "nll", "horizon")
     skip_above = 1000.0
     join = staticmethod(join_segments)
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        return ("loss", "mse", "nll", "horizon")
 
     @staticmethod
     def source_of(sequences: Iterable[Sequence], config: TrainConfig, training: bool) -> WalkSource:

@@ -80,8 +80,6 @@ class Task(ABC):
 
     unit: ClassVar[str]
     """The items of a batch, in the plural: "windows" or "segments"."""
-    figures: ClassVar[tuple[str, ...]]
-    """Names of the losses of a batch."""
     skip_above: ClassVar[float | None] = None
     """Norm of the gradient above which a step is skipped. A step is also skipped if its loss or
     gradient is not finite, or if the filter diverged. None: the first step that is not finite ends
@@ -104,6 +102,11 @@ class Task(ABC):
     @abstractmethod
     def description(self, state: TrainState, workdir: Path) -> Iterator[str]:
         """Lines about what will be trained, and a warning if a part of it is never trained."""
+
+    @property
+    @abstractmethod
+    def figures(self) -> tuple[str, ...]:
+        """Names of the losses of a batch."""
 
     @property
     def changes(self) -> tuple[int, ...]:

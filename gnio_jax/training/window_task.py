@@ -43,8 +43,12 @@ class WindowTask(Task):
     """Training on the windows of a `WindowSource`."""
 
     unit = "windows"
-    figures = ("loss", "mse", "nll")
     join = staticmethod(join_windows)
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        has_corrector = self.config.model.corrector != "none"
+        return ("loss", "mse", "nll", *(["preintegration"] if has_corrector else []))
 
     @staticmethod
     def source_of(
@@ -123,6 +127,8 @@ class WindowTask(Task):
             arguments = self.model, variables, windows, prediction, keys, data.window_seconds
             total = total + loss.rotation_weight * rotation_consistency(*arguments)
         figures = {"loss": total, "mse": values.mse, "nll": values.nll}
+        if values.preintegration is not None:
+            figures["preintegration"] = values.preintegration
         return BatchLosses(figures, changed.get("batch_stats", {}), jnp.bool_(True))
 
     def with_statistics(
@@ -146,8 +152,11 @@ class WindowTask(Task):
 
     def figures_of(self, state: TrainState, held_out: WindowSource, key: PRNGKeyArray) -> Row:
         validation = validate(state, held_out, self.last_stage(state), task=self)
-        loss, mse, nll = map(float, validation.losses)
-        row: Row = {"val_loss": loss, "val_mse": mse, "val_nll": nll, "val_rmse": math.sqrt(mse)}
+        loss, mse, nll, preintegration = validation.losses
+        row: Row = {"val_loss": float(loss), "val_mse": float(mse), "val_nll": float(nll)}
+        row["val_rmse"] = math.sqrt(row["val_mse"])
+        if preintegration is not None:
+            row["val_preintegration"] = float(preintegration)
         normalised = zip("xyz", validation.axis_normalised, strict=True)
         return row | {f"val_normalised/{axis}": float(value) for axis, value in normalised}
 
@@ -157,10 +166,12 @@ class WindowTask(Task):
 
     def remark(self, row: Row) -> str:
         """The parts of both losses, which can be compared between networks, unlike the losses."""
-        return (
-            f"mse {row['mse']:.4g} nll {row['nll']:.4g}  "
-            f"val mse {row['val_mse']:.4g} nll {row['val_nll']:.4g}  "
+        parts = ("mse", "nll", "preintegration")
+        training, validation = (
+            " ".join(f"{part} {row[prefix + part]:.4g}" for part in parts if prefix + part in row)
+            for prefix in ("", "val_")
         )
+        return f"{training}  val {validation}  "
 
 
 # A batch

@@ -228,7 +228,7 @@ def test_a_step_is_skipped_where_the_filter_diverged_or_the_loss_is_infinite(
 
     def gradient_of(trained, variables, batch, step, task_):
         loss = jnp.where(step == 2, jnp.inf, jnp.float64(1))
-        figures = dict.fromkeys(FilterTask.figures, jnp.float64(0)) | {"loss": loss}
+        figures = dict.fromkeys(training.figures, jnp.float64(0)) | {"loss": loss}
         gradient = jax.tree.map(jnp.ones_like, trained)
         return gradient, task.BatchLosses(figures, variables["batch_stats"], step != 1)
 

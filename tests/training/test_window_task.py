@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import models, parallel
-from gnio_jax.config import AugmentConfig, ModelConfig, TrainConfig
+from gnio_jax.config import AugmentConfig, DataConfig, LossConfig, ModelConfig, TrainConfig
 from gnio_jax.models.heads import CalibratedUncertainty
 from gnio_jax.reporting import Silence
 from gnio_jax.training import task, window_task, windows
@@ -79,6 +79,27 @@ def test_steps_and_validation_are_compiled_once(training):
                 assert np.isfinite(finite).all() and progress.failed_step == -1
     assert programs[0] == programs[1] == programs[2]
     assert int(state.step) == 7 and progress.failed_step == 4
+
+
+def test_the_loss_of_a_corrector_is_in_the_log(training, recording):
+    """It is the whole objective here, and its preintegration alone; no other network has one."""
+    changes = {"model": ModelConfig("ionet", width=3, corrector="airimu")}
+    changes["loss"] = LossConfig(mse_weight=0.0, nll_weight=0.0, preintegration_weight=2.0)
+    changes["data"] = DataConfig(rate=50.0, window_rotation="body_axes")
+    experiment = config(recording, "", **changes)
+    with jax.enable_x64(False):
+        other, (source, held_out, _) = set_up(WindowTask, experiment, Silence())
+        state = drawn_state(other.model, experiment, other.steps_per_epoch)
+        batch = jax.eval_shape(other.draw, KEY, source, jnp.zeros(4, jnp.int32))
+        batch_losses = jax.eval_shape(other.losses, state.variables, batch, jnp.int32(0))
+        row = other.figures_of(state, held_out["tlio"], KEY)
+    assert tuple(batch_losses.figures) == other.figures
+    assert set(other.figures) - set(training[0].figures) == {"preintegration"}
+    assert 2 * row["val_preintegration"] == pytest.approx(row["val_loss"], rel=1e-6)
+    assert row["val_preintegration"] != 0
+    remark = other.remark(row | dict.fromkeys(other.figures, 0.25))
+    assert f"preintegration 0.25  val mse {row['val_mse']:.4g}" in remark
+    assert f" preintegration {row['val_preintegration']:.4g}  " in remark
 
 
 class Flat(Tiny):
