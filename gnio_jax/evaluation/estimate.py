@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -36,7 +35,7 @@ from gnio_jax.filtering import (
     sensitivity,
     with_considered,
 )
-from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
+from gnio_jax.filtering.batch import batches, padded_masks, padded_signals
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION, explain_failure
 from gnio_jax.filtering.state import gyro_bias_covariance
 from gnio_jax.filtering.update import Measurement, Outcome
@@ -54,8 +53,6 @@ from gnio_jax.types import Array, Waypoints
 
 PERFECT_STD = 0.01
 """Standard deviation of the true displacements that a `perfect` filter is given, m per axis."""
-SHORTEST = 16
-"""Approximate smallest number of strides to which a batch is padded."""
 
 
 class States(NamedTuple):
@@ -129,7 +126,7 @@ def estimate(
     )
     estimates: dict[int, SequenceEstimate] = {}
     strides = [recording.strides for recording in recordings]
-    for batch in _batches(strides, batch_size):
+    for batch in batches(strides, batch_size):
         members = [recordings[i] for i in batch.members]
         rows = None if displacements is None else [displacements[i] for i in batch.members]
         inputs = filter_inputs(members, rows, batch.intervals, ekf.config)
@@ -205,20 +202,6 @@ class BatchInputs(NamedTuple):
     """(b, K·n, 6) variances of [accel, gyro] by a corrector; None: there is none."""
     measurements: tuple[Measurement, ...] = ()
     """Those of the recordings, (b, K, ...)."""
-
-
-def _batches(strides: list[int], batch_size: int) -> list[Batch]:
-    """Batches of one size, as full as possible. They have few lengths (that of the longest
-    recording times powers of 0.8), and none is padded by more than a quarter."""
-    count = max(1, math.ceil(len(strides) / batch_size))
-
-    def pad(longest: int) -> int:
-        length = max(strides)
-        while 0.8 * length >= longest and length > SHORTEST:
-            length = math.ceil(0.8 * length)
-        return length
-
-    return batches(strides, max(1, math.ceil(len(strides) / count)), pad)
 
 
 def filter_inputs(

@@ -3,6 +3,7 @@ processes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
@@ -29,17 +30,31 @@ class Batch(NamedTuple):
     """Number of clone intervals to which all are padded."""
 
 
-def batches(intervals: Sequence[int], size: int, padded: Callable[[int], int]) -> list[Batch]:
-    """Batches of recordings of similar lengths, which need little padding, the longest first.
+COMPILED_INTERVALS = 10_000
+"""Clone intervals that a batch runs in about the time of one compilation."""
 
-    intervals: length of each recording in clone intervals; `padded` gives the length of a batch
-    from that of its longest member. It should return few different lengths, because each is a
-    compilation. All batches have `size` members.
+
+def batches(intervals: Sequence[int], most: int) -> list[Batch]:
+    """Batches of recordings of similar lengths, the longest first: as few as possible with at most
+    `most` members, and of one size.
+
+    intervals: length of each recording in clone intervals. A batch is padded to the length of its
+    longest member, or to that of a batch before it: every length is a compilation, so another one
+    begins where all the padding since the last one would take longer than that.
     """
+    count = max(1, math.ceil(len(intervals) / most))
+    size = max(1, math.ceil(len(intervals) / count))
     longest_first = sorted(range(len(intervals)), key=lambda i: -intervals[i])
     parts = [longest_first[i : i + size] for i in range(0, len(intervals), size)]
     filled = [part + part[-1:] * (size - len(part)) for part in parts]
-    return [Batch(part, padded(intervals[part[0]])) for part in filled]
+    length, padding, result = max(intervals, default=0), 0, []
+    for part in filled:
+        longest = intervals[part[0]]
+        padding += length - longest
+        if padding > COMPILED_INTERVALS:
+            length, padding = longest, 0
+        result.append(Batch(part, length))
+    return result
 
 
 def padded_signals(

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import evaluation
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.evaluation import infer, metrics
-from gnio_jax.evaluation.estimate import PERFECT_STD, _batches, mean_over_windows, perfect
+from gnio_jax.evaluation.estimate import PERFECT_STD, mean_over_windows, perfect
 from gnio_jax.filtering import ConsideredStd, CorrelatedError, make_filter
 from tests.support.estimators import (
     CONFIG,
@@ -303,14 +303,6 @@ def test_batches_change_nothing(walks):
                 np.testing.assert_allclose(
                     estimate.trajectory.position, other.trajectory.position, atol=1e-6
                 )
-
-
-def test_batches_have_few_lengths_and_little_padding():
-    strides = list(range(9, 3000, 11))
-    padding = {strides[batch.members[0]]: batch.intervals for batch in _batches(strides, 1)}
-    assert all(length <= padded <= max(20, 1.26 * length) for length, padded in padding.items())
-    assert padding.keys() == set(strides) and len(set(padding.values())) < 30
-    assert {len(batch.members) for batch in _batches(strides, 16)} == {16}
 
 
 def test_an_unhealthy_filter_has_diverged(walks):

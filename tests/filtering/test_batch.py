@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering
+from gnio_jax.filtering import batch
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 
 
@@ -39,13 +40,25 @@ def test_on_one_device_also_of_what_is_no_array(monkeypatch, count):
     np.testing.assert_array_equal(outputs["w"], np.ones(count))
 
 
-def test_batches_are_of_similar_lengths_and_the_last_is_filled_up():
-    """With its shortest member."""
+def test_batches_are_few_and_of_similar_lengths_and_the_last_is_filled_up():
+    """With its shortest member. They are not fuller than their number needs."""
     lengths = [30, 50, 10, 40, 20]
-    assert batches(lengths, 3, lambda longest: longest + 5) == [
-        Batch([1, 3, 0], 55),
-        Batch([4, 2, 2], 25),
+    for most in (3, 4):
+        assert batches(lengths, most) == [Batch([1, 3, 0], 50), Batch([4, 2, 2], 50)]
+    assert batches(lengths, 5) == batches(lengths, 16) == [Batch([1, 3, 0, 4, 2], 50)]
+    assert batches([], 3) == []
+
+
+def test_another_length_is_compiled_where_padding_takes_longer(monkeypatch):
+    """Than a compilation, which is as long as 25 intervals here. The second batch has 10 intervals
+    of padding, and the third would have 20 more; the last two have 4 and 8."""
+    assert [part.intervals for part in batches([9, 36_000, 35_990, 10], 1)] == [
+        *(36_000, 36_000),
+        *(10, 10),
     ]
+    monkeypatch.setattr(batch, "COMPILED_INTERVALS", 25)
+    lengths = [part.intervals for part in batches([50, 40, 30, 26, 22], 1)]
+    assert lengths == [50, 50, 30, 30, 30]
 
 
 def test_recordings_begin_together_and_are_filled_up_behind_their_ends():
