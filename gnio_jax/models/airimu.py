@@ -118,7 +118,7 @@ class Corrected(nn.Module):
     The parameters of the network keep their names. The diagnostics have the corrected samples and
     their variances, from which the corrector learns by `preintegration_loss` alone, as published:
     no gradient of the network's losses reaches it. They would make it another encoder, whose
-    samples are no longer those of an IMU (docs/results/networks.md has figures).
+    samples are no longer those of an IMU.
     """
 
     network: nn.Module

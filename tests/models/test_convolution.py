@@ -16,7 +16,7 @@ from gnio_jax.models.convolution import (
     convolve_long,
     convolve_three,
 )
-from tests.support.comparing import assert_close
+from tests.support.comparing import assert_close_in_size
 from tests.support.compiling import quick
 
 
@@ -106,7 +106,7 @@ def test_devices_that_share_a_batch_have_the_same_gradients():
     mesh = jax.make_mesh((2,), ("batch",), (AxisType.Auto,))
     shared = jax.device_put(x, NamedSharding(mesh, PartitionSpec("batch")))
     results = gradients(shared, kernel), gradients(x, kernel)
-    jax.tree.map(lambda one, other: assert_close(one, other, 1e-5), *results)
+    jax.tree.map(lambda one, other: assert_close_in_size(one, other, 1e-5), *results)
 
 
 @pytest.fixture

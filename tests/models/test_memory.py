@@ -16,7 +16,7 @@ from gnio_jax.models import Network
 from gnio_jax.models.memory import turned_heading
 from gnio_jax.models.state_space import decimate, linear_recurrence
 from gnio_jax.types import Memory
-from tests.support.comparing import assert_close
+from tests.support.comparing import assert_close_in_size
 from tests.support.compiling import quick
 from tests.support.networks import SMALL, drawn
 
@@ -84,7 +84,7 @@ def test_steps_predict_what_the_whole_recording_predicts_at_once(name, options):
     first = signals[2][0]
     at_once = whole(net, in_frame(*signals, np.arctan2(first[1, 0], first[0, 0])))
     predictions = jax.tree.map(lambda *leaves: np.stack(leaves)[None], *(row[0] for row in rows))
-    jax.tree.map(lambda steps, row: assert_close(steps, row, 1e-5), predictions, at_once)
+    jax.tree.map(lambda steps, row: assert_close_in_size(steps, row, 1e-5), predictions, at_once)
     spread = np.ptp(predictions.displacement[0], axis=0)
     assert (spread > 1e-4).all() and int(memory.intervals) == INTERVALS
 
@@ -106,7 +106,7 @@ def test_windows_begin_with_an_empty_memory(name):
     windows = in_frame(*signals, 0.4).reshape(5, -1, 6)
     rows = jax.device_get(quick(net.apply)(net.variables, jnp.asarray(windows, jnp.float32)))
     for row, window in zip(rows.displacement, windows, strict=True):
-        assert_close(row, whole(net, window).displacement[0, -1], 1e-5)
+        assert_close_in_size(row, whole(net, window).displacement[0, -1], 1e-5)
 
 
 def test_the_frame_turns_with_the_attitude_that_the_filter_corrects():
@@ -127,7 +127,7 @@ def test_the_frame_turns_with_the_attitude_that_the_filter_corrects():
     _, turned = stepwise(net, gyro, accel, turn @ attitude)
     for k, (plain, corrected, other) in enumerate(zip(rows, after, turned, strict=True)):
         for x in (corrected, other):
-            assert_close(x[0].displacement, plain[0].displacement, 1e-5)
+            assert_close_in_size(x[0].displacement, plain[0].displacement, 1e-5)
         before = np.append(plain[1], 0)
         np.testing.assert_allclose(np.append(other[1], 0), turn @ before, atol=1e-12)
         expected = turn @ before if k >= 12 else before
@@ -204,7 +204,7 @@ def test_four_memories_are_the_mean_over_four_headings(name, options):
         return model.apply(ready.variables, start, signals, N, method="advance")[1]
 
     prediction = jax.device_get(quick(run)(jnp.asarray(np.stack(walks))))
-    assert_close(prediction.displacement, means, 2e-6)
+    assert_close_in_size(prediction.displacement, means, 2e-6)
     np.testing.assert_allclose(np.exp(2 * prediction.log_std), variances, rtol=1e-4)
     for row, diagnostics in enumerate(at_zero):
         for name, value in diagnostics.items():
@@ -268,11 +268,13 @@ def test_the_heading_of_the_device_is_seen_beside_the_samples(name):
     _, without = stepwise(net, gyro, accel, attitude, np.zeros((2, 3)))
     for k in range(INTERVALS):
         for prediction, whole_prediction in ((rows, expected), (without, hidden)):
-            assert_close(prediction[k][0].displacement, whole_prediction.displacement[0, k], 1e-5)
+            assert_close_in_size(
+                prediction[k][0].displacement, whole_prediction.displacement[0, k], 1e-5
+            )
     assert np.abs(expected.displacement - hidden.displacement).max() > 1e-3
     turned = stepwise(net, gyro, accel, about_z(115) @ attitude, np.eye(2, 3))[1]
     for plain, other in zip(rows, turned, strict=True):
-        assert_close(other[0].displacement, plain[0].displacement, 1e-5)
+        assert_close_in_size(other[0].displacement, plain[0].displacement, 1e-5)
 
 
 def test_a_device_on_its_edge_has_finite_gradients():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import models
-from tests.support.comparing import assert_close
+from tests.support.comparing import assert_close_in_size
 from tests.support.compiling import quick
 from tests.support.networks import drawn
 from tests.support.numpy_layers import (
@@ -179,4 +179,4 @@ def test_a_recording_at_once_and_in_pieces_against_numpy(name, heads):
             state, prediction = program(variables, state, jnp.asarray(piece)[None], EVERY)
             rows.append(jax.device_get((prediction.displacement[0], prediction.log_std[0])))
         for values, parts in zip(expected, zip(*rows, strict=True), strict=True):
-            assert_close(np.concatenate(parts), values, 1e-5)
+            assert_close_in_size(np.concatenate(parts), values, 1e-5)

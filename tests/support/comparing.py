@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def assert_close(actual, desired, tolerance):
+def assert_close_in_size(actual, desired, tolerance):
     """No component is off by more than this share of the largest one.
 
     Sums in float32 round in another order on every processor, and by the sizes of their terms. So
