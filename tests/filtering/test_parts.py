@@ -13,6 +13,7 @@ from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.propagation import integrate as integrate_samples
 from gnio_jax.filtering.update import Step
+from tests.support.comparing import assert_close_in_size
 from tests.support.compiling import quick
 from tests.support.manifold import differences, integrate, minus, plus
 
@@ -55,7 +56,7 @@ def test_interval_against_differences_of_the_mean():
     root = np.sqrt(dt)
     spread = np.tile(np.repeat([0.03 / root, 0.2 / root, 0.04 * root, 0.5 * root], 3), n)
     expected = (reach * spread**2) @ reach.T
-    np.testing.assert_allclose(motion.noise, expected, atol=1e-8 * np.abs(expected).max())
+    assert_close_in_size(motion.noise, expected, 1e-8)
     np.testing.assert_allclose(motion.noise, motion.noise.T, atol=1e-15)
 
 

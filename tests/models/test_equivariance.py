@@ -15,6 +15,7 @@ from gnio_jax.models import equivariance, registry
 from gnio_jax.models.heads import root_mean_square
 from gnio_jax.models.layers import conv_norm, linear
 from gnio_jax.types import Prediction
+from tests.support.comparing import assert_close_in_size
 from tests.support.compiling import quick
 
 SAMPLES = 8
@@ -109,9 +110,7 @@ def test_a_turned_window_gives_the_displacement_turned_alike(kind, headings):
     expected = np.einsum("hij,bj->hbi", TURNS, prediction.displacement[0])
     scale = np.abs(expected).max()
     assert np.abs(expected[0, :, :2]).max() > 1e-2 * scale  # the plane is not idle
-    np.testing.assert_allclose(
-        prediction.displacement[:headings], expected[:headings], atol=2e-5 * scale
-    )
+    assert_close_in_size(prediction.displacement[:headings], expected[:headings], 2e-5)
     if headings == 4:
         assert np.abs(prediction.displacement[4] - expected[4]).max() > 1e-3 * scale
 
@@ -121,7 +120,7 @@ def test_four_headings_are_the_mean_of_the_network_turned_back():
     inner = jax.tree.map(lambda x: np.float64(x).reshape(5, 3, *x.shape[1:])[:4], inner)
     prediction, back = predictions("four_headings"), TURNS[:4].transpose(0, 2, 1)[:, None]
     mean = (back @ inner.displacement[..., None])[..., 0].mean(axis=0)
-    np.testing.assert_allclose(prediction.displacement[0], mean, atol=1e-5 * np.abs(mean).max())
+    assert_close_in_size(prediction.displacement[0], mean, 1e-5)
     variance = turned_variance(inner.log_std, back)
     np.testing.assert_allclose(np.exp(2 * prediction.log_std[0]), variance.mean(axis=0), rtol=1e-4)
     diagnostics, inner_diagnostics = prediction.diagnostics, inner.diagnostics
@@ -161,9 +160,7 @@ def test_a_device_whose_screen_faces_up_is_seen_in_the_frame_of_its_heading():
     windows = np.concatenate([np.float32(WINDOWS), axes], axis=-1)
     prediction = plain("device_heading", variables("device_heading"), windows)
     expected = np.einsum("bij,bj->bi", frame, inner.displacement)
-    np.testing.assert_allclose(
-        prediction.displacement, expected, atol=1e-5 * np.abs(expected).max()
-    )
+    assert_close_in_size(prediction.displacement, expected, 1e-5)
     squares = np.exp(2 * np.float64(inner.log_std))[..., None] * np.eye(3)
     covariance = frame @ squares @ frame.swapaxes(1, 2)
     np.testing.assert_allclose(
@@ -230,9 +227,7 @@ def test_the_network_sees_the_window_in_its_frame():
     inner = plain("none", inner_variables, np.float32(inner_windows))
     prediction = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), predictions("canonical_frame"))
     expected = np.einsum("bij,bj->bi", frame, inner.displacement)
-    np.testing.assert_allclose(
-        prediction.displacement, expected, atol=1e-4 * np.abs(expected).max()
-    )
+    assert_close_in_size(prediction.displacement, expected, 1e-4)
     squares = np.exp(2 * np.float64(inner.log_std))[..., None] * np.eye(3)
     covariance = frame @ squares @ frame.swapaxes(1, 2)  # full in the plane
     np.testing.assert_allclose(
