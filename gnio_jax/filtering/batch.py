@@ -33,7 +33,7 @@ class Batch(NamedTuple):
 COMPILED_INTERVALS = 1_000
 """Clone intervals by which batches are padded, in all, before another length is compiled (ours). On
 one core of an AMD EPYC beside other work a batch of 16 with a network of a quarter of the width
-takes 44 s to compile and 14 ms for an interval; the published width takes longer for both."""
+takes 44 s to compile and 14 ms for an interval; a wider one takes longer for an interval."""
 
 
 def batches(intervals: Sequence[int], most: int) -> list[Batch]:
