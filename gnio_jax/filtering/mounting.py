@@ -9,8 +9,8 @@ where v_0 is the velocity at the start and γ gravity, both in the axes of the s
 to the tilt and the bias of the accelerometer. A car moves along its axis ahead a, so for the right
 a, v_0 and γ the part of u_t across a is small. For each a the best v_0 and γ are the solution of a
 linear least-squares problem. So a search over a remains, which has two angles. The car drives ahead
-and not back, so a · u_t is positive in the mean. The axis up is the direction of the mean force
-across a.
+and not back, so a · u_t is positive in the mean. The axis up is the part across a of the mean
+direction −R_tᵀ γ. The mean force would lean towards the inside of the bends.
 """
 
 from __future__ import annotations
@@ -56,6 +56,21 @@ class Piece(NamedTuple):
 
     fixed: Float[np.ndarray, "m 3"]
     slopes: Float[np.ndarray, "m 3 6"]
+    back: Float[np.ndarray, "m 3 3"]
+    """R_tᵀ."""
+    gravity: Float[np.ndarray, "3"]
+    """γ without its error, m/s²."""
+
+
+class Motion(NamedTuple):
+    """The best v_0 and γ of a piece for an axis ahead."""
+
+    residuals: Float[np.ndarray, "k"]
+    """Over their standard deviations."""
+    velocity: Float[np.ndarray, "m 3"]
+    """u_t, m/s."""
+    upward: Float[np.ndarray, "m 3"]
+    """−R_tᵀ γ, m/s²."""
 
 
 def find_mounting(
@@ -92,13 +107,14 @@ def find_mounting(
         return np.array([cosine * c, cosine * s, sine]) @ basis
 
     def across(angles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "k"]:
-        return np.concatenate([_fit(piece, axis(angles))[0] for piece in pieces])
+        return np.concatenate([_fit(piece, axis(angles)).residuals for piece in pieces])
 
     grid = np.radians(np.arange(0.0, 180.0, 5.0))
     costs = [np.sum(across(np.array([angle, 0.0])) ** 2) for angle in grid]
     best = least_squares(across, np.array([grid[int(np.argmin(costs))], 0.0]), xtol=1e-6)
     ahead = axis(best.x)
-    speed = np.mean(np.concatenate([_fit(piece, ahead)[1] @ ahead for piece in pieces]))
+    motions = [_fit(piece, ahead) for piece in pieces]
+    speed = np.mean([motion.velocity @ ahead for motion in motions])
     if abs(speed) < LEAST_SPEED:
         problem = f"drives at {abs(speed):.1f} m/s in the mean, too slowly to find the mounting"
         raise InputError(source, problem, remedy)
@@ -111,7 +127,7 @@ def find_mounting(
         degrees = np.degrees(min(std, np.pi))
         problem = f"turns and brakes too little to find the mounting (±{degrees:.0f}°)"
         raise InputError(source, problem, remedy)
-    leftward = np.cross(up, ahead)
+    leftward = np.cross(np.mean([motion.upward.mean(0) for motion in motions], axis=0), ahead)
     leftward /= np.linalg.norm(leftward)
     upward = np.cross(ahead, leftward)
     yaw, pitch = np.arctan2(ahead[1], ahead[0]), -np.arcsin(np.clip(ahead[2], -1.0, 1.0))
@@ -127,15 +143,14 @@ def _piece(gyro: Float[np.ndarray, "n 3"], accel: Float[np.ndarray, "n 3"], rate
     rows = slice(round(EVERY * rate) - 1, None, round(EVERY * rate))
     back = np.swapaxes(attitude[1:][rows], 1, 2)
     slopes = [VELOCITY_STD * back, GRAVITY_STD * time[rows, None, None] * back]
-    return Piece(np.einsum("kij,kj->ki", back, moved[rows]), np.concatenate(slopes, axis=2))
+    fixed = np.einsum("kij,kj->ki", back, moved[rows])
+    return Piece(fixed, np.concatenate(slopes, axis=2), back, gravity)
 
 
-def _fit(
-    piece: Piece, ahead: Float[np.ndarray, "3"]
-) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "m 3"]]:
-    """Residuals of the best v_0 and γ, over their standard deviations, and the velocities."""
+def _fit(piece: Piece, ahead: Float[np.ndarray, "3"]) -> Motion:
     aside = (np.eye(3) - np.outer(ahead, ahead)) / ACROSS_STD
     rows = np.concatenate([(aside @ piece.slopes).reshape(-1, 6), np.eye(6)])
     values = np.concatenate([(piece.fixed @ aside).ravel(), np.zeros(6)])
     x = np.linalg.solve(rows.T @ rows, -rows.T @ values)
-    return values + rows @ x, piece.fixed + piece.slopes @ x
+    upward = -piece.back @ (piece.gravity + GRAVITY_STD * x[3:])
+    return Motion(values + rows @ x, piece.fixed + piece.slopes @ x, upward)

@@ -34,6 +34,17 @@ def test_the_mounting_is_that_of_the_drive(degrees):
     assert mounting.std < np.radians(2.0)
 
 
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.5, -0.2, 0.1)])
+def test_bends_to_one_side_are_no_roll(angles):
+    """A roundabout at 8 to 12 m/s: the mean force leans by 6° towards its middle."""
+    time = np.arange(4000) / 100
+    speed, rate = 10 + 2 * np.sin(0.5 * time), np.full(len(time), 0.1)
+    force = np.stack([np.cos(0.5 * time), rate * speed, np.full(len(time), 9.81)], axis=1)
+    body = Rotation.from_euler("ZYX", angles).as_matrix()
+    mounting = find_mounting(rate[:, None] * body[:, 2], force @ body.T, 100.0, "drive")
+    np.testing.assert_allclose(mounting[:3], angles, atol=np.radians(0.5))
+
+
 def test_the_standard_deviation_is_that_of_the_errors():
     errors, stds = [], []
     for seed in range(12):
