@@ -6,7 +6,7 @@
 The drives of a fold are held out whole; without `--folds` each drive is a fold of its own. All is
 chosen by the other drives, and the held-out drives are measured once:
 
-- The filter has 14 constants (`UNITS`). The fit starts at the package's defaults and is damped
+- The filter has 16 constants (`UNITS`). The fit starts at the package's defaults and is damped
   Gauss-Newton steps (SciPy) with the derivatives through the whole filter (JAX). What it minimises
   is the mean of two errors, `t_rel` of all pieces and its mean over drives, plus a penalty times
   the squared distance from the defaults in `UNITS`.
@@ -60,9 +60,11 @@ UNITS = {
     "measurements.nonholonomic.pitch": 0.05,
     "measurements.nonholonomic.lever_x": 0.3,
     "measurements.nonholonomic.lever_z": 0.3,
+    "measurements.nonholonomic.pitch_gradient": 0.3,
+    "measurements.nonholonomic.sideslip_gradient": 0.3,
 }
 """The constants of the fit, and how much of each free parameter is one unit of it: a factor e or 2,
-0.005 rad, 0.3 m (`settings.free_parameters`; ours)."""
+0.005 rad, 0.3 m, 0.003 rad/(m/s²) (`settings.free_parameters`; ours)."""
 PENALTIES = (0.3, 0.03, 0.003)
 """%, per squared unit. The fit with one of them starts at that with the one before."""
 ROUNDING = 0.3
@@ -75,7 +77,7 @@ PADDING = 200
 shapes, few compilations."""
 
 Point = np.ndarray
-"""(14,) a place of the fit, in units; zeros are the defaults."""
+"""(16,) a place of the fit, in units; zeros are the defaults."""
 
 
 class Choice(NamedTuple):
@@ -103,7 +105,7 @@ def default_settings(low_pass_seconds: float) -> FilterSettings:
 
 
 def settings_at(low_pass_seconds: float, point: Point) -> FilterSettings:
-    """The settings at a place (14,) of the fit, which may be traced."""
+    """The settings at a place (16,) of the fit, which may be traced."""
     defaults = default_settings(low_pass_seconds)
     free = free_parameters(defaults, UNITS)
     steps = zip(UNITS.items(), point, strict=True)
@@ -129,7 +131,7 @@ run_drive = jax.jit(motion_of_pieces, static_argnums=0)
 
 @partial(jax.jit, static_argnums=0)
 def differentiate_drive(low_pass_seconds, point, *drive):
-    """The derivatives (m, 3, 14) of `motion_of_pieces` by the point."""
+    """The derivatives (m, 3, 16) of `motion_of_pieces` by the point."""
     return jax.jacfwd(partial(motion_of_pieces, low_pass_seconds))(point, *drive)
 
 
@@ -170,7 +172,7 @@ def relative_errors(drive: Drive, low_pass_seconds: float, point: Point) -> np.n
 
 
 def differentiate(drive: Drive, low_pass_seconds: float, point: Point) -> np.ndarray:
-    """The derivatives (m, 3, 14) of `relative_errors`."""
+    """The derivatives (m, 3, 16) of `relative_errors`."""
     derivatives = np.asarray(differentiate_drive(low_pass_seconds, point, *drive.signals))
     return 100 * derivatives[: len(drive.length)] / drive.length[:, None, None]
 

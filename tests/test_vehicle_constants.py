@@ -97,7 +97,7 @@ def test_the_reference_of_a_drive_that_is_held_out_has_no_part_in_the_choice(
 
 
 def test_zero_of_the_fit_is_the_default_and_one_is_a_unit_of_every_constant():
-    default, other = settings_at(0.06, DEFAULTS), settings_at(0.06, np.ones(14))
+    default, other = settings_at(0.06, DEFAULTS), settings_at(0.06, np.ones(len(UNITS)))
     assert default.low_pass_seconds == 0.06
     before, after = (
         dict((settings.measurements["nonholonomic"] or {}).items()) for settings in (default, other)
@@ -157,7 +157,7 @@ def test_a_fit_ends_where_no_constant_makes_the_objective_smaller(drives):
     point = fit(drives, 0.06, 0.03, DEFAULTS)
     value = objective(drives, 0.03, point)
     assert value < 0.9 * objective(drives, 0.03, DEFAULTS)
-    neighbours = [objective(drives, 0.03, point + s * a) for a in np.eye(14) for s in (-0.5, 0.5)]
+    neighbours = [objective(drives, 0.03, point + s * a) for a in np.eye(len(UNITS)) for s in (-0.5, 0.5)]
     assert value < 1.002 * min(neighbours)
 
 

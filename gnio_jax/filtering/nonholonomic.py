@@ -6,6 +6,14 @@ With the rotation C (car ← body) and the lever l from the IMU to the point, in
 
     0 = [C (Rᵀ v + (ω − b_g) × l)]_{left, up} + w,   w ~ N(0, diag(σ_left², σ_up²)).
 
+A car that is accelerated is not aimed where it goes. Ahead, its springs raise the nose by the angle
+γ_p a_ahead, and to the left, its rear tyres slip by the angle γ_s a_left. With the acceleration
+a = C (f − b_a − Rᵀ g e_z) of the car, f the mean specific force of the interval, the constraint is
+
+    0 = [u]_{left, up} + [γ_s a_left, γ_p a_ahead] [u]_ahead + w
+
+for the velocity u = C (Rᵀ v + …) above. Both gradients are zero by default.
+
 σ_left and σ_up are constants. A network in the filter's loop may say by which factors they change
 from interval to interval (`models.ai_imu`).
 
@@ -30,7 +38,7 @@ from gnio_jax.config.schema import ABOVE_ZERO, FINITE, Number
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.geometry import hat, matmul
-from gnio_jax.types import NONHOLONOMIC_LOG_FACTOR, Array
+from gnio_jax.types import GRAVITY, NONHOLONOMIC_LOG_FACTOR, Array
 
 THRESHOLD = 13.816
 """99.9 % of χ² with two degrees of freedom."""
@@ -53,7 +61,16 @@ class NonHolonomic(NamedTuple):
     steered in front this point is the middle of the rear axle."""
     lever_y: Annotated[Number, FINITE] = 0.0
     lever_z: Annotated[Number, FINITE] = 0.0
+    pitch_gradient: Annotated[Number, FINITE] = 0.0
+    """γ_p: pitch of the car on its springs, nose up, for an acceleration ahead, rad per m/s²."""
+    sideslip_gradient: Annotated[Number, FINITE] = 0.0
+    """γ_s: angle by which the rear tyres slip outwards in a curve, for an acceleration towards its
+    inside, rad per m/s²."""
     name = "nonholonomic"
+
+    @property
+    def lever(self) -> tuple[Number, Number, Number]:
+        return self.lever_x, self.lever_y, self.lever_z
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """Where the car slides sideways or jumps, the measurement fails a χ² test of 99.9 % and is
@@ -65,17 +82,27 @@ class NonHolonomic(NamedTuple):
             log_factor = step.diagnostics[NONHOLONOMIC_LOG_FACTOR].astype(dtype)
             finite = jnp.isfinite(log_factor).all()
             std = std * jnp.exp(jnp.where(finite, log_factor, 0.0))
-        across = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)[1:]
-        lever = jnp.stack([jnp.asarray(x, dtype) for x in self[-3:]])
+        ahead, *across = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)
+        lever = jnp.stack([jnp.asarray(x, dtype) for x in self.lever])
         velocity, present = velocity_of_point(state, step, lever)
+        # Rows for the left and up: the angle for an acceleration in the body.
+        gradients = jnp.stack([self.sideslip_gradient * across[0], self.pitch_gradient * ahead])
+        force = jnp.mean(step.imu.accel, axis=0) - state.accel_bias
+        force = force - GRAVITY * state.rotation[2]
+        angles = matmul(gradients, force[:, None])
+        across = jnp.stack(across) + angles * ahead[None]
         of_velocity = matmul(across, state.rotation.T)
+        of_force = jnp.sum(ahead * velocity) * gradients
+        gravity = jnp.array([[0.0, 0.0, GRAVITY]], dtype)
+        of_tilt = jnp.cross(gravity, matmul(of_force, state.rotation.T))
         linear = linearise(
             state,
             jnp.where(present, -matmul(across, velocity[:, None])[:, 0], jnp.nan),
             jnp.diag(std**2),
             velocity=of_velocity,
-            rotation=matmul(of_velocity, hat(state.velocity)),
+            rotation=matmul(of_velocity, hat(state.velocity)) + of_tilt,
             gyro_bias=matmul(across, hat(lever)),
+            accel_bias=-of_force,
         )
         return measure(state, linear, step, THRESHOLD)
 

@@ -219,9 +219,10 @@ SHARE = "noise.correlation.share"
 SIGNED = {
     **{f"measurements.nonholonomic.{angle}": 0.1 for angle in ("yaw", "pitch", "roll")},
     **{f"measurements.nonholonomic.lever_{axis}": 1.0 for axis in "xyz"},
+    **{f"measurements.nonholonomic.{name}_gradient": 0.01 for name in ("pitch", "sideslip")},
 }
-"""Numbers that may have any sign, and 0, with the unit in which they are free, rad and m. A step of
-the optimizer is a share of this unit."""
+"""Numbers that may have any sign, and 0, with the unit in which they are free, rad, m and rad per
+m/s². A step of the optimizer is a share of this unit."""
 FACTORS = "noise.measurement_scale", *(f"noise.std_factor.{axis}" for axis in range(3))
 """Factors of covariances and standard deviations."""
 LIMITS = {SHARE: (0.0, 0.9999)} | dict.fromkeys(FACTORS, FACTOR_LIMITS)

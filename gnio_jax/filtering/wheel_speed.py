@@ -100,5 +100,5 @@ def speeds_on_intervals(
         problem = f"speed: {fastest:.4g} m/s is beyond a car"
         raise InputError("wheel speed", problem, "divide km/h by 3.6")
     ahead = np.asarray(car_axes(mounting.yaw, mounting.pitch, mounting.roll))[0]
-    rows = (np.tile(vector, (intervals, 1)) for vector in (ahead, np.array(mounting[-3:])))
+    rows = (np.tile(vector, (intervals, 1)) for vector in (ahead, np.array(mounting.lever)))
     return WheelSpeed(at_ends, np.full(intervals, float(std)), *rows)

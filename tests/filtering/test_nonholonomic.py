@@ -24,7 +24,7 @@ from tests.support.walks import errors
 from tests.support.whole_covariance import covariance
 
 N, DT, RUNS, INTERVALS = 5, 0.02, 100, 200
-MOUNTED = NonHolonomic(0.05, 0.1, 0.4, -0.3, 0.2, 1.2, -0.3, -0.8)
+MOUNTED = NonHolonomic(0.05, 0.1, 0.4, -0.3, 0.2, 1.2, -0.3, -0.8, 0.006, 0.002)
 NOISE = filtering.NoiseModel(5e-4, 5e-3, 1e-5, 1e-4)
 STD = filtering.InitialStd(0.02, 0.02, 0.5, 1e-3, 2e-3, 0.05)
 CONFIG = filtering.FilterConfig(DT, N, 1, history="core")
@@ -36,12 +36,19 @@ def test_the_axes_of_the_car_are_those_of_its_mounting(angles):
     np.testing.assert_allclose(car_axes(*angles), expected, atol=1e-12)
 
 
-def predicted(poses, gyro):
-    """Velocity of the point ahead, to the left and up, in NumPy, for poses with axes in front."""
-    rotation, velocity, _, gyro_bias, _ = poses
+def predicted(poses, gyro, accel):
+    """Velocity of the point ahead, and across to the direction in which it goes, to the left and
+    up, in NumPy, for poses with axes in front."""
+    rotation, velocity, _, gyro_bias, accel_bias = poses
     in_body = np.einsum("...ji,...j->...i", rotation, velocity)
-    in_body = in_body + np.cross(gyro - gyro_bias, np.array(MOUNTED[-3:]))
-    return in_body @ Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix()
+    in_body = in_body + np.cross(gyro - gyro_bias, np.array(MOUNTED.lever))
+    mounting = Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix()
+    ahead, left, up = np.moveaxis(in_body @ mounting, -1, 0)
+    force = accel - accel_bias - 9.81 * rotation[..., 2, :]
+    accel_ahead, accel_left, _ = np.moveaxis(force @ mounting, -1, 0)
+    left = left + MOUNTED.sideslip_gradient * accel_left * ahead
+    up = up + MOUNTED.pitch_gradient * accel_ahead * ahead
+    return np.stack([ahead, left, up], axis=-1)
 
 
 def wheels(speeds):
@@ -57,15 +64,17 @@ def test_an_update_is_the_textbooks_with_the_derivatives_by_finite_differences(s
     std = filtering.InitialStd(0.1, 0.1, 3.0, 1.0, 0.01, 0.1)
     ekf = filtering.Filter(config, NOISE, std)
     state, _ = filtering.run_filter(ekf, filtering.initial_state(ekf, *start), *signals)
-    gyro = np.random.default_rng(0).normal(size=(N, 3))
+    gyro, accel = np.random.default_rng(0).normal(size=(2, N, 3))
+    accel = 3 * accel + [0.0, 0.0, 9.81]
+    last = gyro[-1], accel.mean(axis=0)
     poses = [np.asarray(part) for part in state.mean]
     axes = slice(1, 3) if sensor == "constraint" else slice(0, 1)
     jacobian = manifold.differences(
-        lambda errors: predicted(manifold.plus(poses, errors), gyro[-1])[..., axes], 15
+        lambda errors: predicted(manifold.plus(poses, errors), *last)[..., axes], 15
     )
-    residual, stds, measurement = -predicted(poses, gyro[-1])[axes], MOUNTED[:2], MOUNTED
+    residual, stds, measurement = -predicted(poses, *last)[axes], MOUNTED[:2], MOUNTED
     if sensor == "wheels":
-        stds, at_end = [0.3], wheels(predicted(poses, gyro[-1])[0] + 0.4)
+        stds, at_end = [0.3], wheels(predicted(poses, *last)[0] + 0.4)
         residual, measurement = np.array([0.4]), jax.tree.map(lambda leaf: leaf[-1], at_end)
     before = np.asarray(covariance(state))
     rows = np.pad(jacobian, ((0, 0), (0, len(before) - 15)))
@@ -73,11 +82,11 @@ def test_an_update_is_the_textbooks_with_the_derivatives_by_finite_differences(s
     gain = np.linalg.solve(spread, rows @ before).T
 
     @quick
-    def updated(state, gyro):
-        step = filtering.Step(Imu(gyro, jnp.zeros((N, 3)), None), 0, 1, config, NOISE)
+    def updated(state, gyro, accel):
+        step = filtering.Step(Imu(gyro, accel, None), 0, 1, config, NOISE)
         return measurement.update(state, step)[:2]
 
-    after, outcome = updated(state, gyro)
+    after, outcome = updated(state, gyro, accel)
     assert bool(outcome.accepted)
     np.testing.assert_allclose(outcome.residual, residual, atol=1e-12)
     nis = residual @ np.linalg.solve(spread, residual)
@@ -127,6 +136,22 @@ def test_squared_errors_of_rides_are_as_the_covariance_says():
     assert np.sqrt(np.mean(across**2)) < 0.15
 
 
+def test_the_gradients_take_away_what_springs_and_tyres_do():
+    """With a trust in the constraint that a car on springs breaks: squared errors of the velocity
+    are several times those that the covariance says without the gradients, and right with them."""
+    tight = MOUNTED._replace(lateral_std=0.05, vertical_std=0.05)
+    rides = drive(5, 20, INTERVALS, N, DT, NOISE, STD, tight, 0.05, 0.05)
+    rigid = tight._replace(pitch_gradient=0.0, sideslip_gradient=0.0)
+    nees = {}
+    for name, constraint in (("rigid", rigid), ("sprung", tight)):
+        history = run(rides, constraint)
+        error = errors(rides, history)[:, 49:, 3:6]
+        spread = np.asarray(history.covariance)[:, 49:, 3:6, 3:6]
+        whitened = np.linalg.solve(spread, error[..., None])[..., 0]
+        nees[name] = np.mean(np.sum(error * whitened, axis=-1)) / 3
+    assert nees["sprung"] < 1.5 < 3 < nees["rigid"]
+
+
 def test_a_car_that_slides_is_not_believed_to_go_straight():
     """It drifts aside with up to 4 m/s for two seconds."""
     tight = MOUNTED._replace(lateral_std=0.1)
@@ -139,7 +164,7 @@ def test_a_car_that_slides_is_not_believed_to_go_straight():
     lateral_axis = Rotation.from_euler("ZYX", tight[2:5]).as_matrix()[:, 1]
     rate = rides.gyro[0, 110 * N - 1] - history.gyro_bias[0, 109]
     velocity = history.rotation[0, 109].T @ history.velocity[0, 109]
-    assert abs(lateral_axis @ (velocity + np.cross(rate, np.array(tight[-3:]))) - 4.0) < 0.3
+    assert abs(lateral_axis @ (velocity + np.cross(rate, np.array(tight.lever))) - 4.0) < 0.3
     error = np.asarray(history.velocity[0]) - rides.velocity[0]
     assert np.abs(error[-1]).max() < 0.5
 
@@ -148,7 +173,7 @@ def test_wheels_show_the_speed_ahead():
     """Of 100 rides without the constraint; a speed of a kilometre a second is refused."""
     rides = drive(2, RUNS, INTERVALS, N, DT, NOISE, STD, MOUNTED, 0.05, 0.1)
     body = np.einsum("rkji,rkj->rki", rides.rotation, rides.velocity)
-    body = body + np.cross(rides.gyro[:, N - 1 :: N] - rides.gyro_bias, np.array(MOUNTED[-3:]))
+    body = body + np.cross(rides.gyro[:, N - 1 :: N] - rides.gyro_bias, np.array(MOUNTED.lever))
     ahead = Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix()[:, 0]
     speed = body @ ahead + 0.3 * np.random.default_rng(0).normal(size=(RUNS, INTERVALS))
     speed[:, 100] = 1000.0
