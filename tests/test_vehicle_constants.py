@@ -157,7 +157,8 @@ def test_a_fit_ends_where_no_constant_makes_the_objective_smaller(drives):
     point = fit(drives, 0.06, 0.03, DEFAULTS)
     value = objective(drives, 0.03, point)
     assert value < 0.9 * objective(drives, 0.03, DEFAULTS)
-    neighbours = [objective(drives, 0.03, point + s * a) for a in np.eye(len(UNITS)) for s in (-0.5, 0.5)]
+    steps = [s * axis for axis in np.eye(len(UNITS)) for s in (-0.5, 0.5)]
+    neighbours = [objective(drives, 0.03, point + step) for step in steps]
     assert value < 1.002 * min(neighbours)
 
 

@@ -6,7 +6,8 @@ the start. From these the rows of the measurements are made, and the filter runs
 1. Magnetometer: the world's field, the phone's own, and the error of the gyro's bias are fitted to
    the first half minute (`filtering.magnetometer.fit_field`). The filter starts from the better
    bias, and from then on estimates it.
-2. Barometer: heights above the start (`filtering.barometer`).
+2. Barometer: heights above the start (`filtering.barometer`). A network that has seen few stairs is
+   sure of level ground, so beside a barometer its vertical displacements count for less.
 3. Receiver: the path of the runs so far is turned and shifted to the fixes of the first minute, or
    to all of them if a magnetometer holds the heading, by robust least squares. If the fixes do not
    show the heading, the time is doubled. This is the start in a world whose axes are east, north
@@ -35,7 +36,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import PreparedRecording, SequenceEstimate
 from gnio_jax.evaluation.prepare import Start
 from gnio_jax.filtering import Filter
-from gnio_jax.filtering.barometer import barometer_on_intervals
+from gnio_jax.filtering.barometer import Barometer, barometer_on_intervals
 from gnio_jax.filtering.fix import Fix, fixes_on_intervals
 from gnio_jax.filtering.magnetometer import Magnetometer, fit_field
 from gnio_jax.filtering.update import Measurement
@@ -71,6 +72,10 @@ the network alone may trust it, because nothing else is there, but a network mak
 person too long or too short by a few per cent, and turned by some degrees."""
 DISPLACEMENT_ERROR = CorrelatedError(share=0.95, seconds=20.0)
 """How long these errors last: the filter learns them from the fixes."""
+
+HEIGHT_STD = 0.5
+"""Smallest standard deviation of a vertical displacement with a barometer, m in a second: on stairs
+a walker rises by about that."""
 
 
 class SensorUse(NamedTuple):
@@ -222,7 +227,10 @@ def _estimate(
     start and the filter."""
     if not fits:
         return base
-    estimate = run(base.ready._replace(measurements=tuple(fits.values())), base.ekf)
+    ekf = _for_heights(base.ekf) if BAROMETER in fits else base.ekf
+    estimate = run(base.ready._replace(measurements=tuple(fits.values())), ekf)
+    if BAROMETER in fits:
+        estimate = _with_offset(estimate, fits[BAROMETER])
     uses = []
     for sensor in fits:
         accepted = estimate.accepted[NAMES[sensor]]
@@ -231,7 +239,7 @@ def _estimate(
         text = _describe(sensor, base.estimate, estimate, base.ready, placement)
         uses.append(SensorUse(sensor, len(readings[sensor].time), share, text))
     origin = placement and placement.origin
-    return base._replace(estimate=estimate, uses=tuple(uses), origin=origin)
+    return base._replace(estimate=estimate, ekf=ekf, uses=tuple(uses), origin=origin)
 
 
 def _try(refused: dict[str, str], sensor: str, make: Callable[[], Any]) -> dict[str, Any]:
@@ -247,9 +255,28 @@ def _try(refused: dict[str, str], sensor: str, make: Callable[[], Any]) -> dict[
 # --- barometer and magnetometer
 
 
+def _for_heights(ekf: Filter) -> Filter:
+    """The filter whose vertical displacements have at least the error of stairs."""
+    noise, config = ekf.noise, ekf.config
+    least = math.exp(config.log_std_min) * math.sqrt(noise.measurement_scale)
+    *level, vertical = noise.std_factor
+    vertical = max(vertical, HEIGHT_STD * config.window * config.dt / least)
+    return dataclasses.replace(ekf, noise=noise._replace(std_factor=(*level, vertical)))
+
+
 def _heights(readings: Readings, ready: PreparedRecording, ekf: Filter) -> Measurement:
     pressure, start = readings.values[:, 0], ready.time[0]
     return barometer_on_intervals(readings.time, pressure, ready.strides, ekf.config, start)
+
+
+def _with_offset(estimate: SequenceEstimate, heights: Measurement) -> SequenceEstimate:
+    """The estimate whose variance of the height has that of the barometer's offset, which wanders
+    with the weather and has no state in the filter."""
+    assert isinstance(heights, Barometer) and estimate.filtered is not None
+    variance = np.square(heights.std)
+    covariance = estimate.filtered.covariance.copy()
+    covariance[1:, 2, 2] += variance - variance[0]
+    return estimate._replace(filtered=estimate.filtered._replace(covariance=covariance))
 
 
 class FieldStart(NamedTuple):

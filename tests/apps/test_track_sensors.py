@@ -1,6 +1,7 @@
 """`gnio track` with magnetometer, barometer and receiver: what each does for a walk that is known,
 and what wrong readings do not do."""
 
+import dataclasses
 import json
 import xml.etree.ElementTree as ElementTree
 
@@ -35,6 +36,9 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("home") / "runs"
     with tiny_run.registry_entry(phone_walk.Pace):
         drawn_run.save(folder / "pace", CONFIG, lambda random, kind, shape: np.ones(shape))
+        sure = changed(considered=CONSIDERED, noise={"measurement_scale": 0.01})
+        sure = dataclasses.replace(CONFIG, filter=sure)
+        drawn_run.save(folder / "sure", sure, lambda random, kind, shape: np.ones(shape))
         yield folder
 
 
@@ -46,8 +50,8 @@ def _undrawn(monkeypatch):
     monkeypatch.setattr("gnio_jax.apps.track._draw", draw)
 
 
-def tracked(runs, folder, sequence, *without, formats=()):
-    network = read_network(runs / "pace")
+def tracked(runs, folder, sequence, *without, formats=(), name="pace"):
+    network = read_network(runs / name)
     recording = Imported(sequence, (), ())
     return track(recording, network, folder / "track", formats, without=without)
 
@@ -104,6 +108,16 @@ def test_field_pressure_and_fixes_mend_heading_height_and_place(runs, tmp_path):
     true = phone_walk.degrees(phone_walk.on_map(result.estimate.trajectory.time[-1:]))[0, :2]
     assert np.abs((last - true) * [111e3, 74e3]).max() < 8.0
     assert points[-1].find(f"{space}time").text.startswith("2023-11-14T22:1")
+
+
+def test_a_barometer_is_heard_beside_a_network_that_is_sure_of_level_ground(runs, tmp_path):
+    """Up a hill of 6 m and down again, by displacements that are level to a centimetre."""
+    walk = phone_walk.walk()
+    result = tracked(runs, tmp_path, walk, "magnetometer", "gnss", name="sure")
+    _, height = error_of(result)
+    std = np.sqrt(result.estimate.filtered.covariance[:, 2, 2])
+    assert np.abs(height).max() < 2.0 and (np.abs(height) < 3 * std)[50:].all()
+    assert share_of(result, "barometer") > 0.95
 
 
 def test_the_magnetometer_alone_holds_the_heading_of_a_raw_gyro(runs, tmp_path):
