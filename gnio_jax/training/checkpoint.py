@@ -27,7 +27,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.networks import TrainedNetwork
 from gnio_jax.networks.folder import write_weights
 from gnio_jax.training.optimizer import Plateau, filter_numbers, trained_settings
-from gnio_jax.training.task import TrainState
+from gnio_jax.training.task import Row, TrainState
 
 METADATA = 2**17
 """Largest number of bytes that a checkpoint takes besides its arrays."""
@@ -52,6 +52,10 @@ class RunPosition(NamedTuple):
     seconds: float = 0.0
     """Time spent training so far."""
     plateau: Plateau = Plateau()
+    row: Row | None = None
+    """The log's row of the epoch that has just finished; None within an epoch."""
+    improved: bool = False
+    """Whether that epoch is the best one so far."""
 
 
 def exists(workdir: Path) -> bool:

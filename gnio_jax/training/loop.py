@@ -30,7 +30,7 @@ from gnio_jax.training.initial import load_initial_network
 from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.run_folder import Log
 from gnio_jax.training.segment_task import SegmentTask
-from gnio_jax.training.task import DispatchSums, Row, Task
+from gnio_jax.training.task import DispatchSums, Row, Task, TrainState
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
@@ -198,6 +198,8 @@ def _train(
             state, position = checkpoint.restore(workdir, state)
             reporter.line(f"resuming at step {position.step}")
         with Log(workdir, position.epoch, position.step) as log:
+            if position.row and log.epochs < position.epoch:  # the process ended between the files
+                _keep_epoch(workdir, config, state, position, log)
             saved = time.perf_counter()
             for epoch in range(position.epoch, epochs):
                 order, end = task.order(order_key, epoch, source), (epoch + 1) * steps
@@ -228,17 +230,27 @@ def _train(
                 state, validation = task.validate(
                     with_statistics(state), data.held_out, statistics_key
                 )
-                position, row, improved = finish_epoch(position, task, validation, rate)
-                log.add(row)
-                for line in describe_epoch(row, improved, task):
-                    reporter.line(line)
-                if improved:
-                    checkpoint.save_best(workdir, config, state, position)
+                position, row = finish_epoch(position, task, validation, rate)
                 checkpoint.save(workdir, state, position)
+                _keep_epoch(workdir, config, state, position, log)
+                for line in describe_epoch(row, position.improved, task):
+                    reporter.line(line)
                 (signum,) = parallel.largest(max(signals))
                 if signum and epoch + 1 < epochs:
                     return TrainingResult(workdir, position.best, signum)
     return TrainingResult(workdir, position.best, None)
+
+
+def _keep_epoch(
+    workdir: Path, config: TrainConfig, state: TrainState, position: RunPosition, log: Log
+) -> None:
+    """Write what follows from the checkpoint at the end of an epoch: the weights if they are the
+    best so far, then the log's row. So whatever ends the process, a run whose log has an epoch has
+    its weights and its checkpoint, and a resumed run writes what is missing."""
+    if position.improved:
+        checkpoint.save_best(workdir, config, state, position)
+    if position.row:
+        log.add(position.row)
 
 
 @contextmanager
@@ -279,15 +291,14 @@ def add_steps(
         )
     sums = {name: float(figure) for name, figure in dispatch.sums.items()}
     sums = {name: position.sums.get(name, 0.0) + figure for name, figure in sums.items()}
-    return position._replace(step=position.step + count, sums=sums)
+    return position._replace(step=position.step + count, sums=sums, row=None, improved=False)
 
 
 def finish_epoch(
     position: RunPosition, task: Task, validation: Row, rate: float
-) -> tuple[RunPosition, Row, bool]:
+) -> tuple[RunPosition, Row]:
     """The end of an epoch at `position`, trained at `rate` windows or segments per second: the
-    position at which the next one starts, the log's row, and whether the epoch is the best one so
-    far.
+    position at which the next one starts, and the log's row.
 
     The choice of the best epoch begins anew with the epoch that changes what is trained, and again
     with the first whole epoch after it. Losses before and after the change cannot be compared, and
@@ -314,8 +325,10 @@ def finish_epoch(
     improved = math.isfinite(merit) and better
     plateau = optimizer.update_plateau(position.plateau, row["val_mse"], optim)
     best = merit if improved else best
-    position = position._replace(epoch=position.epoch + 1, best=best, sums={}, plateau=plateau)
-    return position, row, improved
+    position = RunPosition(
+        position.epoch + 1, position.step, best, {}, position.seconds, plateau, row, improved
+    )
+    return position, row
 
 
 def learning_rate(position: RunPosition, task: Task) -> float:

@@ -65,8 +65,8 @@ def test_validation_is_the_plain_mean_over_every_window(recording, finished):
 def test_stopped_and_killed_and_resumed_gives_the_same_bits(
     recording, finished, tmp_path, monkeypatch
 ):
-    """One run that ends within an epoch, at its end, between the row of the log and the weights of
-    the second epoch, between weights and checkpoint, and once more within one."""
+    """One run that ends within an epoch, at its end, between the checkpoint and the weights of the
+    second epoch, between weights and row of the log, after the row, and once more within one."""
     run = config(recording, tmp_path / "run")
 
     def stop(step, resume=True):
@@ -88,8 +88,15 @@ def test_stopped_and_killed_and_resumed_gives_the_same_bits(
 
     stop(1, resume=False)
     stop(STEPS)
-    kill_after(run_folder.Log, "add")  # the log has a row that no checkpoint has
-    kill_after(checkpoint, "save_best")
+    for owner, name, step, count in (
+        (checkpoint, "save", STEPS, 1),
+        (checkpoint, "save_best", 2 * STEPS, 1),
+        (run_folder.Log, "add", 2 * STEPS, 2),
+    ):
+        kill_after(owner, name)
+        assert checkpoint.load_latest(tmp_path / "run").step == 2 * STEPS
+        assert read_network(tmp_path / "run").step == step
+        assert len(rows(tmp_path / "run")) == count
     stop(2 * STEPS + 4)
     assert loop.train(run, resume=True).stopped_by is None
     assert_same_runs(tmp_path / "run", finished[0])
