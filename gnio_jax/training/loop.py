@@ -19,9 +19,12 @@ import jax.numpy as jnp
 from gnio_jax import config as configuration
 from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
+from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError
+from gnio_jax.filtering.measurements import create_measurements
 from gnio_jax.models.memory import NetworkWithMemory
 from gnio_jax.networks import TrainedNetwork
+from gnio_jax.networks.folder import WEIGHTS
 from gnio_jax.reporting import Lines, Reporter, Silence
 from gnio_jax.training import checkpoint, optimizer, run_folder, support_vectors
 from gnio_jax.training.checkpoint import RunPosition
@@ -66,10 +69,10 @@ def train(config: TrainConfig, resume: bool = False, **options: Any) -> Training
     With `resume` the run continues from its latest checkpoint as if it had never stopped:
     parameters, optimizer, order of the windows or segments, and random draws are functions of the
     seed and the step. A run is resumed by these rules: the settings must be those of config.yaml; a
-    run without a checkpoint starts again; log rows after the checkpoint are removed. After SIGTERM
-    or Ctrl-C the state is saved and the function returns. A loss or gradient that is not finite
-    raises `FloatingPointError` naming the step (through the filter such a step is skipped). The
-    other options and errors are those of `train_all`.
+    run without a checkpoint and without weights starts again; log rows after the checkpoint are
+    removed. After SIGTERM or Ctrl-C the state is saved and the function returns. A loss or gradient
+    that is not finite raises `FloatingPointError` naming the step (through the filter such a step
+    is skipped). The other options and errors are those of `train_all`.
     """
     (result,) = train_all([config], resume, **options)
     return result
@@ -99,7 +102,8 @@ def train_all(
 
     Raises:
         InputError: The initial network is not of the same network, settings do not fit together, a
-            folder holds another run, or the devices cannot share a batch evenly.
+            folder holds another run, or weights without a checkpoint to resume from, or the devices
+            cannot share a batch evenly.
     """
     reporter = (reporter or Lines()) if parallel.is_first() else Silence()
     folders = map(configuration.default_workdir, configs)
@@ -109,6 +113,7 @@ def train_all(
         run_folder.refuse_other_run(configuration.validate(config), resume)
         for config, resume in zip(configs, resumes, strict=True)
     ]
+    refuse_untrainable(configs[0])
     method = METHODS.get(models.trained_by(models.from_experiment(configs[0])))
     if method is not None:  # without steps
         losses = [
@@ -116,6 +121,11 @@ def train_all(
             for config, workdir in zip(configs, workdirs, strict=True)
         ]
         return [TrainingResult(*run, None) for run in zip(workdirs, losses, strict=True)]
+    for workdir, resume in zip(workdirs, resumes, strict=True):
+        if resume and (workdir / WEIGHTS).exists() and not checkpoint.exists(workdir):
+            problem = "has weights, and no checkpoint to continue from"
+            remedy = f"begin with its weights: --init-from {workdir} and another --workdir"
+            raise InputError(workdir, problem, remedy)
     through_filter = bool(configs[0].through_filter.learn)
     if through_filter and devices is not None:
         raise InputError("--devices", "is for training on windows", "leave it out")
@@ -141,8 +151,10 @@ def train_all(
 
 
 def refuse_untrainable(config: TrainConfig) -> None:
-    """Raise `InputError` for an experiment that cannot be trained, before anything is read: as
-    `choose_task` does, and for a library that is missing."""
+    """Raise `InputError` for an experiment that cannot be trained, or whose filter has measurements
+    that do not exist, before anything is read: as `choose_task` does, and for a library that is
+    missing."""
+    create_measurements(config.filter.measurements, Location("config", "filter.measurements"))
     if models.trained_by(models.from_experiment(config)) == "support_vectors":
         support_vectors.require_library()
     else:

@@ -61,8 +61,12 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     if not file.exists():
         problem = "holds no run to resume (config.yaml is missing)"
         raise InputError(workdir, problem, "start it without --resume")
-    configs = map(configuration.without_paths, (config, configuration.load(file)))
-    ours, theirs = map(configuration.flatten, configs)
+    # The path of the data may change, but not that of the weights to begin with: others would make
+    # another run of one that has no checkpoint yet, and would have no effect on the others.
+    ours, theirs = (
+        configuration.flatten(configuration.without_paths(run)) | {"init_from": run.init_from}
+        for run in (config, configuration.load(file))
+    )
     network = models.from_config(config.model)
     fitted = {f"model.options.{option}" for option in models.fitted_options(network)}
     for name in ours | theirs:
