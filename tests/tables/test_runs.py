@@ -69,10 +69,10 @@ def test_a_run_whose_last_weights_were_not_written_is_begun(tmp_path, monkeypatc
     root = tlio_files.write_splits(tmp_path / "data")
     config, real = tiny_run.config(root, tmp_path / "run", epochs=2), checkpoint.write_weights
 
-    def write_weights(folder, variables, epoch, *rest):
+    def write_weights(folder, variables, epoch, step, settings=None):
         if epoch == 2:
             raise OSError(errno.ENOSPC, "no space", str(folder))
-        real(folder, variables, epoch, *rest)
+        real(folder, variables, epoch, step, settings)
 
     with tiny_run.registry_entry():
         with monkeypatch.context() as patch, pytest.raises(OSError, match="no space"):
