@@ -163,19 +163,25 @@ def _write_recipe(card: Card, network: TrainedNetwork) -> str:
     if config.data.poses_by:
         start += f" --set data.poses_by={_shorten(config.data.poses_by)}"
     steps, remark = [f"gnio train --config config.yaml --workdir runs/{card.name}{start}"], ""
-    if (folder / "calibration.json").is_file():
-        calibration = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
-        fitted = _shorten(calibration["run"])
+    record, default = folder / "calibration.json", list(CalibrateConfig().fit)
+    if record.is_file():
+        try:
+            calibration = json.loads(record.read_text(encoding="utf-8"))
+            fitted, split = _shorten(str(calibration["run"])), calibration["split"]
+            parts = list(map(str, calibration.get("fitted") or default))
+        except (OSError, ValueError, LookupError, TypeError):
+            problem = "is not the record of a calibration"
+            remedy = "remove the folder, and calibrate its run again"
+            raise InputError(record, problem, remedy) from None
         if fitted == f"runs/{folder.name.removesuffix('_calibrated')}":
             fitted = f"runs/{card.name}"
         steps = steps if "runs/" in fitted else []  # a published network has its own recipe
         options = " --average-headings" if calibration.get("average_headings") else ""
-        default = list(CalibrateConfig().fit)
-        if (parts := calibration.get("fitted") or default) != default:
+        if parts != default:
             options += f" --fit {' '.join(parts)}"
         steps.append(f"gnio calibrate --network {fitted}{options}")
         name = fitted.removeprefix("runs/")
-        remark = f"\n\nThe filter is fitted to split `{calibration['split']}` of run `{name}`."
+        remark = f"\n\nThe filter is fitted to split `{split}` of run `{name}`."
     return "\n".join(("```", *steps, "```")) + remark
 
 

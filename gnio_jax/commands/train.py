@@ -12,7 +12,7 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
 from gnio_jax.commands.names import NETWORKS, check_names
 from gnio_jax.config import ConsideredStd, TrainConfig
-from gnio_jax.config.schema import Count, Seed, Words
+from gnio_jax.config.schema import Count, Location, Seed, Words
 from gnio_jax.cores import usable_cores
 
 
@@ -71,6 +71,8 @@ def train(request: TrainOptions, call: options.Call) -> None:
     """
     config = experiment(request, call)
     check_names([config.model.name], config.datasets)
+    if not request.resume:
+        config.refuse_unused(Location("config"))
     from gnio_jax import data, filtering, parallel  # late: mistakes do not wait for JAX
     from gnio_jax.training import loop
 

@@ -735,6 +735,32 @@ class TrainConfig:
         self._check_segments(location)
         self._check_through_filter(location)
 
+    def refuse_unused(self, location: Location) -> None:
+        """Refuse settings that this training does not use, unless they have their defaults: those
+        of segments and of training through the filter where there is none, and that of a loss that
+        is not chosen. A run that is there keeps what it has, so this is not part of `check`."""
+        segments = "is for training on segments (segments.seconds)"
+        through = "is for training through the filter (through_filter.learn)"
+        unused: dict[str, str] = {}
+        if not self.segments.seconds:
+            changes = ("walkway_share", "walkway", "alternating_gain", "time_stretch")
+            unused |= dict.fromkeys((f"augment.{name}" for name in changes), segments)
+            losses = ("truncate_seconds", "horizon_weight")
+            unused |= dict.fromkeys((f"segments.{name}" for name in losses), segments)
+        if not self.through_filter.learn:
+            unused |= {f"through_filter.{name}": through for name in vars(self.through_filter)}
+        if self.segments.seconds and not self.through_filter.learn:
+            unused["augment.shift_samples"] = "is for training on windows"
+        if self.loss.name != "polar":
+            unused["loss.angle_weight"] = "is for loss.name: polar"
+        default = TrainConfig()
+        for name, problem in unused.items():
+            section, field = name.split(".")
+            ours, theirs = (getattr(getattr(run, section), field) for run in (self, default))
+            if ours != theirs:
+                value = list(theirs) if isinstance(theirs, tuple) else theirs
+                location.child(name).refuse(problem, f"leave it out, or set it to {value}")
+
     def _check_segments(self, location: Location) -> None:
         segments, data = self.segments, self.data
         if not segments.seconds:

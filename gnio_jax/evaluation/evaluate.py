@@ -39,7 +39,14 @@ from gnio_jax.evaluation.report import DEFINITIONS, Report
 from gnio_jax.evaluation.trajectory import Alignment, Undefined, pair, read_tum
 from gnio_jax.filtering import make_filter
 from gnio_jax.models import Network
-from gnio_jax.networks import TrainedNetwork, find_network, load_corrector, newest_run, read_network
+from gnio_jax.networks import (
+    TrainedNetwork,
+    digest_corrector,
+    find_network,
+    load_corrector,
+    newest_run,
+    read_network,
+)
 from gnio_jax.networks.folder import evaluations_folder, training_recordings
 from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
@@ -57,6 +64,8 @@ NAMED = {
 LONGEST_NAME = 150
 """Largest number of bytes of a folder's name, to which the name of a data root may be added. File
 systems allow 255, and for a file that is written beside it a few more are needed."""
+OF_SAMPLES = ("corrector",)
+"""Settings of the filter that change the samples, and so every estimator."""
 WINDOWS = ("rate", "window_seconds", "context_seconds", "stride_seconds", "window_rotation")
 """Settings of `DataConfig` on which the figures depend."""
 
@@ -189,10 +198,18 @@ def _check(config: EvaluateConfig) -> None:
         problem = f"{what} uses the filter's own attitude"
         remedy = "leave it out, or choose --coupling loose or --estimator integrate"
         raise InputError(f"--orientation {config.orientation}", problem, remedy)
+    if config.estimator != "ekf" and config.coupling != "tight":
+        problem = f"{config.estimator} has no filter that a network is coupled to"
+        remedy = "leave it out, or choose --estimator ekf"
+        raise InputError(f"--coupling {config.coupling}", problem, remedy)
     for assignment in config.set:
         if not assignment.startswith("filter."):
             remedy = "write filter.FIELD=VALUE, e.g. filter.noise.measurement_scale=1"
             raise InputError(f"--set {assignment}", "is not a setting of the filter", remedy)
+        setting = assignment.partition("=")[0].strip().removeprefix("filter.")
+        if config.estimator == "integrate" and setting not in OF_SAMPLES:
+            remedy = "leave it out, or choose --estimator ekf"
+            raise InputError(f"--set {assignment}", "integrate has no filter", remedy)
 
 
 def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
@@ -274,14 +291,13 @@ def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     choices = vars(config)
     parts = [config.dataset, config.split, config.estimator]
     parts += [text.format(choices[x]) for x, text in NAMED.items() if choices[x] != defaults[x]]
-    if config.estimator != "integrate":
-        trained, chosen = configuration.flatten(run.filter), configuration.flatten(config.filter)
-        for name in {**trained, **chosen}:
-            if (value := chosen.get(name)) != trained.get(name):
-                numbers = value if isinstance(value, tuple) else (value,)
-                text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
-                text = text.replace("/", "-")  # the folder of a corrector
-                parts.append(f"{name}-{text}")
+    trained, chosen = configuration.flatten(run.filter), configuration.flatten(config.filter)
+    for name in {**trained, **chosen} if config.estimator != "integrate" else OF_SAMPLES:
+        if (value := chosen.get(name)) != trained.get(name):
+            numbers = value if isinstance(value, tuple) else (value,)
+            text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
+            text = text.replace("/", "-")  # the folder of a corrector
+            parts.append(f"{name}-{text}")
     name = "_".join(map(str, parts))
     if len(name.encode()) <= LONGEST_NAME:
         return name
@@ -315,6 +331,7 @@ def _describe_settings(
         "model": trained.config.model.name,
         "checkpoint": config.checkpoint,
         "weights": trained.digest or None,
+        "corrector_weights": digest_corrector(config.filter, trained),
         **{name: getattr(trained.config.data, name) for name in WINDOWS},
         "filter": configuration.to_plain(config.filter),
         "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,

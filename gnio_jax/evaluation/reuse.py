@@ -8,7 +8,7 @@ from typing import NamedTuple
 from gnio_jax import data
 from gnio_jax.config import EvaluateConfig, to_plain
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.evaluate import evaluate, folder_of, resolve
+from gnio_jax.evaluation.evaluate import OF_SAMPLES, evaluate, folder_of, resolve
 from gnio_jax.evaluation.folder import read
 from gnio_jax.evaluation.report import Report
 from gnio_jax.networks import find_network, newest_run
@@ -71,14 +71,24 @@ def load_or_evaluate(request: RequestedEvaluation, reporter: Reporter, workers: 
 
 
 def find_change(report: Report, path: Path) -> str:
-    """The reason why the figures are not of the weights of the network in `path`; empty if they
-    are."""
+    """The reason why the figures are not of the weights of the network in `path`, and of the
+    corrector of its filter; empty if they are."""
     if report.settings.get("checkpoint") == "latest":
         step = str(report.settings.get("step"))
         current = (path / "checkpoints" / "latest" / step).is_dir()
     else:
         current = report.settings.get("weights") == read_settings(path).digest
-    return "" if current else "its figures are of weights that the network has no more"
+    if not current:
+        return "its figures are of weights that the network has no more"
+    name = report.settings.get("filter", {}).get("corrector")
+    digest = report.settings.get("corrector_weights", "")  # None: it comes with the network
+    if name is None or digest is None:
+        return ""
+    try:
+        current = digest == read_settings(find_network(name)).digest
+    except InputError:  # it is not there any more, so it was not trained again
+        return ""
+    return "" if current else f"its figures are of weights that the corrector {name} has no more"
 
 
 def find_other_recordings(report: Report) -> str:
@@ -97,6 +107,9 @@ def _find_difference(report: Report, config: EvaluateConfig) -> str:
     for name in IDENTITY:
         if (value := report.settings.get(name)) != (request := getattr(config, name)):
             return f"its figures are of {name.replace('_', ' ')} {value}, not {request}"
-    if config.estimator != "integrate" and report.settings["filter"] != to_plain(config.filter):
+    ours, theirs = report.settings.get("filter", {}), to_plain(config.filter)
+    if config.estimator == "integrate":
+        ours, theirs = ([settings.get(name) for name in OF_SAMPLES] for settings in (ours, theirs))
+    if ours != theirs:
         return "its figures are of another filter than the network's"
     return ""

@@ -51,6 +51,7 @@ COLUMNS = {
     "path_length_ratio": Column("path ratio", best=1.0),
     "stationary_drift": Column("standing", "m/min", 1),
     "nees": Column("NEES/3", best=1.0),
+    "nees_2d": Column("NEES/2 2-D", best=1.0),
     "nees_coverage": Column("NEES<95 %", "%", 0, 95.0),
     "nis": Column("NIS/3", best=1.0),
     "nis_coverage": Column("NIS<95 %", "%", 0, 95.0),
@@ -88,10 +89,12 @@ DIVERGED = (
 
 def column(metric: str) -> Column:
     """The format of any metric; a horizontal one has that of the spatial one."""
+    if metric in COLUMNS:
+        return COLUMNS[metric]
     spatial = COLUMNS.get(metric.removesuffix("_2d"))
     if spatial is None:
         return Column(metric, "", 3)
-    return spatial if metric in COLUMNS else spatial._replace(heading=f"{spatial.heading} 2-D")
+    return spatial._replace(heading=f"{spatial.heading} 2-D")
 
 
 # --- cells

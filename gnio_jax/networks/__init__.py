@@ -1,6 +1,7 @@
 """Trained networks: their folder on the disk (`folder`), and where they are found (`find`)."""
 
 from gnio_jax.networks.find import (
+    digest_corrector,
     find_network,
     list_networks,
     load,
@@ -13,6 +14,7 @@ from gnio_jax.networks.folder import Card, TrainedNetwork, read_network, write_n
 __all__ = [
     "Card",
     "TrainedNetwork",
+    "digest_corrector",
     "find_network",
     "list_networks",
     "load",

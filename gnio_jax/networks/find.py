@@ -9,7 +9,14 @@ from pathlib import Path
 from gnio_jax.config import FilterSettings
 from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.models.airimu import Corrector
-from gnio_jax.networks.folder import CONFIG, WEIGHTS, TrainedNetwork, name_of, read_network
+from gnio_jax.networks.folder import (
+    CONFIG,
+    WEIGHTS,
+    TrainedNetwork,
+    name_of,
+    read_network,
+    read_settings,
+)
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """The networks that come with gnio-jax."""
@@ -93,6 +100,14 @@ def load_corrector(
         raise InputError("filter.corrector", problem, f"name one of {rate:g} Hz, as data.rate")
     parts = {kind: tree["corrector"] for kind, tree in trained.variables.items()}
     return Corrector(parts)
+
+
+def digest_corrector(settings: FilterSettings, network: TrainedNetwork) -> str | None:
+    """SHA-256 of the weights of the network that the settings of a filter name for its corrector;
+    None if they name none, or if its corrector comes with `network`, whose digest has it, too."""
+    name = settings.corrector
+    carried = network.corrector is not None and network.config.filter.corrector == name
+    return None if name is None or carried else read_settings(find_network(name)).digest
 
 
 def with_corrector(network: TrainedNetwork) -> TrainedNetwork:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 import zipfile
 import zlib
 from pathlib import Path
@@ -229,7 +230,7 @@ def _split_card(path: Path) -> tuple[dict[str, Any], str]:
         content = _read_file(path, CARD, LARGEST[CARD]).decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(path / CARD, f"cannot be read ({error})", DAMAGED) from None
-    _, *parts = content.split(BOUND, 2)
+    _, *parts = re.split(f"^{BOUND}", content, maxsplit=2, flags=re.MULTILINE)
     facts = configuration.parse_yaml(parts[0], str(path / CARD)) if len(parts) == 2 else None
     if not isinstance(facts, dict):
         raise InputError(path / CARD, "does not begin with the facts of a network", DAMAGED)

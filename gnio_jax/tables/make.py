@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Mapping
@@ -31,6 +30,7 @@ from gnio_jax.tables.duration import announce
 from gnio_jax.tables.experiments import OTHER_BLOCKS, SYSTEMS, Experiment
 from gnio_jax.tables.runs import RowResult, run_row, unfinished_runs
 from gnio_jax.training import loop
+from gnio_jax.training.run_folder import read_rows
 
 METRICS = (
     *("ate", "ate_2d", "ate_ronin", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
@@ -237,8 +237,7 @@ def make_table(
 
 def scale_gradients(run: Path) -> list[float]:
     """Norm of the gradient of the scale's layer in every epoch of a run, a mean over its steps."""
-    lines = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    return [json.loads(line)["gradient_norm/head/scale"] for line in lines]
+    return [float(row["gradient_norm/head/scale"]) for row in read_rows(run)]
 
 
 def _entropies(result: RowResult) -> Float[np.ndarray, "seeds 2"]:

@@ -128,9 +128,9 @@ def run_state(config: TrainConfig) -> str:
 
 
 def finished_epochs(workdir: Path) -> int:
-    """The number of epochs in the log of a run."""
-    log = workdir / "metrics.jsonl"
-    return log.read_text(encoding="utf-8").count("\n") if log.exists() else 0
+    """The number of epochs in the log of a run, to which each is added when all its other files
+    are written. Raises `InputError` as `run_folder.read_rows` does."""
+    return run_folder.count_epochs(run_folder.read_rows(workdir))
 
 
 def calibrate_run(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:

@@ -27,7 +27,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.networks import TrainedNetwork
 from gnio_jax.networks.folder import write_weights
 from gnio_jax.training.optimizer import Plateau, filter_numbers, trained_settings
-from gnio_jax.training.task import TrainState
+from gnio_jax.training.task import Row, TrainState
 
 METADATA = 2**17
 """Largest number of bytes that a checkpoint takes besides its arrays."""
@@ -52,12 +52,18 @@ class RunPosition(NamedTuple):
     seconds: float = 0.0
     """Time spent training so far."""
     plateau: Plateau = Plateau()
+    row: Row | None = None
+    """The log's row of the epoch that has just finished; None within an epoch."""
+    improved: bool = False
+    """Whether that epoch is the best one so far."""
 
 
 def exists(workdir: Path) -> bool:
     """Whether `workdir` holds a finished checkpoint."""
     folder = _folder(workdir)
-    return folder.is_dir() and any(child.name.isdigit() for child in folder.iterdir())
+    return folder.is_dir() and any(
+        child.name.isdigit() and child.is_dir() for child in folder.iterdir()
+    )
 
 
 def save(workdir: Path, state: TrainState, position: RunPosition) -> None:
@@ -173,6 +179,8 @@ def _read_items(workdir: Path, templates: dict[str, Any]) -> tuple[RunPosition, 
     """
     _refuse_missing(workdir)
     where = _folder(workdir)
+    damaged = f"the checkpoint is damaged: begin another run, with --init-from {workdir} from its"
+    damaged += " best weights"
     with _manager(where, create=False) as manager:
         step = manager.latest_step()
 
@@ -181,11 +189,16 @@ def _read_items(workdir: Path, templates: dict[str, Any]) -> tuple[RunPosition, 
                 return manager.restore(step, args=ocp.args.Composite(**items))
             except (OSError, ValueError, KeyError, TypeError) as error:
                 problem = f"cannot be read ({str(error)[:120]})"
-                damaged = InputError(where / str(step), problem, "the checkpoint is damaged")
-                raise damaged from None
+                raise InputError(where / str(step), problem, damaged) from None
 
         meta = restore_items({"meta": ocp.args.JsonRestore()})["meta"]
-        shapes, saved_shapes = _shapes(templates["variables"]), meta["shapes"]
+        try:
+            position, saved_shapes = RunPosition(**meta["position"]), dict(meta["shapes"])
+            position = position._replace(plateau=Plateau(*position.plateau))
+        except (KeyError, TypeError, ValueError):
+            problem = "does not have the position of a run"
+            raise InputError(where / str(step), problem, damaged) from None
+        shapes = _shapes(templates["variables"])
         for name in sorted(shapes.keys() | saved_shapes.keys()):
             if shapes.get(name) != saved_shapes.get(name):
                 problem = (
@@ -196,8 +209,7 @@ def _read_items(workdir: Path, templates: dict[str, Any]) -> tuple[RunPosition, 
                 raise InputError(where, problem, same)
         trees = restore_items({n: ocp.args.StandardRestore(tree) for n, tree in templates.items()})
         trees = {name: trees[name] for name in templates}
-    position = meta["position"]
-    return RunPosition(**position | {"plateau": Plateau(*position["plateau"])}), trees
+    return position, trees
 
 
 def _shapes(variables: Any) -> dict[str, list[int]]:

@@ -19,9 +19,12 @@ import jax.numpy as jnp
 from gnio_jax import config as configuration
 from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
+from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError
+from gnio_jax.filtering.measurements import create_measurements
 from gnio_jax.models.memory import NetworkWithMemory
 from gnio_jax.networks import TrainedNetwork
+from gnio_jax.networks.folder import WEIGHTS
 from gnio_jax.reporting import Lines, Reporter, Silence
 from gnio_jax.training import checkpoint, optimizer, run_folder, support_vectors
 from gnio_jax.training.checkpoint import RunPosition
@@ -30,7 +33,7 @@ from gnio_jax.training.initial import load_initial_network
 from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.run_folder import Log
 from gnio_jax.training.segment_task import SegmentTask
-from gnio_jax.training.task import DispatchSums, Row, Task
+from gnio_jax.training.task import DispatchSums, Row, Task, TrainState
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
@@ -66,10 +69,10 @@ def train(config: TrainConfig, resume: bool = False, **options: Any) -> Training
     With `resume` the run continues from its latest checkpoint as if it had never stopped:
     parameters, optimizer, order of the windows or segments, and random draws are functions of the
     seed and the step. A run is resumed by these rules: the settings must be those of config.yaml; a
-    run without a checkpoint starts again; log rows after the checkpoint are removed. After SIGTERM
-    or Ctrl-C the state is saved and the function returns. A loss or gradient that is not finite
-    raises `FloatingPointError` naming the step (through the filter such a step is skipped). The
-    other options and errors are those of `train_all`.
+    run without a checkpoint and without weights starts again; log rows after the checkpoint are
+    removed. After SIGTERM or Ctrl-C the state is saved and the function returns. A loss or gradient
+    that is not finite raises `FloatingPointError` naming the step (through the filter such a step
+    is skipped). The other options and errors are those of `train_all`.
     """
     (result,) = train_all([config], resume, **options)
     return result
@@ -99,7 +102,8 @@ def train_all(
 
     Raises:
         InputError: The initial network is not of the same network, settings do not fit together, a
-            folder holds another run, or the devices cannot share a batch evenly.
+            folder holds another run, or weights without a checkpoint to resume from, or the devices
+            cannot share a batch evenly.
     """
     reporter = (reporter or Lines()) if parallel.is_first() else Silence()
     folders = map(configuration.default_workdir, configs)
@@ -109,6 +113,7 @@ def train_all(
         run_folder.refuse_other_run(configuration.validate(config), resume)
         for config, resume in zip(configs, resumes, strict=True)
     ]
+    refuse_untrainable(configs[0])
     method = METHODS.get(models.trained_by(models.from_experiment(configs[0])))
     if method is not None:  # without steps
         losses = [
@@ -116,6 +121,11 @@ def train_all(
             for config, workdir in zip(configs, workdirs, strict=True)
         ]
         return [TrainingResult(*run, None) for run in zip(workdirs, losses, strict=True)]
+    for workdir, resume in zip(workdirs, resumes, strict=True):
+        if resume and (workdir / WEIGHTS).exists() and not checkpoint.exists(workdir):
+            problem = "has weights, and no checkpoint to continue from"
+            remedy = f"begin with its weights: --init-from {workdir} and another --workdir"
+            raise InputError(workdir, problem, remedy)
     through_filter = bool(configs[0].through_filter.learn)
     if through_filter and devices is not None:
         raise InputError("--devices", "is for training on windows", "leave it out")
@@ -141,8 +151,10 @@ def train_all(
 
 
 def refuse_untrainable(config: TrainConfig) -> None:
-    """Raise `InputError` for an experiment that cannot be trained, before anything is read: as
-    `choose_task` does, and for a library that is missing."""
+    """Raise `InputError` for an experiment that cannot be trained, or whose filter has measurements
+    that do not exist, before anything is read: as `choose_task` does, and for a library that is
+    missing."""
+    create_measurements(config.filter.measurements, Location("config", "filter.measurements"))
     if models.trained_by(models.from_experiment(config)) == "support_vectors":
         support_vectors.require_library()
     else:
@@ -198,6 +210,8 @@ def _train(
             state, position = checkpoint.restore(workdir, state)
             reporter.line(f"resuming at step {position.step}")
         with Log(workdir, position.epoch, position.step) as log:
+            if position.row and log.epochs < position.epoch:  # the process ended between the files
+                _keep_epoch(workdir, config, state, position, log)
             saved = time.perf_counter()
             for epoch in range(position.epoch, epochs):
                 order, end = task.order(order_key, epoch, source), (epoch + 1) * steps
@@ -228,17 +242,27 @@ def _train(
                 state, validation = task.validate(
                     with_statistics(state), data.held_out, statistics_key
                 )
-                position, row, improved = finish_epoch(position, task, validation, rate)
-                log.add(row)
-                for line in describe_epoch(row, improved, task):
-                    reporter.line(line)
-                if improved:
-                    checkpoint.save_best(workdir, config, state, position)
+                position, row = finish_epoch(position, task, validation, rate)
                 checkpoint.save(workdir, state, position)
+                _keep_epoch(workdir, config, state, position, log)
+                for line in describe_epoch(row, position.improved, task):
+                    reporter.line(line)
                 (signum,) = parallel.largest(max(signals))
                 if signum and epoch + 1 < epochs:
                     return TrainingResult(workdir, position.best, signum)
     return TrainingResult(workdir, position.best, None)
+
+
+def _keep_epoch(
+    workdir: Path, config: TrainConfig, state: TrainState, position: RunPosition, log: Log
+) -> None:
+    """Write what follows from the checkpoint at the end of an epoch: the weights if they are the
+    best so far, then the log's row. So whatever ends the process, a run whose log has an epoch has
+    its weights and its checkpoint, and a resumed run writes what is missing."""
+    if position.improved:
+        checkpoint.save_best(workdir, config, state, position)
+    if position.row:
+        log.add(position.row)
 
 
 @contextmanager
@@ -279,15 +303,14 @@ def add_steps(
         )
     sums = {name: float(figure) for name, figure in dispatch.sums.items()}
     sums = {name: position.sums.get(name, 0.0) + figure for name, figure in sums.items()}
-    return position._replace(step=position.step + count, sums=sums)
+    return position._replace(step=position.step + count, sums=sums, row=None, improved=False)
 
 
 def finish_epoch(
     position: RunPosition, task: Task, validation: Row, rate: float
-) -> tuple[RunPosition, Row, bool]:
+) -> tuple[RunPosition, Row]:
     """The end of an epoch at `position`, trained at `rate` windows or segments per second: the
-    position at which the next one starts, the log's row, and whether the epoch is the best one so
-    far.
+    position at which the next one starts, and the log's row.
 
     The choice of the best epoch begins anew with the epoch that changes what is trained, and again
     with the first whole epoch after it. Losses before and after the change cannot be compared, and
@@ -314,8 +337,10 @@ def finish_epoch(
     improved = math.isfinite(merit) and better
     plateau = optimizer.update_plateau(position.plateau, row["val_mse"], optim)
     best = merit if improved else best
-    position = position._replace(epoch=position.epoch + 1, best=best, sums={}, plateau=plateau)
-    return position, row, improved
+    position = RunPosition(
+        position.epoch + 1, position.step, best, {}, position.seconds, plateau, row, improved
+    )
+    return position, row
 
 
 def learning_rate(position: RunPosition, task: Task) -> float:

@@ -114,6 +114,9 @@ def losses(
     if "router" in prediction.diagnostics:
         balance = network_losses.balance(prediction.diagnostics["router"])
         total = total + config.balance_weight * balance
+    elif config.balance_weight != LossConfig().balance_weight:
+        problem = "is for networks with a router, e.g. experts"
+        raise InputError("loss.balance_weight", problem, "leave it out")
     has_corrector = "corrected" in prediction.diagnostics
     if has_corrector and not config.preintegration_weight:
         problem = "is 0, and a corrector learns from the preintegration alone"

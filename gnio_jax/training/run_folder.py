@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,9 @@ from gnio_jax.training.task import Row
 
 # Made when the module is imported, so type checkers do not know them.
 _Event, _SessionLog = (getattr(event_pb2, name) for name in ("Event", "SessionLog"))
+
+LOG = "metrics.jsonl"
+"""File of a run with a row of figures for each finished epoch."""
 
 
 # Settings and recordings
@@ -58,8 +61,12 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     if not file.exists():
         problem = "holds no run to resume (config.yaml is missing)"
         raise InputError(workdir, problem, "start it without --resume")
-    configs = map(configuration.without_paths, (config, configuration.load(file)))
-    ours, theirs = map(configuration.flatten, configs)
+    # The path of the data may change, but not that of the weights to begin with: others would make
+    # another run of one that has no checkpoint yet, and would have no effect on the others.
+    ours, theirs = (
+        configuration.flatten(configuration.without_paths(run)) | {"init_from": run.init_from}
+        for run in (config, configuration.load(file))
+    )
     network = models.from_config(config.model)
     fitted = {f"model.options.{option}" for option in models.fitted_options(network)}
     for name in ours | theirs:
@@ -169,6 +176,34 @@ def compare_processes(config: TrainConfig, data: TrainingData, variables: Any) -
 # ------------------------------------------------------------------------------------------------
 
 
+def read_rows(workdir: Path) -> list[Row]:
+    """The rows of the log of a run, one for each finished epoch. A last line that was cut off is
+    left out. Raises `InputError` for a log that cannot be read, and for another line that is no
+    row."""
+    path = workdir / LOG
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, f"cannot be read ({error})", "remove it") from None
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+        except ValueError:
+            if number == len(lines):
+                break
+            row = None
+        if not (isinstance(row, dict) and type(row.get("epoch")) is int):
+            raise InputError(path, f"line {number} is no row of figures", "remove this line")
+        rows.append(row)
+    return rows
+
+
+def count_epochs(rows: Sequence[Row]) -> int:
+    """The number of epochs until that of the last row."""
+    return int(rows[-1]["epoch"]) + 1 if rows else 0
+
+
 class Log:
     """A row of figures for each finished epoch, in metrics.jsonl and TensorBoard. A resumed run
     removes the rows after its checkpoint and writes them again. Of several processes the first one
@@ -179,17 +214,21 @@ class Log:
     """
 
     def __init__(self, workdir: Path, epoch: int, step: int):
-        self._path, self._board = workdir / "metrics.jsonl", workdir / "tensorboard"
+        self._path, self._board = workdir / LOG, workdir / "tensorboard"
         self._rows, self._events = [], None
         if parallel.is_first():
-            exists = self._path.exists()
-            lines = self._path.read_text(encoding="utf-8").splitlines() if exists else []
-            self._rows = [row for row in map(json.loads, lines) if row["epoch"] < epoch]
+            self._rows = [row for row in read_rows(workdir) if row["epoch"] < epoch]
             self._board.mkdir(parents=True, exist_ok=True)
             self._events = EventsWriter(str(self._board / "events"))
-            # Events of other files from this step on are invalid.
+            # Events of other files from this step on are invalid: those after the checkpoint.
             start = _SessionLog(status=_SessionLog.START)
-            self._events.write_event(_Event(wall_time=time.time(), step=step, session_log=start))
+            event = _Event(wall_time=time.time(), step=step + 1, session_log=start)
+            self._events.write_event(event)
+
+    @property
+    def epochs(self) -> int:
+        """The number of epochs until the last one of the log."""
+        return count_epochs(self._rows)
 
     def __enter__(self) -> Log:
         return self

@@ -9,6 +9,7 @@ import pytest
 
 from gnio_jax.apps import publish as publishing
 from gnio_jax.apps.publish import describe_data, describe_error, publish
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation import report
 from gnio_jax.evaluation.metrics import Measures
 from gnio_jax.networks import find, read_network
@@ -89,6 +90,16 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run,
         publish(copy, tmp_path / "package", "walk", *SAID)
         assert f"--network runs/walk{options}\n" in read_text(tmp_path / "package")
     assert line.endswith("| – | – | 0.80 (0.71 to 0.89) | 2.00 (2.00 to 2.00) |")
+
+
+@pytest.mark.parametrize(
+    "content", ['{"run": ', "{}", "[1]", '{"run": "a", "split": "b", "fitted": 1}']
+)
+def test_a_damaged_record_of_a_calibration_is_refused(run, tmp_path, content):
+    copy = shutil.copytree(run, tmp_path / "walk_calibrated")
+    (copy / "calibration.json").write_text(content)
+    with pytest.raises(InputError, match=r"calibration\.json: is not the record .*; remove the"):
+        publish(copy, tmp_path / "package", "walk", *SAID)
 
 
 def test_networks_are_listed(published, run, monkeypatch, tmp_path, gnio, mistake):

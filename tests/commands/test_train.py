@@ -14,6 +14,7 @@ from gnio_jax.commands.options import Call, read
 from gnio_jax.commands.train import experiment
 from gnio_jax.commands.train import train as command
 from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.config.schema import Location
 from gnio_jax.training import optimizer
 from tests.support import tiny_run, tlio_files
 from tests.support.filter_settings import changed
@@ -47,11 +48,45 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
         (["--data.stride-seconds", "0.3"], "field 'data.stride_seconds' must divide the window"),
         (["--data.context-seconds", "1", "--model.name", "ctin"], "is not for ctin"),
         (["--workdir", __file__], "test_train.py: is a file; name a folder with --workdir"),
+        (
+            ["--dataset", "tlio", "--set", "filter.measurements.foo.std=1"],
+            "config: field 'filter.measurements.foo' is not known",
+        ),
+        (
+            ["--dataset", "tlio", "--set", "filter.measurements.zero_velocity.sdt=1"],
+            "config: field 'filter.measurements.zero_velocity.sdt' is unknown; known numbers: std",
+        ),
         (["--resume", "--workdir", "none"], "none: holds no run to resume"),
     ],
 )
 def test_mistakes(monkeypatch, capsys, tmp_path, arguments, expected):
     assert expected in mistake(monkeypatch, capsys, tmp_path, *arguments)
+
+
+@pytest.mark.parametrize(
+    "setting, purpose",
+    [
+        ("augment.walkway_share=0.9", "is for training on segments"),
+        ("augment.walkway=[0.5,0.6]", "is for training on segments"),
+        ("augment.time_stretch=[0.5,0.6]", "is for training on segments"),
+        ("augment.alternating_gain=[2,3]", "is for training on segments"),
+        ("segments.truncate_seconds=1", "is for training on segments"),
+        ("segments.horizon_weight=3", "is for training on segments"),
+        ("through_filter.piece_seconds=30", "is for training through the filter"),
+        ("through_filter.start_spread=0", "is for training through the filter"),
+        ("loss.angle_weight=5", "is for loss.name: polar"),
+    ],
+)
+def test_a_setting_without_effect_is_refused(monkeypatch, capsys, tmp_path, setting, purpose):
+    name = setting.partition("=")[0]
+    line = mistake(monkeypatch, capsys, tmp_path, "--dataset", "tlio", "--set", setting)
+    assert line.startswith(f"config: field '{name}' {purpose}") and "leave it out, or set" in line
+
+
+def test_shifted_samples_are_for_windows(monkeypatch, capsys, tmp_path):
+    words = ["--model.name", "gru", "--segments.seconds", "4", "--augment.shift-samples", "3"]
+    line = mistake(monkeypatch, capsys, tmp_path, "--dataset", "tlio", *words)
+    assert "field 'augment.shift_samples' is for training on windows" in line
 
 
 def test_a_damaged_recording_is_left_out_loudly_or_ends_a_strict_run(
@@ -85,6 +120,7 @@ def test_every_config_of_the_repository_is_valid_and_names_its_command():
     commands["drive"] = "gnio track drive.zip --carrier car"
     for name, file in (files | budgets).items():
         config = configuration.validate(configuration.load(file), str(file))
+        config.refuse_unused(Location(str(file)))
         assert configuration.parse(configuration.to_yaml(config), "its own text") == config
         assert commands[name] in file.read_text()
         model, optim = config.model, config.optim

@@ -1,5 +1,6 @@
 """The evaluate command from its options to its folder, on a tiny untrained network."""
 
+import dataclasses
 import importlib.util
 import json
 import runpy
@@ -173,7 +174,17 @@ class Reached(Exception):
 
 
 @pytest.mark.parametrize(
-    "choice, least", [({"coupling": "loose"}, np.exp(-4.0)), ({"estimator": "integrate"}, 0.0)]
+    "choice, least",
+    [
+        ({"coupling": "loose", "set": ("filter.raw_gyro_bias=0.02",)}, np.exp(-4.0)),
+        (
+            {
+                "estimator": "integrate",
+                "filter": dataclasses.replace(TRAINED.filter, raw_gyro_bias=0.02),
+            },
+            0.0,
+        ),
+    ],
 )
 def test_uncertainties_of_the_filter_reach_the_stages(workdir, walks, monkeypatch, choice, least):
     """These are the start, a raw gyro, and the smallest standard deviation of a displacement, which
@@ -193,7 +204,7 @@ def test_uncertainties_of_the_filter_reach_the_stages(workdir, walks, monkeypatc
     monkeypatch.setattr(module, "infer", infer)
     monkeypatch.setattr(data, "load", lambda *_: walks[:1])
     with pytest.raises(Reached):
-        evaluate(EvaluateConfig(str(workdir), set=("filter.raw_gyro_bias=0.02",), **choice))
+        evaluate(EvaluateConfig(str(workdir), **choice))
     assert arguments["ekf"].start.velocity == 0.7 and arguments["ekf"].raw_gyro_bias == 0.02
     assert arguments.get("least_std", 0.0) == pytest.approx(least)
 
@@ -208,6 +219,12 @@ def test_the_name_of_a_folder_has_the_choices():
         ({"coupling": "loose", "orientation": "reference"}, "ekf_loose"),
         (loose, "ekf_loose_device-orientation_static-init"),
         (summed, "integrate_filter-orientation_rest-bias"),
+        # A sum of displacements has no filter, but the corrector's samples.
+        ({**summed, "filter": slower}, "integrate_filter-orientation_rest-bias"),
+        (
+            {**summed, "filter": dataclasses.replace(slower, corrector="a/b")},
+            "integrate_filter-orientation_rest-bias_corrector-a-b",
+        ),
         (
             {"filter": slower, "alignment": "se3", "checkpoint": "latest"},
             "ekf_se3-alignment_latest_start.velocity-0.5",

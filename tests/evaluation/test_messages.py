@@ -150,6 +150,17 @@ REFUSED = [
     ),
     (found_without_weights, "holds no weights .*; let gnio train finish its first epoch"),
     (lambda x: evaluated(x, estimator="imu_only", orientation="device"), "leave it out, or choose"),
+    *(
+        (
+            lambda x, how=how: evaluated(x, estimator=how, coupling="loose"),
+            f"^--coupling loose: {how} has no filter",
+        )
+        for how in ("integrate", "imu_only")
+    ),
+    (
+        lambda x: evaluated(x, estimator="integrate", set=("filter.noise.gyro_density=5",)),
+        "^--set filter.noise.gyro_density=5: integrate has no filter; leave it out",
+    ),
     (lambda x: evaluated(x, alignment="se3"), "^tapped: has waypoints, .*leave it out"),
     (
         lambda x: evaluated(x, estimator="integrate"),

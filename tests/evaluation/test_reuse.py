@@ -78,6 +78,30 @@ def test_figures_with_another_meaning_are_made_again(run, monkeypatch, settings,
     assert "is not a metrics.json" in find(run).problem
 
 
+def test_figures_of_a_corrector_that_was_trained_again_are_not_used(run, tmp_path):
+    """They have a digest of its weights, unless it comes with the network. A corrector that is gone
+    was not trained again. `integrate` has the samples of the corrector, too."""
+    corrector = write_run(tmp_path / "airimu")
+    settings = dataclasses.replace(BASE.filter, corrector=str(corrector))
+    config = configuration.load(run / "config.yaml")
+    configuration.save(run / "config.yaml", dataclasses.replace(config, filter=settings))
+    plain = configuration.to_plain(settings)
+    evaluation(run, estimator="integrate", filter=plain, corrector_weights=digest(corrector))
+    evaluation(run, filter=plain, corrector_weights=digest(corrector))
+    assert find(run).problem == find(run, estimator="integrate").problem == ""
+    write_run(corrector, step=9)
+    assert "airimu has no more" in find(run).problem
+    assert "airimu has no more" in find(run, estimator="integrate").problem
+    evaluation(run, filter=plain, corrector_weights=None)
+    assert find(run).problem == ""
+    evaluation(run, filter=plain)  # from before the digest was kept
+    assert "airimu has no more" in find(run).problem
+    (corrector / "config.yaml").unlink()
+    assert find(run).problem == ""
+    evaluation(run, estimator="integrate", filter={"corrector": "another"})
+    assert "of another filter" in find(run, estimator="integrate").problem
+
+
 def test_figures_of_another_folder_are_never_used(run, tmp_path):
     """A run that was evaluated on A has no figures on B, whatever the names of the recordings. The
     figures of `integrate` have no filter, so its options do not matter."""

@@ -67,6 +67,13 @@ def test_divergence_is_in_the_table(made_report, with_divergence):
     assert "diverged" not in text(made_report)
 
 
+def test_a_heading_says_by_what_a_normalised_error_is_divided():
+    """By the number of its dimensions."""
+    assert tabulate.column("nees").title == "NEES/3 (best 1)"
+    assert tabulate.column("nees_2d").title == "NEES/2 2-D (best 1)"
+    assert tabulate.column("ate_2d").title == "ATE 2-D (m)"
+
+
 def test_cells_have_the_digits_of_an_interval_and_the_spread_of_seeds():
     """A mean of 3.0 ° may differ by 0.0045 °."""
     difference = Difference(0.00452, (0.00213, 0.00709), None, 1, 2, 2, 2)

@@ -1,5 +1,7 @@
 """A trained corrector before filter and network, found by a name and published with the network."""
 
+import hashlib
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,16 @@ def test_a_published_network_has_its_corrector_within(runs, tmp_path):
     np.testing.assert_array_equal(*kernels)
     # The network itself is unchanged.
     assert named.variables.keys() == read_network(behind).variables.keys()
+
+
+def test_a_corrector_has_a_digest_unless_it_comes_with_the_network(runs):
+    first, behind = runs
+    network = read_network(behind)
+    digest = hashlib.sha256((first / "weights.safetensors").read_bytes()).hexdigest()
+    assert networks.digest_corrector(network.config.filter, network) == digest
+    carried = networks.with_corrector(network)
+    assert networks.digest_corrector(network.config.filter, carried) is None
+    assert networks.digest_corrector(FilterSettings(), network) is None
 
 
 def test_a_wrong_corrector_is_refused_in_one_line(runs):

@@ -85,6 +85,15 @@ def test_a_published_network_is_the_run_without_its_folders(run, published, name
     assert (network.name, copy.name) == ("walk", "walk") and copy.card.license == "CC0"
 
 
+@pytest.mark.parametrize("text", ["walks ---", "---", "walks\n---\nand runs"])
+def test_facts_may_have_the_marks_of_their_bounds(run, tmp_path, text):
+    """Only a whole line is a bound."""
+    facts = FACTS._replace(data=text)
+    folder.write_published(tmp_path / "walk", read_network(run), facts, "# walk\n\n---\n\nend")
+    assert read_network(tmp_path / "walk").card.data == text
+    assert folder.read_text(tmp_path / "walk") == "# walk\n\n---\n\nend"
+
+
 def test_other_programs_read_the_files(run, published):
     """The weights by the format's own description: a length, a header of JSON, the bytes."""
     package = published / "walk"

@@ -10,6 +10,7 @@ from gnio_jax.reporting import Lines
 from gnio_jax.tables import duration, runs
 from gnio_jax.tables.experiments import TableRow
 from tests.support import tiny_run, tlio_files
+from tests.support.reports import write_log
 
 
 def test_the_time_is_that_of_a_step_for_all_steps_of_the_epochs_that_are_left(
@@ -22,7 +23,7 @@ def test_the_time_is_that_of_a_step_for_all_steps_of_the_epochs_that_are_left(
     monkeypatch.setattr(runs, "run_state", lambda run: states.get(Path(run.workdir).name, "new"))
     monkeypatch.setattr(duration, "training_seconds", lambda config: 3000.0)
     (tmp_path / "runs" / "a_s1").mkdir(parents=True)
-    (tmp_path / "runs" / "a_s1" / "metrics.jsonl").write_text("{}\n" * 10)
+    write_log(tmp_path / "runs" / "a_s1", 10)
     assert duration.announce(rows, tmp_path, 2, Lines()) == 0.75 * 3000.0 + 6000.0
     assert "about 2 h 18 min (a 38 min, b 100 min, c without steps)" in capsys.readouterr().err
     monkeypatch.setattr(runs, "run_state", lambda run: "finished")

@@ -1,6 +1,7 @@
 """Runs that are there already."""
 
 import dataclasses
+import errno
 import shutil
 from types import SimpleNamespace
 
@@ -9,9 +10,12 @@ import pytest
 from gnio_jax import config as configuration
 from gnio_jax.config import CalibrateConfig
 from gnio_jax.errors import InputError
+from gnio_jax.networks.folder import read_settings
 from gnio_jax.reporting import Lines
 from gnio_jax.tables import runs
-from tests.support.reports import BASE, digest, write_run
+from gnio_jax.training import checkpoint
+from tests.support import tiny_run, tlio_files
+from tests.support.reports import BASE, digest, write_log, write_run
 
 
 def test_a_calibration_is_of_the_best_weights_and_warns(tmp_path, monkeypatch, capsys):
@@ -56,8 +60,29 @@ def test_a_run_is_finished_with_its_last_epoch(tmp_path, rows, state):
     write_run(tmp_path / "gnio_s0")
     configuration.save(tmp_path / "gnio_s0" / "config.yaml", config)
     if rows:
-        (tmp_path / "gnio_s0" / "metrics.jsonl").write_text("{}\n" * rows)
+        write_log(tmp_path / "gnio_s0", rows)
     assert runs.run_state(config) == state
+
+
+def test_a_run_whose_last_weights_were_not_written_is_begun(tmp_path, monkeypatch):
+    """Its disk was full at the end. It is resumed, and then it is finished."""
+    root = tlio_files.write_splits(tmp_path / "data")
+    config, real = tiny_run.config(root, tmp_path / "run", epochs=2), checkpoint.write_weights
+
+    def write_weights(folder, variables, epoch, step, settings=None):
+        if epoch == 2:
+            raise OSError(errno.ENOSPC, "no space", str(folder))
+        real(folder, variables, epoch, step, settings)
+
+    with tiny_run.registry_entry():
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="no space"):
+            patch.setattr(checkpoint, "write_weights", write_weights)
+            runs.loop.train(config)
+        assert runs.run_state(config) == "begun"
+        runs.loop.train(config, resume=True)
+        assert runs.run_state(config) == "finished"
+    assert [row["epoch"] for row in tiny_run.rows(tmp_path / "run")] == [0, 1]
+    assert read_settings(tmp_path / "run").epoch == 2
 
 
 def test_a_run_of_other_recordings_is_refused(tmp_path, monkeypatch):
@@ -69,7 +94,7 @@ def test_a_run_of_other_recordings_is_refused(tmp_path, monkeypatch):
     (seed_config,) = configuration.with_seeds(config, [0])
     write_run(tmp_path / "gnio_s0")
     configuration.save(tmp_path / "gnio_s0" / "config.yaml", seed_config)
-    (tmp_path / "gnio_s0" / "metrics.jsonl").write_text("{}\n" * BASE.optim.epochs)
+    write_log(tmp_path / "gnio_s0", BASE.optim.epochs)
     monkeypatch.setattr(runs.loop, "train_all", None)
     runs.train(config, [0], Lines())
     other = dataclasses.replace(config, data_root=str(tmp_path / "B"))

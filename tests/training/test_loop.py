@@ -65,8 +65,8 @@ def test_validation_is_the_plain_mean_over_every_window(recording, finished):
 def test_stopped_and_killed_and_resumed_gives_the_same_bits(
     recording, finished, tmp_path, monkeypatch
 ):
-    """One run that ends within an epoch, at its end, between the row of the log and the weights of
-    the second epoch, between weights and checkpoint, and once more within one."""
+    """One run that ends within an epoch, at its end, between the checkpoint and the weights of the
+    second epoch, between weights and row of the log, after the row, and once more within one."""
     run = config(recording, tmp_path / "run")
 
     def stop(step, resume=True):
@@ -88,8 +88,15 @@ def test_stopped_and_killed_and_resumed_gives_the_same_bits(
 
     stop(1, resume=False)
     stop(STEPS)
-    kill_after(run_folder.Log, "add")  # the log has a row that no checkpoint has
-    kill_after(checkpoint, "save_best")
+    for owner, name, step, count in (
+        (checkpoint, "save", STEPS, 1),
+        (checkpoint, "save_best", 2 * STEPS, 1),
+        (run_folder.Log, "add", 2 * STEPS, 2),
+    ):
+        kill_after(owner, name)
+        assert checkpoint.load_latest(tmp_path / "run").step == 2 * STEPS
+        assert read_network(tmp_path / "run").step == step
+        assert len(rows(tmp_path / "run")) == count
     stop(2 * STEPS + 4)
     assert loop.train(run, resume=True).stopped_by is None
     assert_same_runs(tmp_path / "run", finished[0])
@@ -146,12 +153,41 @@ def test_a_run_is_not_resumed_with_other_recordings(recording, finished, tmp_pat
         loop.train(run, resume=True)
 
 
+def test_weights_without_a_checkpoint_are_not_trained_over(recording, finished, tmp_path):
+    """As a calibrated run has them. A stray file is no checkpoint."""
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    shutil.rmtree(run / "checkpoints" / "latest" / str(3 * STEPS))
+    (run / "checkpoints" / "latest" / str(3 * STEPS)).touch()
+    before = (run / "weights.safetensors").read_bytes()
+    with pytest.raises(InputError, match=r"run: has weights, and no checkpoint .* --init-from"):
+        loop.train(config(recording, run), resume=True)
+    with pytest.raises(InputError, match="latest: holds no checkpoint"):
+        checkpoint.load_latest(run)
+    assert (run / "weights.safetensors").read_bytes() == before
+
+
+def test_a_damaged_log_is_resumed_or_refused(recording, finished, tmp_path):
+    """Its last line may be cut: the checkpoint has this row."""
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    log = run / "metrics.jsonl"
+    whole = log.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    log.write_bytes(b"".join(lines[:-1]) + lines[-1][:40])
+    loop.train(config(recording, run), resume=True)
+    assert log.read_bytes() == whole
+    for content in (b"[1]\n" + whole, whole + b"{}\n", b"{\n" + whole):
+        log.write_bytes(content)
+        with pytest.raises(InputError, match=r"metrics\.jsonl: line [14] is no row .*; remove"):
+            loop.train(config(recording, run), resume=True)
+
+
 def test_refused_before_anything_is_written(recording, finished, tmp_path):
     (tmp_path / "run").mkdir()
     shutil.copy(finished[0] / "config.yaml", tmp_path / "run")
     for folder, resume, changes, problem in (
         ("run", False, {}, "run: already holds a run; continue it with --resume"),
         ("run", True, {"seed": 5}, r"config\.yaml: 'seed' was 0 and is now 5"),
+        ("run", True, {"init_from": "other"}, "'init_from' was None and is now other"),
         ("run", True, {"epochs": 9}, r"config\.yaml: 'optim\.epochs' was 3 and is now 9"),
         ("none", True, {}, "none: holds no run to resume"),
         ("none", False, {"batch_size": 999}, r"optim\.batch_size: is 999, but there are only 220"),
@@ -169,6 +205,7 @@ def test_refused_before_anything_is_written(recording, finished, tmp_path):
         ({"name": "body_velocity"}, "loss.name: is body_velocity, which needs velocities"),
         ({"name": "bins"}, "loss.name: is bins, which needs a network with model.head: bins"),
         ({"name": "velocity_and_covariance"}, "loss.name: is velocity_and_covariance, which needs"),
+        ({"balance_weight": 7.0}, "loss.balance_weight: is for networks with a router"),
         ({"preintegration_weight": 1.0}, "loss.preintegration_weight: needs a network with a corr"),
     ],
 )
@@ -228,12 +265,18 @@ def cut_arrays(run):
         array.write_bytes(array.read_bytes()[:10])
 
 
+def empty_metadata(run):
+    for file in (run / "checkpoints" / "latest").glob("*/meta/metadata"):
+        file.write_text("{}")
+
+
 @pytest.mark.parametrize(
     "change, problem",
     [
         (no_checkpoint, "latest: holds no checkpoint"),
         (wider_network, r"has shape \[.*\] in the checkpoint and \[.*\] in the conf"),
         (cut_arrays, "cannot be read"),
+        (empty_metadata, f"latest/{3 * STEPS}: does not have the position of a run; .*--init-from"),
     ],
 )
 def test_checkpoints_that_cannot_be_loaded(finished, tmp_path, change, problem):

@@ -1,6 +1,7 @@
 """Training through the filter, with a network of one layer on walks of a few seconds."""
 
 import dataclasses
+import shutil
 import signal
 from contextlib import nullcontext
 
@@ -134,12 +135,12 @@ def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
 
 
 def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path):
-    run = tmp_path / "run"
+    run, start = tmp_path / "run", shutil.copytree(recording / "initial", tmp_path / "initial")
+    config = tiny(recording, run, init_from=str(start))
     with tiny_run.stopped_at(1):
-        assert loop.train(tiny(recording, run)).stopped_by == signal.SIGTERM
-    # The weights that it started from are not needed any more.
-    resumed = tiny(recording, run, init_from="gone")
-    assert loop.train(resumed, resume=True).stopped_by is None
+        assert loop.train(config).stopped_by == signal.SIGTERM
+    shutil.rmtree(start)  # it is not needed any more
+    assert loop.train(config, resume=True).stopped_by is None
     tiny_run.assert_same_runs(run, finished)
 
 
