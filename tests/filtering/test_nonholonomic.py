@@ -185,8 +185,9 @@ def test_a_speed_that_cannot_be_is_refused(change, words):
 
 
 def test_no_velocity_is_measured_where_the_rate_is_missing():
-    imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), Gap(*jnp.zeros((2, N)), jnp.ones(N)))
-    held = imu._replace(gap=imu.gap._replace(gyro_variance=jnp.zeros(N).at[-1].set(1e-6)))
+    gap = Gap(*jnp.zeros((2, N)), jnp.ones(N), jnp.zeros(N, bool))
+    imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), gap)
+    held = imu._replace(gap=gap._replace(missing=jnp.arange(N) == N - 1))
     ekf = filtering.Filter(CONFIG)
     state = filtering.initial_state(ekf, np.eye(3), np.ones(3), np.zeros(3))
     for samples, present in ((imu, True), (held, False)):
@@ -197,12 +198,12 @@ def test_no_velocity_is_measured_where_the_rate_is_missing():
 
 
 def test_derivatives_are_finite_at_rest_and_with_the_axis_ahead_upright():
-    """Also where the measurement is refused, and where the rate is missing (variance above 0)."""
+    """Also where the measurement is refused, and where the rate is missing."""
     ekf = filtering.Filter(CONFIG)
 
-    def loss(numbers, velocity, variance=0.0):
+    def loss(numbers, velocity, missing=False):
         state = filtering.initial_state(ekf, jnp.eye(3), velocity, jnp.zeros(3))
-        gap = Gap(jnp.full(N, variance), jnp.zeros(N), jnp.ones(N))
+        gap = Gap(*jnp.zeros((2, N)), jnp.ones(N), jnp.full(N, missing))
         imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), gap)
         step = filtering.Step(imu, 0, 1, CONFIG, NOISE)
         after, outcome, _ = NonHolonomic(*numbers).update(state, step)
@@ -212,8 +213,8 @@ def test_derivatives_are_finite_at_rest_and_with_the_axis_ahead_upright():
     for velocity in (np.zeros(3), np.array([0.0, 100.0, 0.0]), np.array([10.0, 0.5, -0.2])):
         for pitch in (0.0, np.pi / 2, np.pi):
             numbers = np.array([*MOUNTED[:3], pitch, *MOUNTED[4:]])
-            for variance in (0.0, 1e-6):
-                slopes = gradient(numbers, velocity, variance)
+            for missing in (False, True):
+                slopes = gradient(numbers, velocity, missing)
                 assert all(np.isfinite(slope).all() for slope in slopes)
 
 
