@@ -176,12 +176,31 @@ def test_wheels_show_the_speed_ahead():
         (lambda time, speed: (time + 1e9, speed), "no two stamps are within the 0.5 s of the IMU"),
         (lambda time, speed: (time[::-1], speed), "time: does not increase"),
         (lambda time, speed: (time, speed[1:]), r"must be \(f,\), found"),
+        (lambda time, speed: (time[:0], speed[:0]), "no two stamps are within"),
     ],
 )
 def test_a_speed_that_cannot_be_is_refused(change, words):
     rows = change(np.linspace(0.0, 1.0, 11), np.full(11, 30.0))
     with pytest.raises(InputError, match=rf"^wheel speed: .*{words}"):
         filtering.speeds_on_intervals(*rows, 5, CONFIG, MOUNTED)
+
+
+@pytest.mark.parametrize(
+    "numbers, words",
+    [
+        ({"std": 0.0}, "std: found 0; it must be positive and finite"),
+        ({"std": -1.0}, "std: found -1; it must be"),
+        ({"std": np.nan}, "std: found nan; it must be"),
+        ({"mounting": MOUNTED._replace(yaw=np.nan)}, "yaw: found nan; it must be finite"),
+        ({"mounting": MOUNTED._replace(lever_z=np.inf)}, "lever_z: found inf; it must be finite"),
+        ({"intervals": 0}, "intervals: found 0; give"),
+    ],
+)
+def test_numbers_with_which_no_speed_would_be_measured_are_refused(numbers, words):
+    rows = np.linspace(0.0, 1.0, 11), np.full(11, 30.0)
+    arguments = {"intervals": 5, "config": CONFIG, "mounting": MOUNTED, **numbers}
+    with pytest.raises(InputError, match=f"^wheel speed: {words}"):
+        filtering.speeds_on_intervals(*rows, **arguments)
 
 
 def test_no_velocity_is_measured_where_the_rate_is_missing():

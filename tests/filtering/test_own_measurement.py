@@ -136,6 +136,9 @@ def test_known_displacements_are_those_of_the_filter():
         x, y, z = position[new] - position[old]
         np.testing.assert_allclose(displacements[k], [c * x + s * y, c * y - s * x, z], atol=1e-12)
     assert np.isnan(filtering.displacements(rotations[:3], position[:3], CONFIG)).all()
+    for rows in ((rotations[:0], position[:0]), (rotations[:3], position[:2])):
+        with unchecked(), pytest.raises(ValueError, match=r"^rotation and position: must be \(K"):
+            filtering.displacements(*rows, CONFIG)
 
 
 class Ahead(NamedTuple):
