@@ -50,9 +50,10 @@ class WheelSpeed(NamedTuple):
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         dtype = state.offset.dtype
         row = [jnp.asarray(part, dtype) for part in self]
-        present = jnp.isfinite(row[0]) & jnp.isfinite(row[1]) & (row[1] > 0)
-        speed, std = (jnp.where(present, part, 1.0) for part in row[:2])
-        ahead, lever = row[2][None], row[3]
+        present = jnp.isfinite(jnp.hstack(row)).all() & (row[1] > 0)
+        # No NaN may enter the arithmetic, because otherwise the derivatives would be NaN too.
+        speed, std, ahead, lever = (jnp.where(present, part, 1.0) for part in row)
+        ahead = ahead[None]
         velocity, measured = velocity_of_point(state, step, lever)
         residual = speed - matmul(ahead, velocity[:, None])[0, 0]
         of_velocity = matmul(ahead, state.rotation.T)

@@ -203,6 +203,27 @@ def test_numbers_with_which_no_speed_would_be_measured_are_refused(numbers, word
         filtering.speeds_on_intervals(*rows, **arguments)
 
 
+def test_a_speed_of_which_a_number_is_missing_is_none_and_has_derivatives():
+    row = filtering.WheelSpeed(9.0, 0.3, np.array([1.0, 0.0, 0.0]), np.array([0.5, 0.1, 0.2]))
+    ekf = filtering.Filter(CONFIG)
+    step = filtering.Step(Imu(jnp.ones((N, 3)), jnp.zeros((N, 3)), None), 0, 1, CONFIG, NOISE)
+
+    @quick
+    @functools.partial(jax.value_and_grad, has_aux=True)
+    def loss(velocity, row):
+        state = filtering.initial_state(ekf, jnp.eye(3), velocity, jnp.zeros(3))
+        after, outcome, _ = row.update(state, step)
+        return jnp.sum(after.velocity**2) + outcome.nis, outcome.present
+
+    velocity = np.array([8.0, 0.2, 0.1])
+    assert bool(loss(velocity, row)[0][1])
+    for field in row._fields:
+        lacking = row._replace(**{field: np.nan * getattr(row, field)})
+        (_, present), slope = loss(velocity, lacking)
+        assert not bool(present), field
+        np.testing.assert_allclose(slope, 2 * velocity, err_msg=field)
+
+
 def test_no_velocity_is_measured_where_the_rate_is_missing():
     gap = Gap(*jnp.zeros((2, N)), jnp.ones(N), jnp.zeros(N, bool))
     imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), gap)
