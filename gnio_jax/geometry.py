@@ -175,15 +175,17 @@ def level(up: Vector) -> Matrix:
     body, to the world's z.
 
     If the body's x axis is vertical, its yaw is undefined, and the body's y axis gets the direction
-    of the world's y.
+    of the world's y. If `up` is zero, the rotation is the identity with zero derivative.
     """
-    z = up / jnp.sqrt(jnp.sum(up * up))
+    length_squared = jnp.sum(up * up)
+    defined = length_squared > 0
+    z = jnp.where(defined, up, jnp.array([0.0, 0.0, 1.0], up.dtype))
+    z = z / jnp.sqrt(jnp.where(defined, length_squared, 1.0))
     along = jnp.array([1.0, 0.0, 0.0], up.dtype) - z[0] * z  # the body's x axis, made horizontal
     squared = jnp.sum(along * along)
     vertical = squared < 1e-12
-    x = jnp.where(vertical, jnp.array([0.0, 0.0, 1.0], up.dtype) - z[2] * z, along) / jnp.sqrt(
-        jnp.where(vertical, 1.0, squared)
-    )
+    across = _GENERATORS[1].astype(up.dtype) @ z  # y × z for the body's y axis
+    x = jnp.where(vertical, across, along) / jnp.sqrt(jnp.where(vertical, 1.0, squared))
     return jnp.stack([x, hat(z) @ x, z])
 
 

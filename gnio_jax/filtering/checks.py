@@ -21,11 +21,14 @@ from jaxtyping import Int
 
 from gnio_jax.config.files import bounds, iterate_settings
 from gnio_jax.config.schema import Bound
+from gnio_jax.filtering.barometer import Barometer
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.fix import THRESHOLDS, Fix, improper_covariances
+from gnio_jax.filtering.magnetometer import Magnetometer
 from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
 from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_error
+from gnio_jax.filtering.wheel_speed import WheelSpeed
 from gnio_jax.numerics import finite_rows
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
 
@@ -275,6 +278,11 @@ def check_filter(ekf: Any) -> None:
     if len(ekf.noise.std_factor) != 3:
         raise ValueError("ekf.noise.std_factor: must be three numbers, for x, y and z")
     check_measurements("ekf.measurements", ekf.measurements)
+    for number, measurement in enumerate(ekf.measurements):
+        of_sensor = isinstance(measurement, Barometer | Fix | Magnetometer | WheelSpeed)
+        if of_sensor and min(map(np.ndim, measurement)) > 0:
+            problem = f"{type(measurement).__name__} has rows; pass it as `measurements` of the run"
+            raise ValueError(f"ekf.measurements[{number}]: {problem}")
 
 
 def converted_filter(ekf: Filter, dtype: Any) -> Filter:

@@ -210,8 +210,14 @@ def displacements(
     rotation (K + 1, 3, 3) body → world and position (K + 1, 3), m, are those at the start and at
     the end of each clone interval: every n-th row of a reference at the rate of the IMU. Row k of
     the K rows is from clone k − W to clone k, the rows k + 1 − W and k + 1 of the trajectory,
-    expressed in the yaw frame of clone k − W; NaN for k < W, before there are W + 1 clones.
+    expressed in the yaw frame of clone k − W; NaN for k < W, before there are W + 1 clones. Raises
+    `ValueError` if there is no row, or the two have not the same number of rows.
     """
+    if not len(rotation) == len(position) > 0:
+        shapes = f"{np.shape(rotation)} and {np.shape(position)}"
+        raise ValueError(
+            f"rotation and position: must be (K + 1, 3, 3) and (K + 1, 3), found {shapes}"
+        )
     window = config.clones_per_window
     displacement = np.full((len(position) - 1, 3), np.nan)
     measured = max(len(displacement) - window, 0)

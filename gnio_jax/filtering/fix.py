@@ -24,6 +24,7 @@ from jax.scipy.special import erfc, ndtri
 from jaxtyping import Bool, Float
 
 from gnio_jax.errors import InputError
+from gnio_jax.filtering.readings import interval_ends
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure, whiten
@@ -162,7 +163,7 @@ def fixes_on_intervals(
 
     Raises:
         InputError: A shape differs, a covariance is not symmetric and positive definite, a
-            `time_std` is below 0, or a fix is outside of the recording.
+            `time_std` is below 0, a fix is outside of the recording, or there is no interval.
     """
     time, position, covariance = (np.asarray(x, np.float64) for x in (time, position, covariance))
     count, axes = position.shape if position.ndim == 2 else (-1, 0)
@@ -175,7 +176,7 @@ def fixes_on_intervals(
     used = np.isfinite(position).any(axis=1)
     time, position, covariance = time[used], position[used], covariance[used]
     time_std = np.broadcast_to(np.asarray(time_std, np.float64), used.shape)[used]
-    after, end = time - start, intervals * config.clone_seconds
+    after, end = time - start, interval_ends("fixes", intervals, config, 0.0)[-1]
     outside = time[~((after >= -1e-6) & (after < end + config.clone_seconds))]
     if len(outside):
         problem = f"{len(outside)} of {count} are outside of the recording, one at {outside[0]:g} s"

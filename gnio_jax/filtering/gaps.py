@@ -36,6 +36,9 @@ class Gap(NamedTuple):
     """The same of the accelerometer, (m/s²)²."""
     used: Float[Array, "*n"]
     """1, or 0 where the filter coasts."""
+    missing: Bool[Array, "*n"]
+    """Whether the filter holds an older sample or coasts. The variances do not tell it, because the
+    settings may make them 0."""
 
 
 class Imu(NamedTuple):
@@ -57,7 +60,8 @@ class Imu(NamedTuple):
 
 def no_gap(n: int, dtype: np.dtype) -> Gap:
     """The gap of n samples where none is missing."""
-    return Gap(np.zeros(n, dtype), np.zeros(n, dtype), np.ones(n, dtype))
+    zeros = np.zeros(n, dtype)
+    return Gap(zeros, zeros, np.ones(n, dtype), np.zeros(n, bool))
 
 
 def after_window(
@@ -72,8 +76,8 @@ def after_window(
     rows = jnp.concatenate([before, jnp.concatenate([stream.gyro, stream.accel, used], axis=1)])
     gap = None
     if window is not None or stream.gap is not None:
-        zeros = jnp.zeros(len(rows), dtype)
-        gap = Gap(zeros, zeros, rows[:, 6])
+        # Only `used` of the samples before the stream is remembered, and windows read nothing else.
+        gap = no_gap(len(rows), dtype)._replace(used=rows[:, 6])
     return Imu(rows[:, :3], rows[:, 3:6], gap), rows[-reach:]
 
 
@@ -115,6 +119,7 @@ def bridge(
         gyro_variance=variance * config.gap_gyro_std**2,
         accel_variance=variance * config.gap_accel_std**2,
         used=jnp.where(coasting, 0.0, 1.0).astype(gyro.dtype),
+        missing=age > 0,
     )
     after = memory._replace(
         gyro=jnp.where(begun[-1], gyro[-1], jnp.nan),

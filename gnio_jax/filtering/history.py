@@ -138,6 +138,24 @@ class StepRecord(NamedTuple):
     diagnostics: dict[str, Array]
 
 
+def diagonals(covariance: Array) -> Float[Array, "k 15"]:
+    """The diagonals of K covariances (K, 15, 15), or of K diagonals."""
+    return jnp.diagonal(covariance, axis1=1, axis2=2) if covariance.ndim == 3 else covariance
+
+
+def healthy_rows(
+    mean: Mean, covariance: Array, healthy: Bool[Array, ""], config: FilterConfig
+) -> Bool[Array, "k"]:
+    """`FilterHistory.healthy` of K means and covariances (K, 15, 15), or their diagonals, from a
+    state that was `healthy` or not."""
+    parts = (*mean, covariance)
+    finite = [jnp.all(jnp.isfinite(part), axis=tuple(range(1, part.ndim))) for part in parts]
+    possible = jnp.sum(mean.velocity**2, axis=1) <= config.speed_limit**2
+    positive = jnp.all(diagonals(covariance) >= 0, axis=1)
+    sound = jnp.all(jnp.stack(finite), axis=0) & positive & possible
+    return healthy & (jnp.cumsum(~sound) == 0)
+
+
 def finished_history(
     records: StepRecord, imu_gap: Float[Array, "k"], healthy: Bool[Array, ""], config: FilterConfig
 ) -> FilterHistory:
@@ -152,19 +170,13 @@ def finished_history(
 
     # S is the identity where there is no measurement, so that the logarithm has a derivative there.
     log_likelihood = -0.5 * (update.nis + 3 * math.log(2 * math.pi)) - jnp.log(update.volume)
-    diagonal = jnp.diagonal(covariance, axis1=1, axis2=2) if whole else covariance
-
-    parts = (*records.mean, covariance)
-    finite = [jnp.all(jnp.isfinite(part), axis=tuple(range(1, part.ndim))) for part in parts]
-    possible = jnp.sum(records.mean.velocity**2, axis=1) <= config.speed_limit**2
-    sound = jnp.all(jnp.stack(finite), axis=0) & jnp.all(diagonal >= 0, axis=1) & possible
-    healthy = healthy & (jnp.cumsum(~sound) == 0)
+    healthy = healthy_rows(records.mean, covariance, healthy, config)
     return FilterHistory(
         *records.mean,
         displacement=where_present(records.displacement.displacement),
         measurement_covariance=where_present(records.displacement.covariance),
         innovation=where_present(update.residual),
-        covariance_diagonal=diagonal,
+        covariance_diagonal=diagonals(covariance),
         covariance=covariance if whole else None,
         accepted=where_present(update.accepted),
         gate_passed=where_present(update.weight),

@@ -22,9 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.config.schema import ABOVE_ZERO, NOT_NEGATIVE
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.readings import (
     ONE_DEGREE,
+    check_numbers,
     finite_readings,
     interval_ends,
     readings_at,
@@ -173,6 +175,7 @@ def fit_field(
         time: (f,) increasing stamps, s, on the clock of `start`.
         field: (f, 3) readings in the body, µT. Those that are not finite are none.
         rotation: (K, 3, 3) attitudes at the ends of the intervals, of a run without a magnetometer.
+            From the first one on that is not finite no reading takes part in the fit.
         config: The settings of the filter, for the length of an interval.
         start: Stamp of the first IMU sample, s.
         std: Standard deviation σ of the direction, rad, with its correlation in time.
@@ -181,18 +184,25 @@ def fit_field(
         bias_std: Standard deviation of an axis of the gyro's bias, rad/s; 0: it is known.
 
     Raises:
-        InputError: Shapes do not fit, the unit is not µT, stamps do not increase, or hardly any
-            reading is within the recording.
+        InputError: Shapes do not fit, the unit is not µT, stamps do not increase, hardly any
+            reading is within the recording, an attitude of the beginning is not finite, or a
+            standard deviation is impossible.
     """
     time, field, rotation = (np.asarray(part, np.float64) for part in (time, field, rotation))
     if time.ndim != 1 or field.shape != (len(time), 3) or rotation.shape[1:] != (3, 3):
         shapes = f"found {time.shape}, {field.shape} and {rotation.shape}"
         problem = "time, field and rotation must be (f,), (f, 3) and (K, 3, 3)"
         raise InputError("magnetometer", f"{problem}, {shapes}", "pass one row for each stamp")
+    check_numbers("magnetometer", ABOVE_ZERO, std=std)
+    check_numbers("magnetometer", NOT_NEGATIVE, bias_std=bias_std)
     time, field = finite_readings("magnetometer", time, field)
-    ends = interval_ends(len(rotation), config, start)
+    ends = interval_ends("magnetometer", len(rotation), config, start)
     at_ends = readings_at(ends, time, field)
-    present = np.isfinite(at_ends[:, 0])
+    healthy = np.logical_and.accumulate(np.isfinite(rotation).all(axis=(1, 2)))
+    if not healthy[ends <= start + first_seconds].all():
+        problem = f"rotation: not all attitudes of the first {first_seconds:g} s are finite"
+        raise InputError("magnetometer", problem, "pass those of a run that is healthy")
+    present = np.isfinite(at_ends[:, 0]) & healthy
     first = present & (ends <= start + first_seconds)
     if first.sum() < 10:
         problem = f"time: only {first.sum()} of the first {first_seconds:g} s have a reading"

@@ -113,7 +113,7 @@ def velocity_of_point(
     """Rᵀ v + (ω − b_g) × l with the last sample of the interval, and whether this was measured."""
     rate, present = step.imu.gyro[-1] - state.gyro_bias, jnp.bool_(True)
     if step.imu.gap is not None:
-        present = step.imu.gap.gyro_variance[-1] == 0
+        present = ~step.imu.gap.missing[-1]
     velocity = matmul(state.rotation.T, state.velocity[:, None])[:, 0] + jnp.cross(rate, lever)
     return velocity, present
 

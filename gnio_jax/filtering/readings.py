@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.config.schema import Bound
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.settings import FilterConfig
 
@@ -14,8 +15,22 @@ ONE_DEGREE = 6.635
 """99 % of χ² with one degree of freedom."""
 
 
-def interval_ends(intervals: int, config: FilterConfig, start: float) -> Float[np.ndarray, "k"]:
-    """Stamps of the ends of the clone intervals, s; `start` is that of the first IMU sample."""
+def check_numbers(sensor: str, limit: Bound, **numbers: float) -> None:
+    """Raises `InputError` naming the sensor for the first number beyond the limit: in its rows it
+    would mean that there is no measurement."""
+    for name, number in numbers.items():
+        if not limit.holds(number):
+            raise InputError(sensor, f"{name}: found {number:g}", f"it {limit.problem}")
+
+
+def interval_ends(
+    sensor: str, intervals: int, config: FilterConfig, start: float
+) -> Float[np.ndarray, "k"]:
+    """Stamps of the ends of the clone intervals, s; `start` is that of the first IMU sample. Raises
+    `InputError` naming the sensor if there is no interval."""
+    if not intervals > 0:
+        remedy = "give the number of clone intervals of the run, at least 1"
+        raise InputError(sensor, f"intervals: found {intervals}", remedy)
     return start + config.clone_seconds * np.arange(1, intervals + 1)
 
 
@@ -24,7 +39,7 @@ def finite_readings(
 ) -> tuple[Float[np.ndarray, "g"], Float[np.ndarray, "g *w"]]:
     """The readings that are finite. Raises `InputError` naming the sensor if their stamps do not
     increase."""
-    finite = np.isfinite(time) & np.isfinite(values).reshape(len(time), -1).all(axis=1)
+    finite = np.isfinite(time) & np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
     if not (np.diff(time[finite]) > 0).all():
         raise InputError(sensor, "time: does not increase", "sort its rows by their stamps")
     return time[finite], values[finite]

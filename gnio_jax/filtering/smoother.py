@@ -47,7 +47,7 @@ from gnio_jax.filtering.checks import (
 )
 from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.filter import Filter
-from gnio_jax.filtering.history import StepRecord
+from gnio_jax.filtering.history import StepRecord, healthy_rows
 from gnio_jax.filtering.propagation import Transition, put
 from gnio_jax.filtering.scan import StepTrace, clone_steps, take_row
 from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
@@ -78,6 +78,9 @@ class SmoothedHistory(NamedTuple):
     accel_bias: Float[Array, "k 3"]
     covariance_diagonal: Float[Array, "k 15"]
     covariance: Float[Array, "k 15 15"] | None
+    healthy: Float[Array, "k"]
+    """That of the filter's run, 0 from the first row on that is impossible. The measurements of
+    all rows correct each smoothed row, so a 0 anywhere makes all rows invalid."""
 
 
 def smooth(
@@ -173,7 +176,9 @@ def _smooth(
     backward = functools.partial(_step_back, config=config)
     _, (mean, covariance) = jax.lax.scan(backward, nothing, steps, reverse=True)
     diagonal = jnp.diagonal(covariance, axis1=1, axis2=2)
-    return SmoothedHistory(*mean, diagonal, covariance if config.history == "core" else None)
+    healthy = healthy_rows(steps.mean, steps.covariance, inputs.state.healthy, config)
+    whole = covariance if config.history == "core" else None
+    return SmoothedHistory(*mean, diagonal, whole, healthy.astype(dtype))
 
 
 def _step_back(

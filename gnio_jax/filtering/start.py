@@ -54,6 +54,8 @@ REST_SECONDS = 1.0
 """Shortest rest that gives a bias, s; the tilt is also taken from this time."""
 LEAST_GRAVITY = 0.5 * GRAVITY
 """A mean acceleration below this does not show the vertical, m/s² (ours)."""
+_LEAST_ERROR = 1e-6
+"""Least standard deviation of the mean acceleration, m/s²."""
 
 
 # The arguments of the public functions have no shapes for the run-time checker: a wrong shape is
@@ -118,7 +120,7 @@ def level_state(ekf: Filter, gyro: Any, accel: Any) -> FilterState:
     one independent sample per half second. That of the velocity is proportional to this spread,
     from 0.05 m/s on a table to 1 m/s for a walker. The yaw is zero by definition, so it keeps that
     of `ekf.start`. Raises `ValueError` naming an argument of wrong shape or precision, that is not
-    finite, or that shows no gravity.
+    finite, or that shows no gravity; inside `jax.jit` the attitude is then NaN.
     """
     check_filter(ekf)
     config, std = ekf.config, ekf.start
@@ -156,10 +158,11 @@ def _level(
     accel = jnp.where(quiet, accel, jnp.einsum("ijn,nj->ni", attitudes, accel))
     variance, up = jnp.sum(jnp.var(accel, axis=0)), accel.mean(0)
     independent = max(1.0, 2 * len(gyro) * config.dt)
-    mean_error = jnp.sqrt(bias_std**2 + variance / independent)
-    # The value is bounded before the root, whose slope at zero is infinite.
+    # Both values are bounded before the root, whose slope at zero is infinite.
+    mean_error = jnp.maximum(bias_std**2 + variance / independent, _LEAST_ERROR**2)
     velocity = jnp.clip(_SPEED_OF_SPREAD**2 * variance, _STILL_STD**2, _MOVING_STD**2)
-    return geometry.level(up), gyro_bias, mean_error / GRAVITY, jnp.sqrt(velocity), up
+    rotation = jnp.where(jnp.sum(up**2) < LEAST_GRAVITY**2, jnp.nan, geometry.level(up))
+    return rotation, gyro_bias, jnp.sqrt(mean_error) / GRAVITY, jnp.sqrt(velocity), up
 
 
 class Rest(NamedTuple):

@@ -32,7 +32,6 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -160,7 +159,7 @@ def linearise(state: FilterState, residual: Any, covariance: Any, **jacobian: An
     """A measurement with the residual r (m,) and the covariance R (m, m), in the state's precision.
 
     `jacobian` has the blocks (m, 3) of H, the derivative of the predicted value, by the names of
-    `PARTS`; blocks that are left out are zero. Raises `ValueError` for another name.
+    `PARTS`; blocks that are left out are zero. Raises `ValueError` for another name or shape.
     """
     if unknown := set(jacobian) - set(PARTS):
         raise ValueError(f"linearise: {min(unknown)}: is none of {', '.join(PARTS)}")
@@ -170,10 +169,16 @@ def linearise(state: FilterState, residual: Any, covariance: Any, **jacobian: An
         {name: jnp.asarray(block, dtype) for name, block in jacobian.items()},
         jnp.asarray(covariance, dtype),
     )
-    rows = linear.residual.shape[0]
-    for name, block in linear.jacobian.items():
-        chex.assert_shape(block, (rows, 3), custom_message=f"linearise: {name}")
-    chex.assert_shape(linear.covariance, (rows, rows), custom_message="linearise: covariance")
+    if linear.residual.ndim != 1:
+        problem = f"the shape must be (m,), found {linear.residual.shape}"
+        remedy = "a measurement with rows is one of the `measurements` of a run"
+        raise ValueError(f"linearise: residual: {problem}; {remedy}")
+    rows = len(linear.residual)
+    shapes = {"covariance": (rows, rows), **dict.fromkeys(linear.jacobian, (rows, 3))}
+    for name, value in {"covariance": linear.covariance, **linear.jacobian}.items():
+        if value.shape != shapes[name]:
+            problem = f"the shape must be {shapes[name]}, found {value.shape}"
+            raise ValueError(f"linearise: {name}: {problem}")
     return linear
 
 

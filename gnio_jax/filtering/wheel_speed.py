@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.config.schema import ABOVE_ZERO, FINITE
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.nonholonomic import NonHolonomic, car_axes, velocity_of_point
 from gnio_jax.filtering.readings import (
     ONE_DEGREE,
+    check_numbers,
     finite_readings,
     interval_ends,
     scalars_at,
@@ -48,9 +50,10 @@ class WheelSpeed(NamedTuple):
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         dtype = state.offset.dtype
         row = [jnp.asarray(part, dtype) for part in self]
-        present = jnp.isfinite(row[0]) & jnp.isfinite(row[1]) & (row[1] > 0)
-        speed, std = (jnp.where(present, part, 1.0) for part in row[:2])
-        ahead, lever = row[2][None], row[3]
+        present = jnp.isfinite(jnp.hstack(row)).all() & (row[1] > 0)
+        # No NaN may enter the arithmetic, because otherwise the derivatives would be NaN too.
+        speed, std, ahead, lever = (jnp.where(present, part, 1.0) for part in row)
+        ahead = ahead[None]
         velocity, measured = velocity_of_point(state, step, lever)
         residual = speed - matmul(ahead, velocity[:, None])[0, 0]
         of_velocity = matmul(ahead, state.rotation.T)
@@ -86,15 +89,17 @@ def speeds_on_intervals(
         std: Standard deviation, m/s, with the slip and the radius of the wheels, whose errors last.
 
     Raises:
-        InputError: Shapes do not fit, no car is so fast, stamps do not increase, or no reading is
-            within the recording.
+        InputError: Shapes do not fit, no car is so fast, stamps do not increase, no reading is
+            within the recording, `std` is not above 0, or a number of the mounting is not finite.
     """
     time, speed = np.asarray(time, np.float64), np.asarray(speed, np.float64)
     if time.ndim != 1 or speed.shape != time.shape:
         problem = f"time and speed must be (f,), found {time.shape} and {speed.shape}"
         raise InputError("wheel speed", problem, "pass one speed for each stamp")
+    check_numbers("wheel speed", ABOVE_ZERO, std=std)
+    check_numbers("wheel speed", FINITE, **mounting._asdict())
     time, speed = finite_readings("wheel speed", time, speed)
-    ends = interval_ends(intervals, config, start)
+    ends = interval_ends("wheel speed", intervals, config, start)
     at_ends = scalars_at("wheel speed", ends, time, speed, start)
     if not (fastest := np.abs(speed).max()) <= FASTEST_CAR:
         problem = f"speed: {fastest:.4g} m/s is beyond a car"

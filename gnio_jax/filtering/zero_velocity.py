@@ -69,7 +69,7 @@ def detect_rest(
     """
     quiet = is_quiet(*unbiased_output(imu, state), config)
     if imu.gap is not None:
-        quiet = quiet & jnp.all(imu.gap.gyro_variance == 0)
+        quiet = quiet & jnp.all(~imu.gap.missing)
     count = jnp.where(quiet, state.imu.quiet + 1, 0).astype(state.imu.quiet.dtype)
     enough = intervals_of(config.rest_seconds, config)
     return state._replace(imu=state.imu._replace(quiet=count)), count >= enough

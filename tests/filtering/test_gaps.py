@@ -71,6 +71,7 @@ def test_holes_are_filled_with_the_last_sample(missing_before):
         imu.gap.accel_variance, np.array(variances) * CONFIG.gap_accel_std**2
     )
     np.testing.assert_array_equal(imu.gap.used, np.array(ages) <= 3)
+    np.testing.assert_array_equal(imu.gap.missing, ~good)
     assert after.missing == 1 and (after.gyro == gyro[28]).all()
     # A gap across two streams is one gap.
     first, age_of_first, between = bridge(gyro[:15], accel[:15], valid[:15], memory, CONFIG)
@@ -164,6 +165,22 @@ def test_a_short_hole_is_bridged_a_long_one_costs_certainty():
     assert (off[39:] < 4 * np.sqrt(sigma[39:, 3:6] ** 2 + before[39:, 3:6] ** 2)).all()
 
 
+def test_a_held_sample_measures_nothing_where_a_hole_adds_no_uncertainty():
+    """A carrier at 2 m/s sideways, whose last sample is quiet, neither rests nor is measured in the
+    hole, whatever variance the settings give its samples."""
+    config = dataclasses.replace(CONFIG, gap_gyro_std=0.0, gap_accel_std=0.0)
+    constraints = filtering.ZeroVelocity(), filtering.NonHolonomic()
+    ekf = filtering.Filter(config, NOISE, measurements=constraints)
+    state = filtering.initial_state(ekf, np.eye(3), np.array([0.0, 2.0, 0.0]), np.zeros(3))
+    accel = np.tile([0.0, 0.0, 9.81], (10 * N, 1))
+    accel[:N, 0] = 4.0
+    no_rows = np.full((10, 3), np.nan), np.tile(np.eye(3), (10, 1, 1))
+    valid = np.arange(10 * N) < N
+    _, history = filtering.run_filter(ekf, state, np.zeros_like(accel), accel, *no_rows, valid)
+    assert not np.any(history.outcomes["zero_velocity"].present)
+    np.testing.assert_array_equal(history.outcomes["nonholonomic"].present, np.arange(10) == 0)
+
+
 def test_the_error_coasts_with_the_mean():
     """Φ by differences of a mean that neither turns nor accelerates at the samples that are not
     used, whatever the biases are."""
@@ -178,7 +195,7 @@ def test_the_error_coasts_with_the_mean():
             x = moved if use else (*x[:2], x[2] + x[1] * DT, *x[3:])
         return x
 
-    gap = gaps.Gap(np.zeros(N), np.zeros(N), used)
+    gap = gaps.Gap(np.zeros(N), np.zeros(N), used, used == 0)
     interval = jax.jit(integrate, static_argnames="dt")(
         Mean(*pose), gaps.Imu(gyro, accel, gap), NOISE, dt=DT
     )

@@ -201,6 +201,7 @@ def test_wheels_show_the_speed_ahead():
         (lambda time, speed: (time + 1e9, speed), "no two stamps are within the 0.5 s of the IMU"),
         (lambda time, speed: (time[::-1], speed), "time: does not increase"),
         (lambda time, speed: (time, speed[1:]), r"must be \(f,\), found"),
+        (lambda time, speed: (time[:0], speed[:0]), "no two stamps are within"),
     ],
 )
 def test_a_speed_that_cannot_be_is_refused(change, words):
@@ -209,9 +210,49 @@ def test_a_speed_that_cannot_be_is_refused(change, words):
         filtering.speeds_on_intervals(*rows, 5, CONFIG, MOUNTED)
 
 
+@pytest.mark.parametrize(
+    "numbers, words",
+    [
+        ({"std": 0.0}, "std: found 0; it must be positive and finite"),
+        ({"std": -1.0}, "std: found -1; it must be"),
+        ({"std": np.nan}, "std: found nan; it must be"),
+        ({"mounting": MOUNTED._replace(yaw=np.nan)}, "yaw: found nan; it must be finite"),
+        ({"mounting": MOUNTED._replace(lever_z=np.inf)}, "lever_z: found inf; it must be finite"),
+        ({"intervals": 0}, "intervals: found 0; give"),
+    ],
+)
+def test_numbers_with_which_no_speed_would_be_measured_are_refused(numbers, words):
+    rows = np.linspace(0.0, 1.0, 11), np.full(11, 30.0)
+    arguments = {"intervals": 5, "config": CONFIG, "mounting": MOUNTED, **numbers}
+    with pytest.raises(InputError, match=f"^wheel speed: {words}"):
+        filtering.speeds_on_intervals(*rows, **arguments)
+
+
+def test_a_speed_of_which_a_number_is_missing_is_none_and_has_derivatives():
+    row = filtering.WheelSpeed(9.0, 0.3, np.array([1.0, 0.0, 0.0]), np.array([0.5, 0.1, 0.2]))
+    ekf = filtering.Filter(CONFIG)
+    step = filtering.Step(Imu(jnp.ones((N, 3)), jnp.zeros((N, 3)), None), 0, 1, CONFIG, NOISE)
+
+    @quick
+    @functools.partial(jax.value_and_grad, has_aux=True)
+    def loss(velocity, row):
+        state = filtering.initial_state(ekf, jnp.eye(3), velocity, jnp.zeros(3))
+        after, outcome, _ = row.update(state, step)
+        return jnp.sum(after.velocity**2) + outcome.nis, outcome.present
+
+    velocity = np.array([8.0, 0.2, 0.1])
+    assert bool(loss(velocity, row)[0][1])
+    for field in row._fields:
+        lacking = row._replace(**{field: np.nan * getattr(row, field)})
+        (_, present), slope = loss(velocity, lacking)
+        assert not bool(present), field
+        np.testing.assert_allclose(slope, 2 * velocity, err_msg=field)
+
+
 def test_no_velocity_is_measured_where_the_rate_is_missing():
-    imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), Gap(*jnp.zeros((2, N)), jnp.ones(N)))
-    held = imu._replace(gap=imu.gap._replace(gyro_variance=jnp.zeros(N).at[-1].set(1e-6)))
+    gap = Gap(*jnp.zeros((2, N)), jnp.ones(N), jnp.zeros(N, bool))
+    imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), gap)
+    held = imu._replace(gap=gap._replace(missing=jnp.arange(N) == N - 1))
     ekf = filtering.Filter(CONFIG)
     state = filtering.initial_state(ekf, np.eye(3), np.ones(3), np.zeros(3))
     for samples, present in ((imu, True), (held, False)):
@@ -222,12 +263,12 @@ def test_no_velocity_is_measured_where_the_rate_is_missing():
 
 
 def test_derivatives_are_finite_at_rest_and_with_the_axis_ahead_upright():
-    """Also where the measurement is refused, and where the rate is missing (variance above 0)."""
+    """Also where the measurement is refused, and where the rate is missing."""
     ekf = filtering.Filter(CONFIG)
 
-    def loss(numbers, velocity, variance=0.0):
+    def loss(numbers, velocity, missing=False):
         state = filtering.initial_state(ekf, jnp.eye(3), velocity, jnp.zeros(3))
-        gap = Gap(jnp.full(N, variance), jnp.zeros(N), jnp.ones(N))
+        gap = Gap(*jnp.zeros((2, N)), jnp.ones(N), jnp.full(N, missing))
         imu = Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), gap)
         step = filtering.Step(imu, 0, 1, CONFIG, NOISE)
         after, outcome, _ = NonHolonomic(*numbers).update(state, step)
@@ -237,8 +278,8 @@ def test_derivatives_are_finite_at_rest_and_with_the_axis_ahead_upright():
     for velocity in (np.zeros(3), np.array([0.0, 100.0, 0.0]), np.array([10.0, 0.5, -0.2])):
         for pitch in (0.0, np.pi / 2, np.pi):
             numbers = np.array([*MOUNTED[:3], pitch, *MOUNTED[4:]])
-            for variance in (0.0, 1e-6):
-                slopes = gradient(numbers, velocity, variance)
+            for missing in (False, True):
+                slopes = gradient(numbers, velocity, missing)
                 assert all(np.isfinite(slope).all() for slope in slopes)
 
 

@@ -110,6 +110,36 @@ def test_rows_that_are_missing_are_refused_by_name():
         filtering.linearise(start(), [0.0], [[1.0]], height=[[0.0, 0.0, 1.0]])
 
 
+def test_shapes_that_are_none_of_a_measurement_are_refused_by_name():
+    up = [[0.0, 0.0, 1.0]]
+    for words, residual, spread, block in (
+        (r"residual: the shape must be \(m,\), found \(\); a measurement", 0.0, [[1.0]], up),
+        (r"residual: the shape must be \(m,\), found \(1, 1\); a", [[0.0]], [[1.0]], up),
+        (r"covariance: the shape must be \(1, 1\), found \(1,\)", [0.0], [1.0], up),
+        (r"position: the shape must be \(1, 3\), found \(3,\)", [0.0], [[1.0]], up[0]),
+    ):
+        with unchecked(), pytest.raises(ValueError, match=f"^linearise: {words}"):
+            filtering.linearise(start(), residual, spread, position=block)
+
+
+def test_rows_are_no_measurements_of_the_filter():
+    """A single row, which measures the same in every interval, is one."""
+    scalars, vectors = np.ones(INTERVALS), np.ones((INTERVALS, 3))
+    squares = np.tile(np.eye(3), (INTERVALS, 1, 1))
+    for measurement in (
+        filtering.Barometer(scalars, scalars, scalars),
+        filtering.Magnetometer(vectors, *4 * [scalars]),
+        filtering.WheelSpeed(scalars, scalars, vectors, vectors),
+        filtering.Fix(vectors, squares, *3 * [scalars]),
+    ):
+        name = type(measurement).__name__
+        words = rf"^ekf.measurements\[0\]: {name} has rows; pass it as `measurements` of the run"
+        with pytest.raises(ValueError, match=words):
+            filtering.initial_state(filtering.Filter(CONFIG, measurements=(measurement,)), *START)
+        row = jax.tree.map(lambda part: part[0], measurement)
+        filtering.initial_state(filtering.Filter(CONFIG, measurements=(row,)), *START)
+
+
 def test_a_frame_that_does_not_exist_is_refused():
     """With a word that is not known a place would be measured as if it turned with the carrier."""
     state = start()
@@ -136,6 +166,9 @@ def test_known_displacements_are_those_of_the_filter():
         x, y, z = position[new] - position[old]
         np.testing.assert_allclose(displacements[k], [c * x + s * y, c * y - s * x, z], atol=1e-12)
     assert np.isnan(filtering.displacements(rotations[:3], position[:3], CONFIG)).all()
+    for rows in ((rotations[:0], position[:0]), (rotations[:3], position[:2])):
+        with unchecked(), pytest.raises(ValueError, match=r"^rotation and position: must be \(K"):
+            filtering.displacements(*rows, CONFIG)
 
 
 class Ahead(NamedTuple):

@@ -147,15 +147,26 @@ def pressure_at(height):
     return 101325.0 * (1 - 0.0065 * height / 288.15) ** (9.80665 / (287.053 * 0.0065))
 
 
-def test_pressures_become_heights_above_the_first():
+def test_pressures_become_heights_above_the_start():
     time = 3.0 + np.arange(0, 25.0, 0.2)
     height = 200.0 + 0.5 * (time - 3.0)
     pressure = pressure_at(height)
     rows = filtering.barometer_on_intervals(time, pressure, INTERVALS, CONFIG, 3.0, 1.0, 0.5, 4.0)
-    # The height of the first two seconds is their median; the air at 200 m is 0.5 % thinner.
-    np.testing.assert_allclose(rows.height, 0.5 * ENDS - 0.525, atol=0.1)
+    # The air at 200 m is 0.5 % thinner.
+    np.testing.assert_allclose(rows.height, 0.5 * ENDS, rtol=0.01)
     np.testing.assert_allclose(rows.std**2, 1 + 0.25 * ENDS)
     assert (rows.start == 4.0).all()
+
+
+@pytest.mark.parametrize("first", [0.0, 2.1, 4.9])
+def test_heights_are_above_the_start_also_where_the_pressures_begin_later(first):
+    """The carrier climbs, and two of the first pressures are wrong."""
+    time = np.arange(first, 25.0, 0.1)
+    pressure = pressure_at(0.5 * time)
+    pressure[[0, 7]] += 1000.0
+    height = filtering.barometer_on_intervals(time, pressure, INTERVALS, CONFIG).height
+    inside = (ENDS > first + 1.0) & (ENDS < 24.0)
+    np.testing.assert_allclose(height[inside], 0.5 * ENDS[inside], atol=0.05)
 
 
 def test_pressures_of_once_a_second_are_interpolated():
@@ -210,6 +221,7 @@ MAGNETIC = [
     (lambda time, field: (time[::-1], field), "time: does not increase; sort"),
     (lambda time, field: (time, field[:-1]), r"must be \(f,\), \(f, 3\) and \(K, 3, 3\), found"),
     (lambda time, field: (time, np.nan * field), "0 of the first 30 s have a reading"),
+    (lambda time, field: (time[:0], field[:0]), "0 of the first 30 s have a reading"),
 ]
 BAROMETRIC = [
     (lambda time, pressure: (time, pressure / 100), "the median is 1013.2 Pa.*; multiply by 100"),
@@ -219,6 +231,11 @@ BAROMETRIC = [
     (lambda time, pressure: (np.zeros_like(time), pressure), "time: does not increase"),
     (lambda time, pressure: (time, pressure[:-1]), r"must be \(f,\), found"),
     (lambda time, pressure: (time, np.nan * pressure), "no two stamps are within"),
+    (lambda time, pressure: (time[:0], pressure[:0]), "no two stamps are within"),
+    (
+        lambda time, pressure: (time + 6.0, pressure),
+        r"begins 5\.9 s after the IMU.*; let it begin at",
+    ),
 ]
 
 
@@ -235,6 +252,49 @@ def test_a_pressure_that_cannot_be_is_refused(change, words):
     with pytest.raises(InputError, match=rf"^barometer: .*{words}"):
         rows = change(time, np.full(len(time), 101325.0))
         filtering.barometer_on_intervals(*rows, INTERVALS, CONFIG)
+
+
+@pytest.mark.parametrize(
+    "numbers, words",
+    [
+        ({"std": 0.0}, "std: found 0; it must be positive and finite"),
+        ({"std": -2.0}, "std: found -2; it must be positive"),
+        ({"std": np.nan}, "std: found nan; it must be positive"),
+        ({"std": np.inf}, "std: found inf; it must be positive"),
+        ({"walk": -0.1}, "walk: found -0.1; it must be finite and not negative"),
+        ({"walk": np.nan}, "walk: found nan; it must be"),
+        ({"start_height": np.nan}, "start_height: found nan; it must be finite"),
+        ({"intervals": 0}, "intervals: found 0; give"),
+    ],
+)
+def test_numbers_with_which_no_height_would_be_measured_are_refused(numbers, words):
+    time = np.arange(0.0, 25.0, 0.2)
+    arguments = {"intervals": INTERVALS, "config": CONFIG, **numbers}
+    with pytest.raises(InputError, match=f"^barometer: {words}"):
+        filtering.barometer_on_intervals(time, np.full(len(time), 101325.0), **arguments)
+
+
+def test_numbers_with_which_no_heading_would_be_measured_are_refused():
+    attitude = rotations(INTERVALS).as_matrix()
+    for numbers, words in (
+        *(({"std": std}, "std: found .*; it must be positive") for std in (0.0, -0.3, np.nan)),
+        *(({"bias_std": std}, "bias_std: found .*; it must be") for std in (-0.01, np.nan)),
+    ):
+        with pytest.raises(InputError, match=f"^magnetometer: {words}"):
+            filtering.fit_field(*readings(), attitude, CONFIG, 7.0, **numbers)
+
+
+def test_attitudes_that_are_not_finite_take_no_part_in_the_fit():
+    """Those of the beginning are needed. A run may have failed later."""
+    attitude = rotations(INTERVALS).as_matrix()
+    whole = filtering.fit_field(*readings(), attitude[:150], CONFIG, 7.0, first_seconds=10.0)
+    attitude[150:] = np.nan
+    fit = filtering.fit_field(*readings(), attitude, CONFIG, 7.0, first_seconds=10.0)
+    np.testing.assert_allclose(fit.rows.direction[0], whole.rows.direction[0], rtol=1e-12)
+    longer = filtering.fit_field(*readings(), attitude, CONFIG, 7.0, 0.3, 10.0, bias_std=0.1)
+    assert np.isfinite(longer.gyro_bias).all()
+    with pytest.raises(InputError, match=r"^magnetometer: rotation: not all attitudes"):
+        filtering.fit_field(*readings(), attitude, CONFIG, 7.0, first_seconds=18.0)
 
 
 def test_derivatives_are_finite_where_there_is_no_heading_or_no_reading():

@@ -1,5 +1,6 @@
 """Smoothing against batch least squares over all states at once."""
 
+import dataclasses
 import functools
 
 import jax
@@ -290,3 +291,22 @@ def test_a_gate_with_a_slope_and_rest_and_the_gradient_through_them():
     assert np.isfinite(value) and (np.abs(gradient) > 1e-3).all()
     expected = [(loss(x + e)[0][0] - loss(x - e)[0][0]) / 2e-3 for e in 1e-3 * np.eye(2)]
     np.testing.assert_allclose(gradient, expected, rtol=1e-4)
+
+
+def test_a_smoothed_run_says_where_its_filter_was_not_healthy():
+    """Beyond the largest speed, and from a state that was not healthy."""
+    _, start, *signals = walk(5)
+    config = dataclasses.replace(GATED, speed_limit=3.0)
+    ekf = filtering.Filter(config, NOISE)
+    state = filtering.initial_state(filtering.Filter(config, start=STD), *start)
+    fast = signals[1].copy()
+    fast[6 * N : 7 * N] += 30.0
+    ends = []
+    for first, accel in ((state, signals[1]), (state, fast)):
+        arguments = ekf, first, signals[0], accel, *signals[2:]
+        end, filtered = filtering.run_filter(*arguments)
+        np.testing.assert_array_equal(filtering.smooth(*arguments).healthy, filtered.healthy)
+        ends.append((end, int(np.sum(filtered.healthy))))
+    assert [count for _, count in ends] == [INTERVALS, 6]
+    smoothed = filtering.smooth(ekf, ends[1][0], *signals)
+    assert not np.any(smoothed.healthy) and np.isfinite(smoothed.position).all()

@@ -1,5 +1,7 @@
 """Starts without a reference."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -144,6 +146,24 @@ def test_level_state_refuses_accelerations_without_gravity():
         filtering.level_state(
             filtering.Filter(CONFIG), np.zeros((50, 3)), np.tile([0, 0, 1.0], (50, 1))
         )
+    # Inside jit the values are not known, and the history says that the start is not healthy.
+    start = jax.jit(functools.partial(filtering.level_state, filtering.Filter(CONFIG)))
+    for force in (0.0, 1.0):
+        assert np.isnan(start(np.zeros((50, 3)), np.tile([0, 0, force], (50, 1))).rotation).all()
+
+
+def test_a_level_start_has_derivatives_where_nothing_shows_an_uncertain_tilt():
+    """Without a bias of the accelerometer and without any spread of its samples."""
+
+    def tilt_variance(bias_std, force):
+        std = filtering.InitialStd(accel_bias=bias_std)
+        ekf, accel = filtering.Filter(CONFIG, start=std), jnp.tile(force[None], (50, 1))
+        return filtering.level_state(ekf, jnp.zeros((50, 3)), accel).core_covariance[0, 0]
+
+    force = jnp.array([0.0, 0.0, 9.81])
+    slopes = jax.grad(tilt_variance, (0, 1))(jnp.array(0.0), force)
+    assert all(np.isfinite(slope).all() for slope in slopes)
+    assert tilt_variance(0.0, force) < 1e-13
 
 
 def test_level_is_a_rotation_with_derivatives():
@@ -156,7 +176,11 @@ def test_level_is_a_rotation_with_derivatives():
         if abs(up[0]) < 0.99:
             np.testing.assert_allclose(rotation[1, 0], 0, atol=1e-12)
             assert rotation[0, 0] > 0
+        else:
+            np.testing.assert_allclose(rotation[:, 1], [0, 1, 0], atol=1e-12)
         assert np.isfinite(slope_of_level(up)).all()
+    np.testing.assert_array_equal(level(np.zeros(3)), np.eye(3))
+    np.testing.assert_array_equal(slope_of_level(np.zeros(3)), 0)
 
 
 def test_orthonormalize_is_the_nearest_rotation():

@@ -295,8 +295,9 @@ def test_the_covariance_without_a_prior_of_the_yaw_has_the_information_of_the_re
     prior[2, 2] = 1 / prior_std**2
     covariance = np.linalg.inv(information + prior)[None]
     zero = np.zeros((1, 3))
+    variance = np.diagonal(covariance, 0, 1, 2)
     history = filtering.SmoothedHistory(
-        np.eye(3)[None], zero, zero, zero, zero, np.diagonal(covariance, 0, 1, 2), covariance
+        np.eye(3)[None], zero, zero, zero, zero, variance, covariance, np.ones(1)
     )
     honest = smoothing._without_yaw_prior(history, prior_std)
     expected = np.linalg.inv(information)

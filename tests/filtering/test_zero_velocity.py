@@ -51,7 +51,7 @@ def test_rest_counts_only_after_its_time(seconds, intervals):
     config = dataclasses.replace(CONFIG, rest_seconds=seconds)
     turning = STILL._replace(gyro=STILL.gyro.at[2, 1].set(1.01 * config.rest_gyro))
     shaken = STILL._replace(accel=STILL.accel.at[3, 2].add(-1.01 * config.rest_accel))
-    held = STILL._replace(gap=Gap(jnp.zeros(N).at[-1].set(1e-6), jnp.zeros(N), jnp.ones(N)))
+    held = STILL._replace(gap=Gap(*jnp.zeros((2, N)), jnp.ones(N), jnp.arange(N) == N - 1))
     state = filtering.initial_state(filtering.Filter(config), np.eye(3), np.zeros(3), np.zeros(3))
     decisions, expected, count = [], [], 0
     for imu in [*5 * [STILL], turning, *5 * [STILL], shaken, *5 * [STILL], held, *5 * [STILL]]:
