@@ -159,10 +159,10 @@ def _level(
     variance, up = jnp.sum(jnp.var(accel, axis=0)), accel.mean(0)
     independent = max(1.0, 2 * len(gyro) * config.dt)
     # Both values are bounded before the root, whose slope at zero is infinite.
-    mean_error = jnp.maximum(bias_std**2 + variance / independent, _LEAST_ERROR**2)
+    mean_variance = jnp.maximum(bias_std**2 + variance / independent, _LEAST_ERROR**2)
     velocity = jnp.clip(_SPEED_OF_SPREAD**2 * variance, _STILL_STD**2, _MOVING_STD**2)
     rotation = jnp.where(jnp.sum(up**2) < LEAST_GRAVITY**2, jnp.nan, geometry.level(up))
-    return rotation, gyro_bias, jnp.sqrt(mean_error) / GRAVITY, jnp.sqrt(velocity), up
+    return rotation, gyro_bias, jnp.sqrt(mean_variance) / GRAVITY, jnp.sqrt(velocity), up
 
 
 class Rest(NamedTuple):
