@@ -62,7 +62,7 @@ class Piece(NamedTuple):
     """γ without its error, m/s²."""
 
 
-class Motion(NamedTuple):
+class PieceMotion(NamedTuple):
     """The best v_0 and γ of a piece for an axis ahead."""
 
     residuals: Float[np.ndarray, "k"]
@@ -147,10 +147,10 @@ def _piece(gyro: Float[np.ndarray, "n 3"], accel: Float[np.ndarray, "n 3"], rate
     return Piece(fixed, np.concatenate(slopes, axis=2), back, gravity)
 
 
-def _fit(piece: Piece, ahead: Float[np.ndarray, "3"]) -> Motion:
+def _fit(piece: Piece, ahead: Float[np.ndarray, "3"]) -> PieceMotion:
     aside = (np.eye(3) - np.outer(ahead, ahead)) / ACROSS_STD
     rows = np.concatenate([(aside @ piece.slopes).reshape(-1, 6), np.eye(6)])
     values = np.concatenate([(piece.fixed @ aside).ravel(), np.zeros(6)])
     x = np.linalg.solve(rows.T @ rows, -rows.T @ values)
     upward = -piece.back @ (piece.gravity + GRAVITY_STD * x[3:])
-    return Motion(values + rows @ x, piece.fixed + piece.slopes @ x, upward)
+    return PieceMotion(values + rows @ x, piece.fixed + piece.slopes @ x, upward)
