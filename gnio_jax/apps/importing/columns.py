@@ -18,7 +18,12 @@ from jaxtyping import Float, Num
 from gnio_jax.apps.importing import units
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.files import LogFile, files_of, log_file, spell_names
-from gnio_jax.apps.importing.readings import RawReadings, columns_of, readings_of
+from gnio_jax.apps.importing.readings import (
+    RawReadings,
+    columns_of,
+    leaving_out,
+    readings_of,
+)
 from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.config import ImportOptions
 from gnio_jax.data import labels
@@ -185,7 +190,7 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
         problem = f"has the layout of no known recording (found: {spell_names(files)})"
         remedy = "known: CSV, Sensor Logger, phyphox, ROS bags, MCAP and EuRoC folders"
         raise InputError(path, problem, f"{remedy}; a CSV of other columns needs --columns")
-    notes, sensors, track = list[str](), dict[str, Sensor](), None
+    notes, warnings, sensors, track = list[str](), list[str](), dict[str, Sensor](), None
     others = dict[str, RawReadings]()
     for group, (file,) in groups.items():
         log = _open_log(file, names, options.where, notes)
@@ -206,19 +211,23 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
             row = log.table.row
             sensors[sensor] = Sensor(sensor, file.path, stamps, values, row, second, unit)
         for sensor, labeled in columns_of(log.table.columns).items():
-            if not set(labeled.values()) & set(columns.values()):
-                new = readings_of(sensor, log.table, stamps, labeled, second)
-                others.setdefault(sensor, new)
+            if set(labeled.values()) & set(columns.values()):
+                continue
+            with leaving_out(sensor, warnings):
+                new = readings_of(sensor, log.table, stamps, labeled, texts=log.texts)
+                others.setdefault(sensor, new._replace(table_of=group[0]))
         if "gyro" in group:
             try:
                 track = _reference(log.table, names, sensors["gyro"], options.time_unit)
             except InputError as error:
                 notes.append(f"no reference is taken: {error}")
-    recording = RawRecording(path, sensors["gyro"], sensors["accel"], notes, [], "android", True)
+    recording = RawRecording(
+        path, sensors["gyro"], sensors["accel"], notes, warnings, "android", True
+    )
     used = {file.name for tables in groups.values() for file in tables}
     for file in files:
         if file.name not in used:
-            others = _others_of(file, notes) | others
+            others = _others_of(file, notes, warnings) | others
     return recording._replace(track=track, others=tuple(others.values()))
 
 
@@ -228,20 +237,19 @@ def _has_both(file: LogFile, units: dict[str, None] | None = None) -> bool:
     return {*GYRO, *ACCEL} <= set(labels.resolve_labels(file.layout.labels, units=units))
 
 
-def _others_of(file: LogFile, notes: list[str]) -> dict[str, RawReadings]:
-    """The sensors beside the IMU in a table of their own; none if it cannot be read, or has no
-    stamps."""
+def _others_of(file: LogFile, notes: list[str], warnings: list[str]) -> dict[str, RawReadings]:
+    """The sensors beside the IMU in a table of their own; none if it has no stamps. A sensor that
+    cannot be read is left out with a warning."""
     columns = columns_of(file.layout.labels)
     time = labels.resolve_labels(file.layout.labels).get("time")
-    if not columns or time is None:
-        return {}
-    try:
-        log = _open_log(file, {}, None, notes)
-        stamps, second = log.stamps(time)
-        return {s: readings_of(s, log.table, stamps, c, second) for s, c in columns.items()}
-    except InputError as error:
-        notes.append(f"{', '.join(columns)} left out: {error}")
-        return {}
+    readings = dict[str, RawReadings]()
+    for sensor, names in columns.items() if time else ():
+        with leaving_out(sensor, warnings):
+            log = _open_log(file, {}, None, notes)
+            stamps, second = log.stamps(time)
+            new = readings_of(sensor, log.table, stamps, names, second, texts=log.texts)
+            readings[sensor] = new
+    return readings
 
 
 def _columns(

@@ -82,7 +82,8 @@ def as_sequence(
     Raises `InputError`."""
     notes, sensors = raw.notes, (raw.gyro, raw.accel)
     gyro, accel = (read_clock(one, options.time_unit, notes, raw.warnings) for one in sensors)
-    accel = accel._replace(time=accel.time + float(accel.start - gyro.start))
+    delay = float(accel.start - gyro.start)
+    accel = accel._replace(time=accel.time + delay, row_time=accel.row_time + delay)
     gyro, accel = _in_si(raw, options, gyro, accel)
     if not np.array_equal(gyro.time, accel.time):
         lost = sum(abs(gyro.time[row] - accel.time[row]) for row in (0, -1))
@@ -97,8 +98,8 @@ def as_sequence(
     attributes |= {"imu_compensated": "no"} if raw.raw_gyro else {}
     samples = [Samples(one.time, one.values, str(one.file)) for one in (gyro, accel)]
     streams = Streams(name, str(raw.path), samples[0], samples[1], attributes, float(gyro.start))
-    clock = gyro.time, notes, raw.warnings
-    readings = readings_on_clock(raw.others, raw.gyro, options.time_unit, gyro.start, *clock)
+    by_stamps = options.sample_rate is None
+    readings = readings_on_clock(raw.others, gyro, accel, by_stamps, notes, raw.warnings)
     streams = streams._replace(readings=readings)
     sequence = raw.track and _with_track(streams, rate, raw.track, gyro.start, notes)
     if sequence is None:

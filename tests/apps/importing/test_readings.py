@@ -9,6 +9,7 @@ from tests.support.logger_files import EPOCH, phyphox_sets, phyphox_table, senso
 
 NORTH = np.array([20.0, 5.0, -40.0])
 SLOW = np.arange(0.2, 7.5, 1.0)
+TIME = np.arange(800) / 100
 
 
 def field(time):
@@ -109,12 +110,12 @@ def test_phyphox_has_field_pressure_and_place_by_units_in_any_language(tmp_path)
     assert recording.warnings == ()
 
 
-def test_a_table_of_any_names_has_them_beside_the_imu_in_rows_of_their_own(tmp_path):
-    """Receiver and barometer have a value in every hundredth row, and are empty in the others."""
-    time = np.arange(800) / 100
+def table_columns(time=TIME):
+    """A table of any names. Receiver and barometer have a value in every hundredth row, and are
+    empty in the others."""
     rows = np.isin(np.round(time, 2), np.round(SLOW, 2))
     latitude, longitude, altitude = coordinates(time)
-    columns = {
+    return {
         "Timestamp": time,
         **{f"Gyr_{axis}": known_walk.rate(time)[:, k] for k, axis in enumerate("XYZ")},
         **{f"Acc_{axis}": known_walk.force(time)[:, k] for k, axis in enumerate("XYZ")},
@@ -126,15 +127,159 @@ def test_a_table_of_any_names_has_them_beside_the_imu_in_rows_of_their_own(tmp_p
         "HAcc": np.where(rows, 4.0, np.nan),
         "vAcc": np.where(rows, 6.0, np.nan),
     }
+
+
+def write_table(path, columns):
     lines = [",".join(columns)]
     for cells in zip(*columns.values(), strict=True):
         lines.append(",".join("" if np.isnan(cell) else f"{cell:.9f}" for cell in cells))
-    (tmp_path / "walk.csv").write_text("\n".join(lines))
-    recording = imported(tmp_path / "walk.csv", gyro_unit="rad/s")
+    path.write_text("\n".join(lines))
+    return path
+
+
+def import_table(path, columns, **stated):
+    return imported(write_table(path / "walk.csv", columns), gyro_unit="rad/s", **stated)
+
+
+def test_a_table_of_any_names_has_them_beside_the_imu_in_rows_of_their_own(tmp_path):
+    recording = import_table(tmp_path, table_columns())
     compare(recording, 0.0)
     notes = " | ".join(recording.notes)
     assert "magnetometer taken as gauss (median 0.45" in notes
     assert "barometer taken as hPa (median 1013" in notes
+
+
+@pytest.mark.parametrize("period", [1000, 4096])
+def test_readings_have_the_repaired_clock_of_their_rows(tmp_path, period):
+    """A clock in ms wraps after a second, or at 12 bits."""
+    columns = table_columns()
+    columns["Timestamp"] = np.round(TIME * 1000) % period
+    recording = import_table(tmp_path, columns, time_unit="ms")
+    assert "the clock of gyro wrapped" in " | ".join(recording.notes)
+    compare(recording, 0.0)
+
+
+def test_readings_between_the_rows_of_the_imu_have_its_repaired_clock(tmp_path):
+    """The receiver has rows of its own, one of them between two rows around a wrap."""
+    columns = table_columns()
+    rows = np.flatnonzero(np.isfinite(columns["GPS_LAT"]))
+    stamps = np.insert(np.round(TIME * 1000), rows, np.round(TIME[rows] * 1000) - 5)
+    for name, cells in columns.items():
+        is_fix = name.startswith(("GPS", "gps", "HAcc", "vAcc"))
+        fix_cells = np.where(is_fix, cells[rows], np.nan)
+        columns[name] = np.insert(np.where(is_fix, np.nan, cells), rows, fix_cells)
+    # The fourth fix has the stamp 4095, and the row after it 4.
+    columns["Timestamp"] = (stamps + 900) % 4096
+    recording = import_table(tmp_path, columns, time_unit="ms")
+    time, values, _ = recording.sequence.readings["gnss"]
+    np.testing.assert_allclose(time, SLOW - 0.005, atol=1e-6)
+    np.testing.assert_allclose(values[:, 0], coordinates(SLOW)[0], atol=1e-8)
+
+
+def test_readings_after_another_start_of_the_clock_are_left_out(tmp_path):
+    columns = table_columns()
+    columns["Timestamp"] = np.where(TIME < 7, TIME, TIME - 7 + 1.003)
+    recording = import_table(tmp_path, columns)
+    time, values, _ = recording.sequence.readings["gnss"]
+    np.testing.assert_allclose(time, SLOW[:-1], atol=1e-6)
+    np.testing.assert_allclose(values[:, 0], coordinates(SLOW[:-1])[0], atol=1e-8)
+    assert "1 rows of gnss have no time on this clock" in " | ".join(recording.notes)
+
+
+def test_a_table_of_its_own_whose_clock_starts_again_is_left_out(tmp_path):
+    write_table(tmp_path / "imu.csv", {n: c for n, c in list(table_columns().items())[:7]})
+    stamps = np.where(TIME < 4, TIME, TIME - 4 + 0.003)
+    fields = {f"mag_{axis}": field(TIME)[:, k] for k, axis in enumerate("xyz")}
+    write_table(tmp_path / "mag.csv", {"time": stamps} | fields)
+    recording = imported(tmp_path, gyro_unit="rad/s")
+    (warning,) = recording.warnings
+    assert recording.sequence.readings == {}
+    assert "mag.csv: the clock of magnetometer wraps, starts again or was set back" in warning
+
+
+@pytest.mark.parametrize(
+    ("factors", "names"),
+    [
+        (
+            {"GPS_LAT": np.pi / 180, "gps_altitude": 1 / 0.3048, "HAcc": 1e3, "Baro": 1 / 33.8639},
+            {
+                "GPS_LAT": "GPS_LAT (rad)",
+                "gps_altitude": "gps_altitude [ft]",
+                "HAcc": "HAcc (mm)",
+                "Baro": "Baro (inHg)",
+            },
+        ),
+        (
+            {"GPS_Lon": 1e7, "gps_altitude": 1e-3, "Baro": 1 / 1.33322}
+            | dict.fromkeys(["Mag_X", "Mag_Y", "Mag_Z"], 1e3),
+            {
+                "GPS_Lon": "GPS_Lon (degE7)",
+                "gps_altitude": "gps_altitude_km",
+                "Baro": "Baro (mmHg)",
+                **{f"Mag_{axis}": f"Mag_{axis} (mG)" for axis in "XYZ"},
+            },
+        ),
+    ],
+)
+def test_a_unit_in_the_header_of_another_sensor_counts(tmp_path, factors, names):
+    columns = table_columns()
+    columns = {names.get(n, n): factors.get(n, 1.0) * cells for n, cells in columns.items()}
+    recording = import_table(tmp_path, columns)
+    time, values, _ = recording.sequence.readings["barometer"]
+    np.testing.assert_allclose(values[:, 0], pressure(time), rtol=2e-6)
+    time, values, std = recording.sequence.readings["gnss"]
+    np.testing.assert_allclose(values, np.stack(coordinates(time), axis=1), rtol=1e-8)
+    np.testing.assert_allclose(std[:, 0], 4.0)
+    time, values, _ = recording.sequence.readings["magnetometer"]
+    np.testing.assert_allclose(values, field(time), atol=1e-5)
+
+
+def test_a_row_of_units_counts_for_another_sensor(tmp_path):
+    columns = table_columns() | {"GPS_LAT": np.radians(table_columns()["GPS_LAT"])}
+    path = write_table(tmp_path / "walk.csv", columns)
+    header, rows = path.read_text().split("\n", 1)
+    units = "s,rad/s,rad/s,rad/s,m/s2,m/s2,m/s2,G,G,G,hPa,rad,°,m,m,m"
+    path.write_text(f"{header}\n{units}\n{rows}")
+    compare(imported(path), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "sensor"),
+    [
+        ("gps_altitude", "fathom", "gnss"),
+        ("GPS_LAT", "gon", "gnss"),
+        ("Baro", "C", "barometer"),
+        ("Mag_Y", "LSB", "magnetometer"),
+    ],
+)
+def test_an_unknown_unit_in_the_header_of_another_sensor_is_no_reading(
+    tmp_path, name, unit, sensor
+):
+    columns = {f"{n} ({unit})" if n == name else n: c for n, c in table_columns().items()}
+    recording = import_table(tmp_path, columns)
+    (warning,) = recording.warnings
+    assert warning.startswith(f"{sensor}: it is left out: ")
+    assert f"column '{name} ({unit})' is in '{unit}', no known unit; convert it" in warning
+    compare(recording, 0.0, {"barometer", "gnss", "magnetometer"} - {sensor})
+
+
+@pytest.mark.parametrize(("tick", "of_imu"), [(1.0, 1000), (1000, 1.0), (1e6, 1000)])
+def test_a_table_of_its_own_has_its_own_unit_of_time(tmp_path, tick, of_imu):
+    columns = table_columns()
+    imu = {name: columns[name] for name in list(columns)[:7]}
+    write_table(tmp_path / "imu.csv", imu | {"Timestamp": TIME * of_imu})
+    latitude, longitude, altitude = coordinates(SLOW)
+    fixes = {"lat": latitude, "lon": longitude, "altitude": altitude}
+    accuracies = {"accuracy": 4 + 0 * SLOW, "vertical_accuracy": 6 + 0 * SLOW}
+    write_table(tmp_path / "gps.csv", {"time": SLOW * tick} | fixes | accuracies)
+    compare(imported(tmp_path, gyro_unit="rad/s"), 0.0, ("gnss",))
+    write_table(tmp_path / "imu.csv", {name: imu[name] for name in list(imu)[1:]})
+    stated = {"gyro_unit": "rad/s", "sample_rate": 100.0}
+    compare(imported(tmp_path, **stated), 0.0, ("gnss",))
+    write_table(tmp_path / "gps.csv", {"time": (SLOW + 50) * tick} | fixes | accuracies)
+    (warning,) = imported(tmp_path, **stated).warnings
+    assert "gps.csv: the stamps of field 'gnss' (" in warning
+    assert "do not fit the 7.99 s of the IMU in any unit; give the stamps of both by" in warning
 
 
 def test_a_folder_of_tables_has_the_place_in_a_table_of_its_own(tmp_path):
