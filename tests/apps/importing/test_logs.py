@@ -862,6 +862,17 @@ def test_rows_of_two_imus_are_chosen_by_a_column(tmp_path):
     check(path, options={"where": "I=0"})
 
 
+@pytest.mark.parametrize("delay", [0, 4, 5])
+def test_two_devices_in_turn_without_a_column_are_refused(tmp_path, delay):
+    """The other one is turned by a quarter, and has the same stamps or those between."""
+    turned = Rotation.from_euler("z", 90, degrees=True).apply(WALK.reshape(-1, 3)).reshape(-1, 6)
+    header, others = rows(table([f"{n * 10}" for n in ROWS]))
+    second = rows(table([f"{n * 10 + delay}" for n in ROWS], values=turned))[1]
+    path = put(tmp_path, lines(header, *interleaved(others, second)))
+    refused(path, "two sensors in turn: .* far more from the next .*; keep the rows of one sensor")
+    check(put(tmp_path, lines(header, *interleaved(others, second)[::2])))
+
+
 # --- sensors that contradict each other
 
 
