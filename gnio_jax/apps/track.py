@@ -181,7 +181,8 @@ def _write_figures(
         if kind not in export.MAP_FORMATS:
             export.export(folder / f"trajectory.{kind}", path, kind, covariance)
         elif summary.origin is not None:
-            export.export_map(folder / f"trajectory.{kind}", path, summary.origin)
+            place, name = summary.origin, summary.recording
+            export.export_map(folder / f"trajectory.{kind}", path, place, name)
 
 
 def _draw(
