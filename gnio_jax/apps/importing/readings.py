@@ -85,10 +85,12 @@ _NOT_ACCURACY = r"(?!.*(acc|std|err|vel|speed))"
 _NAMES = {
     MAGNETOMETER: {axis: (_AXIS.format(axis=axis),) for axis in "xyz"},
     BAROMETER: {
-        "pressure": (r"(?!.*(sea|qnh|alt|height))(.*_)?(pressure|baro|barometer|pres)(_.*)?",)
+        "pressure": (
+            r"(?!.*(sea|qnh|alt|height|temp|acc|std|err))(.*_)?(pressure|baro|barometer|pres)(_.*)?",
+        )
     },
     GNSS: {
-        "latitude": (_NOT_ACCURACY + r"(.*_)?(latitude|lat)(_.*)?",),
+        "latitude": (_NOT_ACCURACY + r"(.*_)?(latitude|latit|lat)(_.*)?",),
         "longitude": (_NOT_ACCURACY + r"(.*_)?(longitude|lon|lng|long)(_.*)?",),
         "altitude": (
             r"altitude|alt",

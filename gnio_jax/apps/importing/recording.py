@@ -3,6 +3,7 @@ units and signs, the uniform clock of all recordings (`data.assembly`), the refe
 
 from __future__ import annotations
 
+import re
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
@@ -69,6 +70,8 @@ class RawRecording(NamedTuple):
     """Whether it is known that the phone subtracts no bias from the gyro."""
     others: tuple[RawReadings, ...] = ()
     """The sensors beside the IMU."""
+    by_columns: bool = True
+    """Whether it is a table, whose columns and rate options can state."""
 
 
 class Imported(NamedTuple):
@@ -154,7 +157,11 @@ def _in_si(
     unit = options.gyro_unit or raw.gyro.unit
     scale, slowness = units.gyro_scale(imu, unit, gyro.file, notes)
     imu = imu._replace(gyro=imu.gyro * scale)
-    warnings += doubts + slowness + physics.check_turning(imu, gyro.file)
+    warnings += (
+        doubts
+        + slowness
+        + physics.check_turning(imu, gyro.file, str if raw.by_columns else _without_columns)
+    )
     if (gyro.is_doubtful or accel.is_doubtful) and not physics.is_clock_supported(imu):
         problem = f"field 'time' makes it run at {rounded_rate(imu.time):g} Hz, which may be wrong"
         remedy = "if that is right, state its unit by --time-unit, or give --sample-rate (Hz)"
@@ -170,6 +177,12 @@ def _in_si(
         remedy = "compare with --accel-sign ios"
         warnings.append(f"sign: {problem} iOS's sign and the track is wrong: {remedy}")
     return gyro._replace(values=gyro.values * scale), accel._replace(values=force)
+
+
+def _without_columns(remedy: str) -> str:
+    """A remedy for a recording that is no table, in the place of one by columns or by a rate."""
+    remedy = re.sub(r",? (or|as by) --columns.*", " in their driver, or in the bag", remedy)
+    return remedy.replace(" or --sample-rate (Hz)", "")
 
 
 def _without_repeats(

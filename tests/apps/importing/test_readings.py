@@ -401,13 +401,42 @@ def test_missing_late_repeated_and_damaged_rows_are_left_out_and_counted(tmp_pat
 def test_a_log_whose_other_sensors_are_empty_is_read_without_them(tmp_path):
     members = logger_members(
         Location_csv="time,seconds_elapsed,latitude,longitude\n",
-        Barometer_csv="time,seconds_elapsed,relativeAltitude\n1,0.1,2.0\n",
+        Barometer_csv="time,seconds_elapsed,relativeAltitude,pressure\n",
     )
     recording = imported(zipped(tmp_path / "walk.zip", members))
     compare(recording, sensors=("magnetometer",))
     assert recording.warnings == ()
     notes = [note for note in recording.notes if "left out" in note]
-    assert any("column 'pressure' is missing" in note for note in notes)
+    assert all("holds no row" in note for note in notes) and len(notes) == 2
+
+
+def test_a_log_whose_other_sensors_lack_a_column_is_read_without_them_with_a_warning(tmp_path):
+    members = logger_members(
+        Barometer_csv="time,seconds_elapsed,relativeAltitude\n1,0.1,2.0\n2,0.2,2.0\n",
+        Location_csv=location(SLOW).replace("longitude", "lon"),
+    )
+    recording = imported(zipped(tmp_path / "walk.zip", members))
+    compare(recording, sensors=("magnetometer",))
+    text = " | ".join(recording.warnings)
+    assert "barometer: it is left out: " in text and "column 'pressure' is missing" in text
+    assert "gnss: it is left out: " in text and "column 'longitude' is missing" in text
+
+
+def test_a_phyphox_table_may_have_several_other_sensors(tmp_path):
+    sets, (latitude, longitude, altitude) = phyphox_sets(), coordinates(TIME)
+    place = [latitude, longitude, altitude, 1 + 0 * TIME, 4 + 0 * TIME, 6 + 0 * TIME]
+    names = ["Latitude (°)", "Longitude (°)", "Height (m)", "Velocity (m/s)"]
+    names += ["Horizontal Accuracy (m)", "Vertical Accuracy (m)"]
+    values = [*field(TIME).T, pressure(TIME) / 100, *place]
+    labels = [f"Magnetic field {axis} (µT)" for axis in "xyz"] + ["Pressure (hPa)", *names]
+    members = logger_files.phyphox(sets=sets | {"All": (TIME, np.stack(values, axis=1), labels)})
+    recording = imported(zipped(tmp_path / "walk.zip", members))
+    readings = recording.sequence.readings
+    assert sorted(readings) == ["barometer", "gnss", "magnetometer"]
+    time = readings["gnss"].time + 0.01
+    np.testing.assert_allclose(readings["gnss"].values[:, 0], coordinates(time)[0], atol=1e-7)
+    np.testing.assert_allclose(readings["gnss"].std[0], [4.0, 4.0, 6.0])
+    assert recording.warnings == ()
 
 
 def test_a_phyphox_table_without_stamps_has_no_readings(tmp_path):
@@ -416,4 +445,96 @@ def test_a_phyphox_table_without_stamps_has_no_readings(tmp_path):
     members["Pressure.csv"] = phyphox_table(SLOW, pressure(SLOW)[:, None], ["p (hPa)"]).replace(
         "Time (s)", "Index"
     )
-    assert imported(zipped(tmp_path / "walk.zip", members)).sequence.readings == {}
+    recording = imported(zipped(tmp_path / "walk.zip", members))
+    assert recording.sequence.readings == {}
+    (warning,) = recording.warnings
+    assert "barometer: it is left out: " in warning and "column 'Time (s)' is missing" in warning
+
+
+def test_what_is_beside_a_pressure_is_no_pressure(tmp_path):
+    """A temperature of the barometer alone is no barometer, and beside it no second one."""
+    columns = table_columns() | {"baro_temp (C)": 31 + 0.01 * TIME, "baro_temp": 31 + 0.01 * TIME}
+    compare(import_table(tmp_path, columns), 0.0)
+    del columns["Baro"]
+    recording = import_table(tmp_path, columns)
+    compare(recording, 0.0, ("gnss", "magnetometer"))
+    assert recording.warnings == ()
+
+
+def test_the_status_of_a_sensor_is_no_accuracy_of_a_receiver(tmp_path):
+    columns = table_columns() | {"accuracy": 3 + 0 * TIME}
+    del columns["HAcc"]
+    recording = import_table(tmp_path, columns)
+    assert np.isnan(recording.sequence.readings["gnss"].std[:, 0]).all()
+    assert "column 'accuracy' is Android's status" in " | ".join(recording.notes)
+    rows = np.isfinite(columns["GPS_LAT"])
+    recording = import_table(tmp_path, columns | {"accuracy": np.where(rows, 3.0, np.nan)})
+    np.testing.assert_allclose(recording.sequence.readings["gnss"].std[:, 0], 3.0)
+
+
+def test_columns_that_exchange_the_axes_leave_the_magnetometer_out(tmp_path):
+    """The table is of a body that is turned by a quarter about z."""
+    columns = table_columns()
+    names = {f"Gyr_{a}": f"u{n}" for n, a in enumerate("YXZ")}
+    names |= {f"Acc_{a}": f"v{n}" for n, a in enumerate("YXZ")}
+    for sensor in ("Gyr", "Acc"):
+        columns[f"{sensor}_X"] = -columns[f"{sensor}_X"]
+    columns = {names.get(name, name): cells for name, cells in columns.items()}
+    words = {"gyro_x": "-u1", "gyro_y": "u0", "gyro_z": "u2"}
+    words |= {axis.replace("gyro", "accel"): name.replace("u", "v") for axis, name in words.items()}
+    recording = import_table(tmp_path, columns, columns=words)
+    compare(recording, 0.0, ("barometer", "gnss"))
+    (warning,) = recording.warnings
+    assert (
+        "magnetometer: it is left out: " in warning and "--columns gives the gyro other" in warning
+    )
+    plain = {f"gyro_{a.lower()}": f"Gyr_{a}" for a in "XYZ"}
+    compare(import_table(tmp_path, table_columns(), columns=plain), 0.0)
+    accel = {f"accel_{a.lower()}": f"-Acc_{a}" for a in "XYZ"}  # iOS's sign has the same axes
+    columns = table_columns() | {f"Acc_{a}": -table_columns()[f"Acc_{a}"] for a in "XYZ"}
+    compare(import_table(tmp_path, columns, columns=accel), 0.0)
+    cyclic = {"Gyr_X": "Gyr_Y", "Gyr_Y": "Gyr_Z", "Gyr_Z": "Gyr_X"}
+    cyclic |= {
+        name.replace("Gyr", "Acc"): other.replace("Gyr", "Acc") for name, other in cyclic.items()
+    }
+    columns = {cyclic.get(name, name): cells for name, cells in table_columns().items()}
+    words = {"gyro_x": "Gyr_Y", "gyro_y": "Gyr_Z", "gyro_z": "Gyr_X"}
+    words |= {f"accel_{axis[-1]}": name.replace("Gyr", "Acc") for axis, name in words.items()}
+    compare(import_table(tmp_path, columns, columns=words), 0.0, ("barometer", "gnss"))
+
+
+@pytest.mark.parametrize("header", ["# MAGN;AppTime(s);time(s);Mag_X(uT);Mag_Y(uT);Mag_Z(uT)", ""])
+def test_rows_that_name_another_sensor_are_read_or_warned_of(tmp_path, header):
+    lines = [header] if header else []
+    values = known_walk.force(TIME), known_walk.rate(TIME), field(TIME)
+    for row, time in enumerate(TIME):
+        for tag, vectors in zip(("ACCE", "GYRO", "MAGN"), values, strict=True):
+            cells = ";".join(f"{value:.9f}" for value in vectors[row])
+            lines.append(f"{tag};{time:.3f};{time:.3f};{cells}")
+    (tmp_path / "log.txt").write_text("\n".join(lines))
+    recording = imported(tmp_path / "log.txt", gyro_unit="rad/s")
+    if header:
+        compare(recording, 0.0, ("magnetometer",))
+        assert recording.warnings == ()
+    else:
+        (warning,) = recording.warnings
+        assert "magnetometer: it is left out: " in warning and "MAGN: has no header with" in warning
+        assert "it is a comment, # MAGN, ..." in warning
+
+
+@pytest.mark.parametrize("delay", [18.0, -0.05])
+def test_a_fix_that_is_stamped_by_another_clock_has_that_of_the_bag(tmp_path, delay):
+    """A receiver that stamps in the time of GPS, and one that is late as receivers are."""
+    make, name = bag_files.Maker("mcap"), "sensor_msgs/msg/NavSatFix"
+
+    def fix(time):
+        status = make.new("sensor_msgs/msg/NavSatStatus", 0, 1)
+        header, values = make.header(time + delay, "gps"), map(float, coordinates(time))
+        return make.new(name, header, status, *values, np.zeros(9), 0)
+
+    entries = bag_files.imu(make, seconds=8.0) + bag_files.rows("/fix", name, SLOW, fix)
+    recording = imported(bag_files.write(tmp_path, "mcap", entries))
+    shift = delay if delay < 0 else 0.0
+    np.testing.assert_allclose(recording.sequence.readings["gnss"].time, SLOW + shift, atol=1e-6)
+    text = "the headers of /fix are +18.00 s from the IMU's, by the bag's clock, whose stamps are"
+    assert [text in warning for warning in recording.warnings] == [True] * (delay > 0)
