@@ -181,8 +181,8 @@ def _write_figures(
         if kind not in export.MAP_FORMATS:
             export.export(folder / f"trajectory.{kind}", path, kind, covariance)
         elif summary.origin is not None:
-            place, name = summary.origin, summary.recording
-            export.export_map(folder / f"trajectory.{kind}", path, place, name)
+            file, name = folder / f"trajectory.{kind}", summary.recording
+            export.export_map(file, path, summary.origin, name)
 
 
 def _draw(

@@ -124,9 +124,9 @@ def test_a_map_has_the_name_of_the_recording_and_longitudes_within_180_degrees(t
     ferry = Trajectory(time, east, np.tile([1.0, 0, 0, 0], (60, 1)))
     longitude = 179.9995 + np.degrees(east[:, 0] / 6378137.0)
     longitude[longitude > 180.0] -= 360.0
-    place = Place(0.0, 179.9995, 0.0)
+    origin = Place(0.0, 179.9995, 0.0)
     for kind in ("gpx", "geojson"):
-        export_map(tmp_path / f"trajectory.{kind}", ferry, place, "ferry & walk")
+        export_map(tmp_path / f"trajectory.{kind}", ferry, origin, "ferry & walk")
     space = "{http://www.topografix.com/GPX/1/1}"
     track = ElementTree.parse(tmp_path / "trajectory.gpx").getroot()
     assert track.findtext(f"{space}trk/{space}name") == "ferry & walk"

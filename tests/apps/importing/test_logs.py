@@ -770,8 +770,8 @@ def test_a_date_and_a_time_are_one_stamp(tmp_path):
 def test_a_date_is_the_same_in_a_column_of_its_own(tmp_path, date, words):
     texts = clock_text(33_302_250 + ROWS * 10, "{h:02d}:{m:02d}:{s:02d}.{ms:03d}")
     path = put(tmp_path, table([f"{date},{text}" for text in texts], ("date", *HEADER)))
-    apart, notes = import_recording(path, {"time": "date+time"})
-    assert apart.attributes["start_time"] == pytest.approx(1_714_727_702.25)
+    sequence, notes = import_recording(path, {"time": "date+time"})
+    assert sequence.attributes["start_time"] == pytest.approx(1_714_727_702.25)
     assert any(re.search(words, note) for note in notes)
     if len(date) != 8 or "." in date:  # a number of eight digits is no date beside others
         joined, notes = import_recording(put(tmp_path, table([f"{date} {x}" for x in texts])))

@@ -137,8 +137,8 @@ def write_table(path, columns):
     return path
 
 
-def import_table(path, columns, **stated):
-    return imported(write_table(path / "walk.csv", columns), gyro_unit="rad/s", **stated)
+def import_table(path, table, /, **stated):
+    return imported(write_table(path / "walk.csv", table), gyro_unit="rad/s", **stated)
 
 
 def test_a_table_of_any_names_has_them_beside_the_imu_in_rows_of_their_own(tmp_path):
@@ -424,10 +424,10 @@ def test_a_log_whose_other_sensors_lack_a_column_is_read_without_them_with_a_war
 
 def test_a_phyphox_table_may_have_several_other_sensors(tmp_path):
     sets, (latitude, longitude, altitude) = phyphox_sets(), coordinates(TIME)
-    place = [latitude, longitude, altitude, 1 + 0 * TIME, 4 + 0 * TIME, 6 + 0 * TIME]
+    of_place = [latitude, longitude, altitude, 1 + 0 * TIME, 4 + 0 * TIME, 6 + 0 * TIME]
     names = ["Latitude (°)", "Longitude (°)", "Height (m)", "Velocity (m/s)"]
     names += ["Horizontal Accuracy (m)", "Vertical Accuracy (m)"]
-    values = [*field(TIME).T, pressure(TIME) / 100, *place]
+    values = [*field(TIME).T, pressure(TIME) / 100, *of_place]
     labels = [f"Magnetic field {axis} (µT)" for axis in "xyz"] + ["Pressure (hPa)", *names]
     members = logger_files.phyphox(sets=sets | {"All": (TIME, np.stack(values, axis=1), labels)})
     recording = imported(zipped(tmp_path / "walk.zip", members))

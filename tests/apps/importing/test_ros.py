@@ -153,10 +153,10 @@ def test_an_accelerometer_in_a_frame_of_its_own_is_turned_to_the_gyro(tmp_path):
 
 def test_topics_of_different_clocks_and_options_of_tables_are_refused(tmp_path):
     make = Maker()
-    late = imu(make, "/accel", no="gyro")
-    for _, _, _, message in late:
+    accel_rows = imu(make, "/accel", no="gyro")
+    for _, _, _, message in accel_rows:
         message.header.stamp.sec += 1
-    path = write(tmp_path, "mcap", imu(make, "/gyro", no="accel") + late)
+    path = write(tmp_path, "mcap", imu(make, "/gyro", no="accel") + accel_rows)
     topics = {"imu_topic": "/gyro", "accel_topic": "/accel"}
     refused(path, "topics /gyro and /accel are stamped by different clocks", **topics)
     words = "is an MCAP, no table with columns and rows; leave out --columns"
