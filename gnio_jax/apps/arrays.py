@@ -190,7 +190,7 @@ def _checked_readings(sensor: str, parts: Any, clock: Float[np.ndarray, "n"]) ->
     rows = np.unique(time, return_index=True)[1]
     readings = Readings(time[rows] - clock.min(), values[rows], std[rows])
     check_readings(sensor, readings, np.sort(clock) - clock.min(), field)
-    return RawReadings(sensor, Path(SOURCE), time, values, std, second="s", unit=kind.unit)
+    return RawReadings(sensor, Path(SOURCE), time, values, std, second="s", has_unit=True)
 
 
 def _checked_array(name: str, values: Any, count: int | None) -> np.ndarray:

@@ -87,9 +87,10 @@ def check_map(formats: Iterable[str]) -> None:
             raise InputError("--format", problem, "switch on the location, or leave the format out")
 
 
-def export_map(path: Path, trajectory: Trajectory, origin: Place) -> None:
+def export_map(path: Path, trajectory: Trajectory, origin: Place, name: str) -> None:
     """Write the path on the map, one point a second, as the suffix says. `origin` is the place of
-    the trajectory's origin, whose axes are east, north and up."""
+    the trajectory's origin, whose axes are east, north and up, and `name` that of the
+    recording."""
     rows = np.flatnonzero(trajectory.known & np.isfinite(trajectory.time))
     seconds = np.floor(trajectory.time[rows] - trajectory.time[rows[0]] + 1e-6)
     rows = rows[np.unique(np.append(np.unique(seconds, return_index=True)[1], len(rows) - 1))]
@@ -100,7 +101,7 @@ def export_map(path: Path, trajectory: Trajectory, origin: Place) -> None:
         stamps = [moment.isoformat(timespec="milliseconds")[:23] + "Z" for moment in moments]
     with replacing(path) as temporary:
         if path.suffix == ".gpx":
-            _write_gpx(temporary, path.parent.name, places, stamps)
+            _write_gpx(temporary, name, places, stamps)
             return
         line = [[round(east, 7), round(north, 7), round(up, 2)] for north, east, up in places]
         properties: dict[str, Any] = {"coordTimes": stamps} if stamps[0] else {}

@@ -30,7 +30,7 @@ from jaxtyping import Float
 
 from gnio_jax import geometry
 from gnio_jax.config import ConsideredStd, CorrelatedError
-from gnio_jax.data.geodesy import Place, east_north_up, geodetic
+from gnio_jax.data.geodesy import Place, east_north_up, geodetic, near_longitude
 from gnio_jax.data.sensors import BAROMETER, GNSS, MAGNETOMETER
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import PreparedRecording, SequenceEstimate
@@ -371,7 +371,8 @@ def place_on_map(readings: Readings, path: SequenceEstimate, longest: float) -> 
     std = np.maximum(np.where(np.isfinite(std), std, ACCURACY), LEAST_ACCURACY)
     altitude = values[:, 2][np.isfinite(values[:, 2])]
     level = float(np.median(altitude[:10])) if len(altitude) else 0.0
-    places = np.column_stack([values[:, :2], np.full(len(time), level)])
+    longitude = near_longitude(values[:, 1], values[0, 1])
+    places = np.column_stack([values[:, 0], longitude, np.full(len(time), level)])
     reference = Place(*np.median(places, axis=0).tolist())
     position = east_north_up(places, reference)[:, :2]
     crowd = (np.abs(time[:, None] - time[None]) < FIX_SECONDS / 2).sum(axis=1).astype(float)

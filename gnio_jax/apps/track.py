@@ -181,7 +181,8 @@ def _write_figures(
         if kind not in export.MAP_FORMATS:
             export.export(folder / f"trajectory.{kind}", path, kind, covariance)
         elif summary.origin is not None:
-            export.export_map(folder / f"trajectory.{kind}", path, summary.origin)
+            file, name = folder / f"trajectory.{kind}", summary.recording
+            export.export_map(file, path, summary.origin, name)
 
 
 def _draw(

@@ -34,8 +34,8 @@ def east_north_up(places: Float[np.ndarray, "n 3"], origin: Place) -> Float[np.n
 
 
 def geodetic(position: Float[np.ndarray, "n 3"], origin: Place) -> Float[np.ndarray, "n 3"]:
-    """The inverse of `east_north_up`: latitude, longitude (degrees) and altitude (m). Steps by the
-    radii of curvature at the origin reach 1 mm up to 100 km from it."""
+    """The inverse of `east_north_up`: latitude, longitude (degrees, -180 to 180) and altitude
+    (m). Steps by the radii of curvature at the origin reach 1 mm up to 100 km from it."""
     latitude = np.radians(origin.latitude)
     across = SEMI_MAJOR / np.sqrt(1 - _ECCENTRICITY * np.sin(latitude) ** 2)
     along = across * (1 - _ECCENTRICITY) / (1 - _ECCENTRICITY * np.sin(latitude) ** 2)
@@ -44,7 +44,13 @@ def geodetic(position: Float[np.ndarray, "n 3"], origin: Place) -> Float[np.ndar
     for _ in range(6):
         error = position - east_north_up(places, origin)
         places = places + error[:, [1, 0, 2]] * [*degrees, 1.0]
+    places[:, 1] = near_longitude(places[:, 1], 0.0)
     return places
+
+
+def near_longitude(longitude: Float[np.ndarray, " n"], other: float) -> Float[np.ndarray, " n"]:
+    """The same longitudes, degrees, within 180 of another one: the antimeridian is no step."""
+    return longitude - 360.0 * np.round((longitude - other) / 360.0)
 
 
 def _earth_frame(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -10,6 +10,7 @@ and 220 pieces of 10 s of them, and find a negated gyro in every second piece.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -134,10 +135,11 @@ def contradiction(imu: ImuSamples) -> tuple[float, str, str] | None:
     return max(factors, default=None)
 
 
-def check_turning(imu: ImuSamples, source: object) -> list[str]:
+def check_turning(imu: ImuSamples, source: object, adapt: Callable[[str], str] = str) -> list[str]:
     """Warnings about a gyro that gravity may contradict. Raises `InputError` where it certainly
-    does. `imu` is in SI units."""
+    does. `imu` is in SI units; `adapt` gives the remedy that the format of the recording allows."""
     factor, problem, remedy = contradiction(imu) or (0.0, "", "")
+    remedy = adapt(remedy)
     if factor > PROOF and np.ptp(imu.time) >= SHORT:
         raise InputError(source, problem, remedy)
     return [f"sensors: {problem}; {remedy}"] if factor else []

@@ -1,12 +1,16 @@
 """Trajectories in other programs' formats, read back by other means than they were written."""
 
+import json
+from xml.etree import ElementTree
+
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gnio_jax.apps.export import export
+from gnio_jax.apps.export import export, export_map
+from gnio_jax.data.geodesy import Place
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import Trajectory, read_tum
 from tests.support import known_walk
@@ -111,3 +115,23 @@ def test_a_mistake_is_one_line(tmp_path, monkeypatch, mistake, text, out, expect
     before = sorted(tmp_path.iterdir())
     assert expected in mistake("data", "export", "walk.txt", out)
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_map_has_the_name_of_the_recording_and_longitudes_within_180_degrees(tmp_path):
+    """A ferry goes two metres east in a second, across the antimeridian after 27 s."""
+    time = START + np.arange(60.0)
+    east = np.column_stack([2.0 * (time - START), 0 * time, 0 * time])
+    ferry = Trajectory(time, east, np.tile([1.0, 0, 0, 0], (60, 1)))
+    longitude = 179.9995 + np.degrees(east[:, 0] / 6378137.0)
+    longitude[longitude > 180.0] -= 360.0
+    origin = Place(0.0, 179.9995, 0.0)
+    for kind in ("gpx", "geojson"):
+        export_map(tmp_path / f"trajectory.{kind}", ferry, origin, "ferry & walk")
+    space = "{http://www.topografix.com/GPX/1/1}"
+    track = ElementTree.parse(tmp_path / "trajectory.gpx").getroot()
+    assert track.findtext(f"{space}trk/{space}name") == "ferry & walk"
+    points = [float(point.get("lon")) for point in track.iter(f"{space}trkpt")]
+    np.testing.assert_allclose(points, longitude, atol=1e-6)
+    content = json.loads((tmp_path / "trajectory.geojson").read_text())
+    line = np.array(content["features"][0]["geometry"]["coordinates"])
+    np.testing.assert_allclose(line[:, 0], longitude, atol=1e-6)

@@ -20,6 +20,7 @@ from gnio_jax.evaluation import SequenceEstimate, prepare
 from gnio_jax.evaluation.trajectory import Trajectory, read_tum
 from gnio_jax.filtering import magnetometer, make_filter
 from gnio_jax.networks import read_network
+from gnio_jax.types import Readings
 from tests.support import drawn_run, phone_walk, tiny_run
 from tests.support.filter_settings import changed
 
@@ -100,7 +101,9 @@ def test_field_pressure_and_fixes_mend_heading_height_and_place(runs, tmp_path):
     assert (error < 3 * std)[50:].all() and std[-1] < 8  # it is honest
     # The exports lie on the map.
     space = "{http://www.topografix.com/GPX/1/1}"
-    points = list(ElementTree.parse(tmp_path / "track" / "trajectory.gpx").iter(f"{space}trkpt"))
+    gpx = ElementTree.parse(tmp_path / "track" / "trajectory.gpx")
+    assert gpx.findtext(f"{space}trk/{space}name") == sequence.name
+    points = list(gpx.iter(f"{space}trkpt"))
     content = json.loads((tmp_path / "track" / "trajectory.geojson").read_text())
     line = np.array(content["features"][0]["geometry"]["coordinates"])
     last = np.array([float(points[-1].get("lat")), float(points[-1].get("lon"))])
@@ -362,3 +365,22 @@ def test_fixes_of_a_phone_that_stands_show_no_heading():
     with pytest.raises(InputError, match="2 fixes are within the recording, and 4 are needed"):
         few = gnss._replace(time=gnss.time[:2], values=gnss.values[:2], std=gnss.std[:2])
         sensors.place_on_map(few, still, 60.0)
+
+
+def test_fixes_on_both_sides_of_the_antimeridian_are_one_place():
+    """Half of the fixes have longitudes of 180 degrees, half of them of -180."""
+    time = np.arange(0, 100.0)
+    position = np.column_stack([time - 50.0, 20.0 * np.sin(time / 15.0), 0 * time])
+    level = np.tile([1.0, 0, 0, 0], (len(time), 1))
+    path = Trajectory(time, position, level)
+    rows = slice(1, 99)
+    metre = 1.0 / 111_319.49  # degrees, at the equator
+    longitude = 180.0 + (position[rows, 0] + 0.5) * metre
+    longitude[longitude > 180.0] -= 360.0
+    assert np.median(longitude) == 0.0
+    values = np.column_stack([position[rows, 1] / 110_574.3, longitude, 0 * longitude])
+    fixes = Readings(time[rows], values, np.full((98, 3), 3.0))
+    placement = sensors.place_on_map(fixes, SequenceEstimate("ferry", path, path), 1e9)
+    assert placement.distance < 0.05 and abs(placement.yaw) < 1e-3
+    assert abs(abs(placement.origin.longitude) - 180.0) < 2 * metre
+    assert abs(placement.origin.latitude) < metre

@@ -25,3 +25,13 @@ def test_metres_and_degrees_are_inverse_to_each_other(origin):
     position = np.array([[0.0, 0, 0], [4000.0, -7000.0, 120.0], [-9.0, 3.0, -4.0]])
     back = east_north_up(geodetic(position, Place(*origin)), Place(*origin))
     np.testing.assert_allclose(back, position, atol=1e-3)
+
+
+def test_a_longitude_beyond_180_degrees_is_that_of_the_other_side():
+    radius = 6378137.0  # at the equator
+    step = np.degrees(2000.0 / radius)
+    for side in (1.0, -1.0):
+        position = np.array([[2000.0 * side, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        longitude = geodetic(position, Place(0.0, side * 179.99, 0.0))[:, 1]
+        expected = [side * (179.99 + step - 360.0), side * 179.99]
+        np.testing.assert_allclose(longitude, expected, atol=1e-8)

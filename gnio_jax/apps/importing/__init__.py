@@ -76,13 +76,17 @@ def import_recording(
 def _read(path: Path, options: ImportOptions) -> RawRecording:
     is_named = any((options.columns, options.accel_path, options.where, options.sample_rate))
     path = path if is_named else _whole(path)
-    kind = "tables" if is_named else _recognise(path)
+    kind = _recognise(path)
     if kind in bags.KINDS:
+        if is_named:
+            problem = f"is {bags.KINDS[kind]}, no table with columns and rows"
+            remedy = "leave out --columns, --accel-path, --where and --sample-rate"
+            raise InputError(path, problem, remedy)
         return ros.read_bag(path, kind, options)
     if any((options.imu_topic, options.accel_topic, options.reference_topic)):
         remedy = "--imu-topic and the like are for ROS bags and MCAP"
         raise InputError(path, "has no topics", remedy)
-    if kind == "euroc":
+    if kind == "euroc" and not is_named:
         return _euroc(path)
     files = files_of(path)
     recording = None if is_named else loggers.read_logger(path, files)

@@ -66,12 +66,18 @@ class Sensor(NamedTuple):
     """Unit of the stamps; None: it is detected."""
     unit: str | None = None
     """Unit of the values (`units.scale_of`); None: it is detected."""
+    index: Int[np.ndarray, " n"] | None = None
+    """Rows of the table that hold the samples, from 0; None: all."""
 
     def select_rows(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> Sensor:
         """The samples in these rows."""
         numbers, row = np.arange(len(self.stamps))[rows], self.row
-        stamps, values = self.stamps[rows], self.values[rows]
-        return self._replace(stamps=stamps, values=values, row=lambda n: row(int(numbers[n])))
+        return self._replace(
+            stamps=self.stamps[rows],
+            values=self.values[rows],
+            row=lambda n: row(int(numbers[n])),
+            index=numbers if self.index is None else self.index[rows],
+        )
 
 
 class Clocked(NamedTuple):
@@ -86,6 +92,11 @@ class Clocked(NamedTuple):
     """The exact first stamp, s, because unix time in a float is good to a quarter of a µs."""
     is_doubtful: bool
     """Whether the unit was detected by a rate beyond `EDGES` or one that a counter may have."""
+    second: str
+    """Unit of the stamps."""
+    row_time: Float[np.ndarray, " m"]
+    """Time of each row of the table, s since `start`, by the same repairs; NaN for a row without a
+    stamp, or of another start of the clock."""
 
 
 def sensor_of(
@@ -103,6 +114,8 @@ def read_clock(sensor: Sensor, unit: str | None, notes: list[str], warnings: lis
     """The samples in order and in seconds. `unit` is that of the stamps; None: it is detected.
     Raises `InputError`."""
     name, file, remarks = sensor.name, sensor.file, list[str]()
+    table_stamps, index = sensor.stamps, np.arange(len(sensor.stamps))
+    sensor = sensor._replace(index=index)
     blank = np.isnan(sensor.values).all(axis=1)
     if blank.any() and not blank.all():
         # Loggers that write all sensors into one table leave the columns of the others empty.
@@ -122,15 +135,16 @@ def read_clock(sensor: Sensor, unit: str | None, notes: list[str], warnings: lis
             raise InputError(file, f"{problem} {row}", "repair or cut the recording there")
         remarks.append(f"{problem} {row}: they are left out")
         sensor = sensor.select_rows(valid)
-    stamps, wraps = _unwrap(sensor.stamps)
+    stamps, wraps = unwrap(sensor.stamps)
     if wraps:
         remarks.append(f"the clock of {name} wrapped {wraps} times and is continued")
-        sensor = sensor._replace(stamps=stamps)
+    in_file, shift = sensor, stamps - sensor.stamps
+    sensor = sensor._replace(stamps=stamps)
     strays = _strays(sensor.stamps)
     if lost := int(strays.sum()):
         remarks.append(f"{lost} rows of {name} are left out, whose stamps are far from all others")
         sensor = sensor.select_rows(~strays)
-    mixed = _find_mixed(sensor)
+    mixed = find_mixed(sensor)
     if lost := int(mixed.sum()):
         row = sensor.row(int(np.argmax(mixed)))
         problem = f"the clock of {name} starts again or was set back near row {row}: {lost} rows"
@@ -139,6 +153,7 @@ def read_clock(sensor: Sensor, unit: str | None, notes: list[str], warnings: lis
         problem = f"{file.name}: {problem} of the shorter part are left out"
         (notes if lost <= most_damaged_rows(len(mixed)) else warnings).append(problem)
         sensor = sensor.select_rows(~mixed)
+    is_lost = ~np.isin(in_file.index, sensor.index)
     if backward := int((np.diff(sensor.stamps) < 0).sum()):
         remarks.append(f"{name} had {backward} steps back in time; its rows were sorted")
         sensor = sensor.select_rows(np.argsort(sensor.stamps, kind="stable"))
@@ -163,7 +178,22 @@ def read_clock(sensor: Sensor, unit: str | None, notes: list[str], warnings: lis
     time = _space_evenly(parsing.seconds(stamps, first, second), name, remarks)
     start = Fraction(first) * parsing.seconds_of(second)
     notes += [f"{file.name}: {remark}" for remark in remarks]
-    return Clocked(name, file, time, sensor.values, start, is_doubtful)
+    nearest = _nearest_sample(table_stamps, in_file)
+    row_time = parsing.seconds(table_stamps + shift[nearest], first, second)
+    row_time[is_lost[nearest]] = np.nan
+    row_time[sensor.index] = time
+    return Clocked(name, file, time, sensor.values, start, is_doubtful, second, row_time)
+
+
+def _nearest_sample(stamps: Num[np.ndarray, " m"], sensor: Sensor) -> Int[np.ndarray, " m"]:
+    """The sample in each row of a table with these `stamps`. For a row without one it is the sample
+    before or after it, whichever has the nearer stamp, so that it is of the same start of the
+    clock."""
+    after = np.searchsorted(sensor.index, np.arange(len(stamps)))
+    after = np.minimum(after, len(sensor.stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    misfits = (np.abs(stamps - sensor.stamps[rows]) for rows in (before, after))
+    return np.where(np.less(*misfits), before, after)
 
 
 def _is_same(sensor: Sensor) -> Bool[np.ndarray, " m"]:
@@ -194,7 +224,7 @@ def _detected_unit(sensor: Sensor, notes: list[str]) -> tuple[str, bool]:
 # --- wraps, rows of other times, new starts
 
 
-def _unwrap(stamps: Real[np.ndarray, " n"]) -> tuple[Real[np.ndarray, " n"], int]:
+def unwrap(stamps: Real[np.ndarray, " n"]) -> tuple[Real[np.ndarray, " n"], int]:
     """Stamps that go on where a clock wrapped, and the number of wraps."""
     steps = np.diff(stamps)
     if not (steps < 0).any():
@@ -228,7 +258,7 @@ def _strays(stamps: Real[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     return strays if strays.sum() <= most_damaged_rows(len(stamps)) else np.zeros_like(strays)
 
 
-def _find_mixed(sensor: Sensor) -> Bool[np.ndarray, " n"]:
+def find_mixed(sensor: Sensor) -> Bool[np.ndarray, " n"]:
     """Rows of pieces of the file that lie between the samples of a longer piece: the clock started
     again. Blocks and single rows out of order fill holes, and are not meant."""
     steps = np.diff(sensor.stamps).astype(np.float64)

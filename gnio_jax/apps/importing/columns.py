@@ -3,6 +3,7 @@ which unit their names state."""
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Iterable
 from fractions import Fraction
@@ -18,7 +19,13 @@ from jaxtyping import Float, Num
 from gnio_jax.apps.importing import units
 from gnio_jax.apps.importing.clocks import Sensor
 from gnio_jax.apps.importing.files import LogFile, files_of, log_file, spell_names
-from gnio_jax.apps.importing.readings import RawReadings, columns_of, readings_of
+from gnio_jax.apps.importing.readings import (
+    ACCURACY,
+    RawReadings,
+    columns_of,
+    leaving_out,
+    readings_of,
+)
 from gnio_jax.apps.importing.recording import RawRecording, Track
 from gnio_jax.config import ImportOptions
 from gnio_jax.data import labels
@@ -28,12 +35,26 @@ from gnio_jax.data.parsing.tables import Table, shorten
 from gnio_jax.data.parsing.text import FIRST_LINES, cells_of, rows_of, without_mark
 from gnio_jax.data.readers.csv_files import check_columns, reference
 from gnio_jax.data.reference import SHORTEST_RUN
+from gnio_jax.data.sensors import BAROMETER, GNSS, MAGNETOMETER
 from gnio_jax.errors import InputError
 
 FIRST_ROWS, MOST_IMUS = 1000, 8
 """Rows in which sensors that take turns are searched, and their largest number (ours)."""
-_ANDROID = {"1": "accelerometer", "4": "gyroscope"}
+_ANDROID = {"1": "accelerometer", "2": "magnetometer", "4": "gyroscope", "6": "pressure"}
 """Types of sensors in a column of that name (developer.android.com, Sensor)."""
+_OTHER_TAGS = {
+    MAGNETOMETER: r"(.*_)?magn?(et.*)?(_.*)?",
+    BAROMETER: r"(.*_)?(pres|pressure|baro|barometer)(_.*)?",
+    GNSS: r"(.*_)?(gnss|gps|location)(_.*)?",
+}
+"""Tags of rows, and names of files, of a sensor beside the IMU, as `labels.plain_name` writes
+them."""
+_PLAIN_HEADERS = {
+    MAGNETOMETER: ("mag_x", "mag_y", "mag_z"),
+    BAROMETER: ("pressure",),
+    GNSS: ("latitude", "longitude"),
+}
+"""Known names of its columns, for messages."""
 
 
 def named_by(words: Iterable[str]) -> dict[str, str]:
@@ -68,16 +89,22 @@ class _Log(NamedTuple):
         signs = [1 if part == name else -1 for part, name in zip(parts, names, strict=True)]
         return np.dot(signs, [self.table.take(name, gaps=True) for name in names])
 
-    def stamps(self, column: str) -> tuple[Num[np.ndarray, " n"], str | None]:
+    def stamps(self, column: str, notes: list[str]) -> tuple[Num[np.ndarray, " n"], str | None]:
         """The stamps of the rows, and the unit that their name or header states. Two columns are
-        one stamp: s + ns, or date + time."""
+        one stamp: s + ns, or date + time. Raises `InputError` for a column without dates."""
         columns = self.table.columns
         kinds = {label: series.dtype.kind for label, series in columns.items()}
         whole, _, part = column.partition("+") if column not in kinds else (column, "", "")
         if "M" in (kinds.get(column), kinds.get(part)):
             stamps = columns[part or column].astype(np.int64).to_numpy()
             if part:
-                dates = pd.to_datetime(columns[whole], format="mixed", errors="coerce")
+                dates, remark = parsing.parse_dates(columns[whole])
+                if dates.isna().any():
+                    cell = shorten(columns[whole][dates.isna()].iloc[0])
+                    problem = f"column '{whole}' holds '{cell}', no date"
+                    raise InputError(self.table.path, problem, "write dates as 2024-05-03")
+                remark = f"{self.table.path.name}: {remark}"
+                notes += [remark] * (remark not in notes)
                 days = (dates - pd.Timestamp(0)).dt.days.to_numpy()
                 stamps = stamps % parsing.DAY + days * parsing.DAY
             return stamps, "ns"
@@ -145,19 +172,31 @@ def rows_by_sensor(file: LogFile) -> list[LogFile]:
             break
     else:
         return []
-    is_shared = layout.labels and labels.sensor_named(name) is None
+    is_shared = layout.labels and not (labels.sensor_named(name) or _other_sensor(name))
     header = [layout.separator.join(layout.labels)] if is_shared else []
     groups: dict[str, list[str]] = {}
     comments = (cells_of(without_mark(line), layout.separator) for line in layout.preamble)
     for cells in (layout.labels, *layout.subheaders, *comments):
-        if len(cells) > index and cells[index] in words and labels.sensor_named(cells[index]):
-            groups[cells[index]] = [layout.separator.join(cells)]
+        tag = cells[index] if len(cells) > index else ""
+        if _other_sensor(tag) or (tag in words and labels.sensor_named(tag)):
+            groups[tag] = [layout.separator.join(cells)]
     for _, cells in rows_of(file.path, layout, content):
         tag = tags.get(cells[index], cells[index]) if len(cells) > index else ""
-        if labels.sensor_named(tag):
+        if labels.sensor_named(tag) or _other_sensor(tag):
             groups.setdefault(tag, [*header]).append(layout.separator.join(cells))
     texts = {tag: "\n".join(rows).encode() for tag, rows in groups.items()}
-    return [log_file(tag, file.path / tag, partial(bytes, text)) for tag, text in texts.items()]
+    return [
+        log_file(tag, file.path / tag, partial(bytes, text))
+        for tag, text in texts.items()
+        if labels.sensor_named(tag) or len(groups[tag]) > 1  # a header alone is no sensor
+    ]
+
+
+@functools.cache
+def _other_sensor(tag: str) -> str | None:
+    """The sensor beside the IMU that a tag of rows means."""
+    name = labels.plain_name(tag)
+    return next((sensor for sensor, tags in _OTHER_TAGS.items() if re.fullmatch(tags, name)), None)
 
 
 # --- the recording
@@ -185,7 +224,8 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
         problem = f"has the layout of no known recording (found: {spell_names(files)})"
         remedy = "known: CSV, Sensor Logger, phyphox, ROS bags, MCAP and EuRoC folders"
         raise InputError(path, problem, f"{remedy}; a CSV of other columns needs --columns")
-    notes, sensors, track = list[str](), dict[str, Sensor](), None
+    notes, warnings, sensors, track = list[str](), list[str](), dict[str, Sensor](), None
+    is_turned = False
     others = dict[str, RawReadings]()
     for group, (file,) in groups.items():
         log = _open_log(file, names, options.where, notes)
@@ -202,24 +242,47 @@ def read_columns(path: Path, files: list[LogFile], options: ImportOptions) -> Ra
                 second = str(1 / Fraction(str(options.sample_rate)))
                 stamps = np.arange(len(values))
             else:
-                stamps, second = log.stamps(clock)
+                stamps, second = log.stamps(clock, notes)
             row = log.table.row
             sensors[sensor] = Sensor(sensor, file.path, stamps, values, row, second, unit)
         for sensor, labeled in columns_of(log.table.columns).items():
-            if not set(labeled.values()) & set(columns.values()):
-                new = readings_of(sensor, log.table, stamps, labeled, second)
-                others.setdefault(sensor, new)
+            if set(labeled.values()) & set(columns.values()):
+                continue
+            with leaving_out(sensor, warnings):
+                if (label := labeled.get(ACCURACY[0], "")).lower() in ("accuracy", "acc"):
+                    if np.isin(log.table.columns[label], range(-1, 4)).all():
+                        problem = f"column '{label}' is Android's status of a sensor, not in metres"
+                        notes.append(f"{file.path.name}: {problem}")
+                        labeled = {n: column for n, column in labeled.items() if n != ACCURACY[0]}
+                new = readings_of(sensor, log.table, stamps, labeled, texts=log.texts)
+                others.setdefault(sensor, new._replace(table_of=group[0]))
         if "gyro" in group:
+            is_turned = bool(set(GYRO) & set(names)) and _are_exchanged([columns[x] for x in GYRO])
             try:
                 track = _reference(log.table, names, sensors["gyro"], options.time_unit)
             except InputError as error:
                 notes.append(f"no reference is taken: {error}")
-    recording = RawRecording(path, sensors["gyro"], sensors["accel"], notes, [], "android", True)
+    recording = RawRecording(
+        path, sensors["gyro"], sensors["accel"], notes, warnings, "android", True
+    )
     used = {file.name for tables in groups.values() for file in tables}
     for file in files:
         if file.name not in used:
-            others = _others_of(file, notes) | others
+            others = _others_of(file, notes, warnings) | others
+    if is_turned and MAGNETOMETER in others:
+        with leaving_out(MAGNETOMETER, warnings):
+            problem = "--columns gives the gyro other axes, and no option those of the magnetometer"
+            remedy = "exchange the columns of both in the file"
+            raise InputError(others.pop(MAGNETOMETER).file, problem, remedy)
     return recording._replace(track=track, others=tuple(others.values()))
+
+
+def _are_exchanged(columns: list[str]) -> bool:
+    """Whether columns that are taken as x, y and z are negated, or have names in another order."""
+    places = zip(*map(labels.plain_name, columns), strict=False)
+    axes = [letters for letters in places if len(set(letters)) > 1]
+    is_in_order = len(axes) != 1 or sorted(axes[0]) == list(axes[0])
+    return any(column.startswith("-") for column in columns) or not is_in_order
 
 
 def _has_both(file: LogFile, units: dict[str, None] | None = None) -> bool:
@@ -228,20 +291,27 @@ def _has_both(file: LogFile, units: dict[str, None] | None = None) -> bool:
     return {*GYRO, *ACCEL} <= set(labels.resolve_labels(file.layout.labels, units=units))
 
 
-def _others_of(file: LogFile, notes: list[str]) -> dict[str, RawReadings]:
-    """The sensors beside the IMU in a table of their own; none if it cannot be read, or has no
-    stamps."""
-    columns = columns_of(file.layout.labels)
+def _others_of(file: LogFile, notes: list[str], warnings: list[str]) -> dict[str, RawReadings]:
+    """The sensors beside the IMU in a table of their own; none if it has no stamps. A sensor that
+    cannot be read is left out with a warning."""
+    columns, tagged = columns_of(file.layout.labels), _other_sensor(file.location.name)
+    if tagged and tagged not in columns:
+        with leaving_out(tagged, warnings):
+            problem = "has no header with known names of its columns"
+            names = f"time, {', '.join(_PLAIN_HEADERS[tagged])}"
+            remedy = (
+                f"write one, as {names}; for rows with tags it is a comment, # {file.name}, ..."
+            )
+            raise InputError(file.path, problem, remedy)
     time = labels.resolve_labels(file.layout.labels).get("time")
-    if not columns or time is None:
-        return {}
-    try:
-        log = _open_log(file, {}, None, notes)
-        stamps, second = log.stamps(time)
-        return {s: readings_of(s, log.table, stamps, c, second) for s, c in columns.items()}
-    except InputError as error:
-        notes.append(f"{', '.join(columns)} left out: {error}")
-        return {}
+    readings = dict[str, RawReadings]()
+    for sensor, names in columns.items():
+        with leaving_out(sensor, warnings):
+            log = _open_log(file, {}, None, notes)
+            stamps, second = log.stamps(time or "time", notes)
+            new = readings_of(sensor, log.table, stamps, names, second, texts=log.texts)
+            readings[sensor] = new
+    return readings
 
 
 def _columns(

@@ -50,10 +50,10 @@ import pandas as pd
 
 from gnio_jax.apps.importing.clocks import Sensor, sensor_of
 from gnio_jax.apps.importing.files import LogFile, spell_names
-from gnio_jax.apps.importing.readings import ACCURACY, RawReadings, readings_of
+from gnio_jax.apps.importing.readings import ACCURACY, RawReadings, leaving_out, readings_of
 from gnio_jax.apps.importing.recording import RawRecording
 from gnio_jax.data.labels import unit_of, unit_text
-from gnio_jax.data.parsing.text import open_text
+from gnio_jax.data.parsing.text import NO_ROW, open_text
 from gnio_jax.data.sensors import BAROMETER, GNSS, MAGNETOMETER, SENSOR_KINDS
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
@@ -187,7 +187,7 @@ def _phyphox_columns(files: list[LogFile]) -> Iterator[_OtherTable]:
     """The tables of other sensors of phyphox, by the units and the order of their columns."""
     for file in files:
         labels = file.layout.labels
-        time = next(filter(_is_time, labels), None)
+        time = next(filter(_is_time, labels), "Time (s)")
         units = {label: (unit_text(label) or "").lower() for label in labels}
         degrees, metres = ([x for x in labels if units[x] == unit] for unit in ("°", "m"))
         pressures = [label for label in labels if units[label] in ("hpa", "mbar")]
@@ -196,18 +196,15 @@ def _phyphox_columns(files: list[LogFile]) -> Iterator[_OtherTable]:
             for label in labels
             if units[label] in ("µt", "μt", "ut") and (match := _AXIS.search(label))
         }
-        if time is None:
-            continue
+        clock = file, time, "s"
         if set("xyz") == fields.keys():
-            yield _OtherTable(MAGNETOMETER, file, time, "s", fields, "µT")
-        elif len(pressures) == 1:
-            yield _OtherTable(BAROMETER, file, time, "s", {"pressure": pressures[0]}, "hPa")
-        elif len(degrees) >= 2:
+            yield _OtherTable(MAGNETOMETER, *clock, fields, "µT")
+        if len(pressures) == 1:
+            yield _OtherTable(BAROMETER, *clock, {"pressure": pressures[0]}, "hPa")
+        if len(degrees) >= 2:
             names = ("altitude", *ACCURACY)
             columns = dict(zip(("latitude", "longitude"), degrees, strict=False))
-            yield _OtherTable(
-                GNSS, file, time, "s", columns | dict(zip(names, metres, strict=False))
-            )
+            yield _OtherTable(GNSS, *clock, columns | dict(zip(names, metres, strict=False)))
 
 
 def _is_time(label: str) -> bool:
@@ -260,24 +257,26 @@ class _OtherTable(NamedTuple):
 
 
 def _with_others(recording: RawRecording, tables: Iterable[_OtherTable]) -> RawRecording:
-    """The recording with the readings of these tables. Empty ones, and those without the columns of
-    their sensor, are left out with a note."""
+    """The recording with the readings of these tables. Those of a sensor that was not recorded are
+    left out with a note, and those without its columns with a warning."""
     readings = dict[str, RawReadings]()
     for sensor, file, clock, second, columns, unit in tables:
-        try:
-            table, _ = file.read()
-            is_whole = table.columns[clock].dtype.kind in "iu"
+        with leaving_out(sensor, recording.warnings):
+            try:
+                table, _ = file.read()
+            except InputError as error:
+                if error.parts[1] != NO_ROW:
+                    raise
+                recording.notes.append(f"{sensor} is left out: {error}")
+                continue
+            is_whole = clock in table.columns and table.columns[clock].dtype.kind in "iu"
             stamps = table.stamps(clock) if is_whole else table.take(clock, gaps=True)
-            missing = (
-                set(SENSOR_KINDS[sensor].columns[: SENSOR_KINDS[sensor].required]) - columns.keys()
-            )
-            if missing:
+            kind = SENSOR_KINDS[sensor]
+            if missing := set(kind.columns[: kind.required]) - columns.keys():
                 problem = f"column '{min(missing)}' is missing"
                 raise InputError(file.path, problem, "export it again")
             new = readings_of(sensor, table, stamps, columns, second, unit)
             readings.setdefault(sensor, new)
-        except InputError as error:
-            recording.notes.append(f"{sensor} is left out: {error}")
     return recording._replace(others=tuple(readings.values()))
 
 

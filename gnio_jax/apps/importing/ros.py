@@ -63,9 +63,12 @@ def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
     samples, poses, mounts, rows = content
     of_gyro, of_accel = samples[imu.name], samples[other.name]
     gyro, accel = of_gyro.sensor("gyro", imu.name, path), of_accel.sensor("accel", other.name, path)
-    if of_gyro.by_headers != of_accel.by_headers:
+    delay = abs(of_gyro.lead - of_accel.lead) * of_gyro.by_headers
+    if of_gyro.by_headers != of_accel.by_headers or delay > DELAY:
         problem = f"topics {imu.name} and {other.name} are stamped by different clocks"
         raise InputError(path, problem, "name other topics")
+    frames = (one.first.header.frame_id.lstrip("/") for one in (of_gyro, of_accel))
+    accel = accel._replace(values=_turn(accel.values, *frames, other.name, mounts, path, notes))
     clock = "headers" if of_gyro.by_headers else "bag: its headers have no time"
     if of_gyro.has_headers and not of_gyro.by_headers:
         clock, problem = "bag", f"the headers of {imu.name} run {of_gyro.pace:.3g} times as fast as"
@@ -84,8 +87,9 @@ def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
                 raise
             notes.append(f"{path.name}: no reference is taken: {error}")
     recording = RawRecording(path, gyro, accel, notes, warnings, "android", track=track)
+    recording = recording._replace(by_columns=False)
     others = (
-        _other_readings(topic, rows[topic.name], mounts, of_gyro, path, notes)
+        _other_readings(topic, rows[topic.name], mounts, of_gyro, path, notes, warnings)
         for topic in topics
         if rows[topic.name]
     )
@@ -109,24 +113,53 @@ def _other_topics(bag: Bag, notes: list[str]) -> list[Topic]:
 
 
 def _other_readings(
-    topic: Topic, rows: list[_Row], mounts: _Mounts, imu: _Imu, path: Path, notes: list[str]
+    topic: Topic,
+    rows: list[_Row],
+    mounts: _Mounts,
+    imu: _Imu,
+    path: Path,
+    notes: list[str],
+    warnings: list[str],
 ) -> RawReadings:
     """The readings of a topic of one of `OTHERS`, a field turned to the axes of the IMU."""
     sensor = OTHERS[topic.type]
     headers, logged, values, std = (
         np.array(column) for column in list(zip(*rows, strict=True))[:4]
     )
-    stamps = headers if imu.by_headers and (headers > 0).all() else logged
+    is_stamped = imu.by_headers and bool((headers > 0).all())
+    delay = _lead(headers, logged) - imu.lead if is_stamped else 0.0
+    if abs(delay) > DELAY:
+        problem = f"clock: {path.name}: the headers of {topic.name} are {delay:+.2f} s from the"
+        warnings.append(f"{problem} IMU's, by the bag's clock, whose stamps are taken for it")
+        headers = logged + round(imu.lead * 1e9)
+    stamps = headers if is_stamped else logged
     if sensor == MAGNETOMETER:
-        frame, body = rows[0].frame.lstrip("/"), imu.first.header.frame_id.lstrip("/")
-        mount = _mount(body, frame, mounts)
-        if mount is not None:
-            values = mount.rotation.apply(values)
-        elif frame != body:
-            problem = f"{path.name}: {topic.name} is in '{frame}', the IMU in '{body}', and no"
-            notes.append(f"{problem} static transform joins them: taken as one")
+        frames = imu.first.header.frame_id.lstrip("/"), rows[0].frame.lstrip("/")
+        values = _turn(values, *frames, topic.name, mounts, path, notes)
     file = path / topic.name.strip("/")
     return RawReadings(sensor, file, stamps, values.astype(float), std.astype(float), "ns")
+
+
+def _turn(
+    values: Float[np.ndarray, "n 3"],
+    body: str,
+    frame: str,
+    topic: str,
+    mounts: _Mounts,
+    path: Path,
+    notes: list[str],
+) -> Float[np.ndarray, "n 3"]:
+    """Vectors of a topic in the axes of `body`, the frame of the gyro, by the static transforms. If
+    these do not join the frames, they are taken as one, with a note."""
+    if body == frame:
+        return values
+    mount = _mount(body, frame, mounts)
+    if mount is None:
+        problem = f"{path.name}: {topic} is in '{frame}', the IMU in '{body}', and no"
+        notes.append(f"{problem} static transform joins them: taken as one")
+        return values
+    notes.append(f"{path.name}: {topic} turned from '{frame}' to '{body}' by /tf_static")
+    return mount.rotation.apply(values)
 
 
 def _imu_topic(bag: Bag, name: str | None) -> Topic:
@@ -196,6 +229,11 @@ class _Imu(NamedTuple):
         """Time that passes by the headers in a second of the bag, without the outermost stamps."""
         spans = [np.ptp(np.percentile(stamps, [5, 95])) for stamps in (self.headers, self.logged)]
         return float(spans[0] / max(spans[1], 1.0))
+
+    @property
+    def lead(self) -> float:
+        """Time by which the headers are ahead of the bag's stamps, s."""
+        return _lead(self.headers, self.logged)
 
     @property
     def has_headers(self) -> bool:
@@ -285,6 +323,10 @@ def _row(message: Any, logged: int) -> _Row:
         if message.position_covariance_type > 0:
             std = tuple(np.sqrt(np.maximum(variances, 0.0)).tolist())
     return _Row(_stamp(message), logged, values, std, message.header.frame_id)
+
+
+def _lead(headers: Int[np.ndarray, " n"], logged: Int[np.ndarray, " n"]) -> float:
+    return float(np.median(headers - logged)) * 1e-9
 
 
 def _stamp(message: Any) -> int:

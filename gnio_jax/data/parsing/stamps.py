@@ -174,12 +174,31 @@ def most_damaged_rows(count: int) -> float:
     return float(max(min(FEW_ROWS, MOST_SHARE * count), FEW_SHARE * count))
 
 
-def parse_times(cells: pd.Series) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Stamps of times of day, and which cells are one: ns since 1970, or since midnight if there is
-    no date, in UTC if there is no zone. Examples are 2024-05-03 09:15:02.250, 20240503_091502.250,
-    09:15:02:250, 15:02.250 and 5/3/2024 9:15:02 AM. A time without a date that is earlier by half
-    a day than the one before is of the next day, and minutes without an hour are of the next
-    hour."""
+def parse_dates(cells: pd.Series) -> tuple[pd.Series, str]:
+    """The moments of dates, with a time of day or without (NaT: none), and what is assumed about
+    them. A date is in UTC if it states no zone. The day comes before the month if the date has
+    points, or a first number above 12; otherwise the month comes first. Examples are 2024-05-03,
+    20240503, 3.5.2024, 13/5/2024 and 5/3/2024."""
+    text = cells.astype(str).str.strip(" \"'")
+    text = text.str.replace(r"^(\d{4})(\d\d)(\d\d)(\.0)?$", r"\1-\2-\3", regex=True)
+    parts = text.str.extract(r"^(\d{1,2})([./-])\d{1,2}\2")
+    by_day = bool((parts[1] == ".").any() or (parts[0].astype(np.float64) > 12).any())
+    moments = pd.to_datetime(text, format="mixed", dayfirst=by_day, utc=True, errors="coerce")
+    has_zone = text.str.contains(r":\d\d(?:\.\d+)? *(?:Z|[+-]\d\d:?\d\d)$").any()
+    order = "with the day before the month" if by_day else "with the month before the day"
+    words = ["in UTC"] * (not has_zone) + [order] * bool(parts[0].notna().any())
+    remark = f"dates are taken to be {', '.join(words)}" if words else ""
+    return moments.dt.tz_localize(None), remark
+
+
+def parse_times(
+    cells: pd.Series,
+) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], str]:
+    """Stamps of times of day, which cells are one, and what is assumed about dates: ns since 1970
+    (`parse_dates`), or since midnight if there is no date. Examples are 2024-05-03 09:15:02.250,
+    20240503_091502.250, 09:15:02:250, 15:02.250 and 5/3/2024 9:15:02 AM. A time without a date that
+    is earlier by half a day than the one before is of the next day, and minutes without an hour are
+    of the next hour."""
     text = cells.astype(str).str.strip(" \"'[]")
     date = r"^(\d{4})-?(\d\d)-?(\d\d)[ _T-](\d\d)[:-]?(\d\d)[:-]?(\d\d)"
     text = text.str.replace(date, r"\1-\2-\3 \4:\5:\6", regex=True)
@@ -194,9 +213,8 @@ def parse_times(cells: pd.Series) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarra
         stamps = np.where(np.isnan(half), stamps, stamps % (DAY // 2) + (half == 1) * (DAY // 2))
         turn = DAY if has_hours else DAY // 24
         stamps[valid] += turn * np.cumsum(np.diff(stamps[valid], prepend=0) < -turn // 2)
-        return stamps, valid
+        return stamps, valid, ""
     dated = text.where(text.str.contains(r"\d:\d\d"))
-    is_dotted = bool(text.str.match(r"\d{1,2}\.\d").any())
-    dates = pd.to_datetime(dated, format="mixed", dayfirst=is_dotted, utc=True, errors="coerce")
-    moments = dates.dt.tz_localize(None).fillna(pd.Timestamp(0)).to_numpy()
-    return moments.astype("datetime64[ns]").astype(np.int64), dates.notna().to_numpy()
+    dates, remark = parse_dates(dated)
+    moments = dates.fillna(pd.Timestamp(0)).to_numpy()
+    return moments.astype("datetime64[ns]").astype(np.int64), dates.notna().to_numpy(), remark

@@ -31,6 +31,8 @@ NUMERIC_SHARE = 0.9
 """Share of numbers among the cells of a column from which others are damaged."""
 SEPARATORS = (",", ";", "\t", "|", " ")
 """Separators of cells; " " means any run of blanks."""
+NO_ROW = "holds no row"
+"""The problem of a table with nothing below its header."""
 _CONTROLS = bytes({*range(32)} - {*b"\t\n\v\f\r"})
 _MARK = re.compile(r"^\s*(#|//|%|@|!)+\s*")
 _DIGITS = r"[+\-\u2212]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
@@ -225,7 +227,7 @@ def _parse(path: Path, layout: Layout, content: bytes | None) -> pd.DataFrame:
             compression=None,
         )
     except pd.errors.EmptyDataError:
-        raise InputError(path, "holds no row", "take the file as the logger wrote it") from None
+        raise InputError(path, NO_ROW, "take the file as the logger wrote it") from None
 
 
 def strict_frame(path: Path, layout: Layout, content: bytes | None = None) -> pd.DataFrame:
@@ -274,8 +276,9 @@ def tolerant_frame(
     columns = {index: frame[index] for index in frame}
     for index, column in columns.items():
         if column.dtype.kind == "O":
-            columns[index], valid = _convert_columns(column, damaged, layout.decimal)
+            columns[index], valid, remark = _convert_column(column, damaged, layout.decimal)
             damaged = damaged | ~valid
+            notes += [f"{path.name}: {remark}"] if remark else []
     if damaged.any():
         number, cells = next(islice(rows_of(path, layout, content), int(np.argmax(damaged)), None))
         problem = f"row {number} is not a row of {width} numbers: it has {len(cells)} cells"
@@ -287,10 +290,11 @@ def tolerant_frame(
     return pd.DataFrame(columns).loc[~damaged].reset_index(drop=True), np.flatnonzero(~damaged)
 
 
-def _convert_columns(
+def _convert_column(
     column: pd.Series, damaged: Bool[np.ndarray, " n"], decimal: str
-) -> tuple[pd.Series, Bool[np.ndarray, " n"]]:
-    """A column of cells as numbers or times, if most are that, and which of them are."""
+) -> tuple[pd.Series, Bool[np.ndarray, " n"], str]:
+    """A column of cells as numbers or times, if most are that; which of them are; and what is
+    assumed about dates."""
     text = column.astype(str).str.strip(" \"'\0").str.replace("\u2212", "-")
     if decimal == "," and text[text.str.contains(".", regex=False)].str.fullmatch(_THOUSANDS).all():
         text = text.str.replace(".", "")
@@ -299,8 +303,8 @@ def _convert_columns(
     numbers = pd.Series(pd.to_numeric(text.str.replace(",", "."), errors="coerce"))
     valid = numbers.notna().to_numpy()
     if (valid & ~blank & ~damaged).sum() >= least:
-        return numbers, valid | blank
-    stamps, valid = parse_times(text)
+        return numbers, valid | blank, ""
+    stamps, valid, remark = parse_times(text)
     if (valid & ~blank & ~damaged).sum() >= least:
-        return pd.Series(stamps.astype("datetime64[ns]")), valid
-    return column, np.ones(len(column), dtype=bool)
+        return pd.Series(stamps.astype("datetime64[ns]")), valid, remark
+    return column, np.ones(len(column), dtype=bool), ""

@@ -757,6 +757,41 @@ def test_a_date_and_a_time_are_one_stamp(tmp_path):
     assert sequence.attributes["start_time"] == pytest.approx(1_714_780_795.0)
 
 
+@pytest.mark.parametrize(
+    ("date", "words"),
+    [
+        ("2024-05-03", "to be in UTC$"),
+        ("20240503", "to be in UTC$"),
+        ("03.05.2024", "to be in UTC, with the day before the month"),
+        ("3.5.2024", "to be in UTC, with the day before the month"),
+        ("05/03/2024", "to be in UTC, with the month before the day"),
+    ],
+)
+def test_a_date_is_the_same_in_a_column_of_its_own(tmp_path, date, words):
+    texts = clock_text(33_302_250 + ROWS * 10, "{h:02d}:{m:02d}:{s:02d}.{ms:03d}")
+    path = put(tmp_path, table([f"{date},{text}" for text in texts], ("date", *HEADER)))
+    sequence, notes = import_recording(path, {"time": "date+time"})
+    assert sequence.attributes["start_time"] == pytest.approx(1_714_727_702.25)
+    assert any(re.search(words, note) for note in notes)
+    if len(date) != 8 or "." in date:  # a number of eight digits is no date beside others
+        joined, notes = import_recording(put(tmp_path, table([f"{date} {x}" for x in texts])))
+        assert joined.attributes["start_time"] == pytest.approx(1_714_727_702.25)
+        assert sum(bool(re.search(words, note)) for note in notes) == 1
+
+
+def test_a_first_number_above_twelve_is_a_day_and_what_is_no_date_is_refused(tmp_path):
+    texts = clock_text(86_400_000 - 5_000 + ROWS * 10, "{h:02d}:{m:02d}:{s:02d}.{ms:03d}")
+    dates = np.where(ROWS < 500, "12/05/2024", "13/05/2024")
+    stamps = [f"{date},{text}" for date, text in zip(dates, texts, strict=True)]
+    path = put(tmp_path, table(stamps, ("date", *HEADER)))
+    sequence, _ = import_recording(path, {"time": "date+time"})
+    compare_imu(sequence)
+    assert sequence.attributes["start_time"] == pytest.approx(1_715_558_395.0)
+    path = put(tmp_path, table([f"Monday,{text}" for text in texts], ("date", *HEADER)))
+    words = "column 'date' holds 'Monday', no date; write dates as 2024-05-03"
+    refused(path, words, {"time": "date+time"})
+
+
 # --- units
 
 
@@ -860,6 +895,17 @@ def test_rows_of_two_imus_are_chosen_by_a_column(tmp_path):
     path = put(tmp_path, lines(header, *others, *second))  # one after the other
     refused(path, "rows of several sensors: column 'I' holds 0, 1 in turn; choose one: --where I=0")
     check(path, options={"where": "I=0"})
+
+
+@pytest.mark.parametrize("delay", [0, 4, 5])
+def test_two_devices_in_turn_without_a_column_are_refused(tmp_path, delay):
+    """The other one is turned by a quarter, and has the same stamps or those between."""
+    turned = Rotation.from_euler("z", 90, degrees=True).apply(WALK.reshape(-1, 3)).reshape(-1, 6)
+    header, others = rows(table([f"{n * 10}" for n in ROWS]))
+    second = rows(table([f"{n * 10 + delay}" for n in ROWS], values=turned))[1]
+    path = put(tmp_path, lines(header, *interleaved(others, second)))
+    refused(path, "two sensors in turn: .* far more from the next .*; keep the rows of one sensor")
+    check(put(tmp_path, lines(header, *interleaved(others, second)[::2])))
 
 
 # --- sensors that contradict each other

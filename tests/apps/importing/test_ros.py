@@ -131,6 +131,38 @@ def test_gyro_and_accelerometer_of_two_topics(tmp_path):
         refused(path, words, imu_topic=topic)
 
 
+def test_an_accelerometer_in_a_frame_of_its_own_is_turned_to_the_gyro(tmp_path):
+    make, turn = Maker(), Rotation.from_euler("z", 90, degrees=True)
+    entries = imu(make, "/accel", seconds=20.0, no="gyro", frame="accel_link")
+    for _, _, _, message in entries:
+        force = message.linear_acceleration
+        message.linear_acceleration = make.vector(turn.inv().apply([force.x, force.y, force.z]))
+    static = make.static("imu_link", "accel_link", turn, [0.0, 0.0, 0.0])
+    entries += imu(make, "/gyro", seconds=20.0, no="accel")
+    topics = {"imu_topic": "/gyro", "accel_topic": "/accel"}
+    refused(
+        write(tmp_path, "mcap", entries),
+        "the sensors contradict each other.*give both sensors the same axes in their driver, or in",
+        **topics,
+    )
+    entries += bag_files.rows("/tf_static", "tf2_msgs/msg/TFMessage", [0.0], lambda _: static)
+    sequence, notes = import_recording(write(tmp_path, "mcap", entries), **topics)
+    np.testing.assert_allclose(sequence.accel, known_walk.force(sequence.time), atol=1e-9)
+    assert "walk.mcap: /accel turned from 'accel_link' to 'imu_link' by /tf_static" in notes
+
+
+def test_topics_of_different_clocks_and_options_of_tables_are_refused(tmp_path):
+    make = Maker()
+    accel_rows = imu(make, "/accel", no="gyro")
+    for _, _, _, message in accel_rows:
+        message.header.stamp.sec += 1
+    path = write(tmp_path, "mcap", imu(make, "/gyro", no="accel") + accel_rows)
+    topics = {"imu_topic": "/gyro", "accel_topic": "/accel"}
+    refused(path, "topics /gyro and /accel are stamped by different clocks", **topics)
+    words = "is an MCAP, no table with columns and rows; leave out --columns"
+    refused(path, words, {"gyro_x": "gyro_y"}, **topics)
+
+
 def test_a_reference_that_is_none_is_left_out_unless_it_was_named(tmp_path):
     """Too few poses, those of another time, those of a world that lies on its side."""
     make = Maker()
