@@ -43,12 +43,12 @@ def predicted(poses, gyro, accel):
     in_body = np.einsum("...ji,...j->...i", rotation, velocity)
     in_body = in_body + np.cross(gyro - gyro_bias, np.array(MOUNTED.lever))
     mounting = Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix()
-    ahead, left, up = np.moveaxis(in_body @ mounting, -1, 0)
+    ahead, leftward, upward = np.moveaxis(in_body @ mounting, -1, 0)
     force = accel - accel_bias - 9.81 * rotation[..., 2, :]
     accel_ahead, accel_left, _ = np.moveaxis(force @ mounting, -1, 0)
-    left = left + MOUNTED.sideslip_gradient * accel_left * ahead
-    up = up + MOUNTED.pitch_gradient * accel_ahead * ahead
-    return np.stack([ahead, left, up], axis=-1)
+    leftward = leftward + MOUNTED.sideslip_gradient * accel_left * ahead
+    upward = upward + MOUNTED.pitch_gradient * accel_ahead * ahead
+    return np.stack([ahead, leftward, upward], axis=-1)
 
 
 def wheels(speeds):
