@@ -16,7 +16,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.data.assembly import RECORDED_RATE
 from gnio_jax.data.gait import Gait, detect_gait
 from gnio_jax.data.geodesy import Place
-from gnio_jax.data.sensors import GNSS
+from gnio_jax.data.sensors import BAROMETER, GNSS
 from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, metrics
 from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.filtering import Filter
@@ -275,6 +275,7 @@ def _warnings_of_walk(summary: Summary, recorded_rate: float, ekf: Filter) -> li
     accepted = 1.0 if summary.accepted is None else summary.accepted
     speed = summary.path_length / max(summary.seconds, 1e-9)
     rate = 1.0 / ekf.config.dt
+    has_height = any(use.sensor == BAROMETER and use.accepted for use in summary.sensors)
     at_rest = "the filter holds the position"
     if not any(isinstance(measurement, ZeroVelocity) for measurement in ekf.measurements):
         at_rest = "the filter does not measure this (filter.measurements.zero_velocity), so the "
@@ -288,7 +289,7 @@ def _warnings_of_walk(summary: Summary, recorded_rate: float, ekf: Filter) -> li
         f"running: in {summary.running:.0%} of the seconds it is shaken as in a run, where "
         "networks trained on walks make the path too short": summary.running > RUNNING_SHARE,
         f"height: it changes by {summary.climb:.1f} m: that is drift unless the way goes up or "
-        "down, which few networks have learnt": summary.climb > CLIMB,
+        "down, which few networks have learnt": summary.climb > CLIMB and not has_height,
         f"gate: the filter refused {1.0 - accepted:.0%} of the network's displacements: the motion "
         "is unlike that in the network's training data, and the error may be many times the "
         "expected one": accepted < 1.0 - REFUSED,

@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.apps.importing import Imported, import_recording
+from gnio_jax.apps.sensors import SensorUse
 from gnio_jax.apps.summary import (
     Summary,
     _warnings_of_errors,
@@ -311,6 +312,7 @@ FILTER = make_filter(DataConfig(), FilterSettings(measurements={"zero_velocity":
         ({"at_rest": 0.97}, "rest: it lies still 97% of the time, and the filter holds"),
         ({"running": 0.94}, "running: in 94% of the seconds it is shaken as in a run"),
         ({"climb": 4.26}, "height: it changes by 4.3 m: that is drift unless"),
+        ({"climb": 4.26, "sensors": (SensorUse("barometer", 9, 0.9, ""),)}, None),
         ({"path_length": 400.0}, "speed: 4.0 m/s in the mean"),
         ({"errors": {"nees_coverage_2d": 88.0}}, None),
         (

@@ -121,6 +121,7 @@ def test_a_barometer_is_heard_beside_a_network_that_is_sure_of_level_ground(runs
     std = np.sqrt(result.estimate.filtered.covariance[:, 2, 2])
     assert np.abs(height).max() < 2.0 and (np.abs(height) < 3 * std)[50:].all()
     assert share_of(result, "barometer") > 0.95
+    assert not any("that is drift" in line for line in result.summary.warnings)
 
 
 def test_the_magnetometer_alone_holds_the_heading_of_a_raw_gyro(runs, tmp_path):
