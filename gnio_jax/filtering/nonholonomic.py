@@ -6,11 +6,11 @@ With the rotation C (car ← body) and the lever l from the IMU to the point, in
 
     0 = [C (Rᵀ v + (ω − b_g) × l)]_{left, up} + w,   w ~ N(0, diag(σ_left², σ_up²)).
 
-A car that is accelerated is not aimed where it goes. Ahead, its springs raise the nose by the angle
-γ_p a_ahead, and to the left, its rear tyres slip by the angle γ_s a_left. With the acceleration
-a = C (f − b_a − Rᵀ g e_z) of the car, f the mean specific force of the interval, the constraint is
+A car that the road pushes is not aimed where it goes. Pushed ahead, its springs raise the nose by
+the angle γ_p f_ahead. Pushed to the left, its rear tyres slip by the angle γ_s f_left, driving
+backwards, too. With the specific force f = C (f̄ − b_a), f̄ its mean over the interval, the constraint is
 
-    0 = [u]_{left, up} + [γ_s a_left, γ_p a_ahead] [u]_ahead + w
+    0 = u_{left, up} + [γ_s f_left |u_ahead|, γ_p f_ahead u_ahead] + w
 
 for the velocity u = C (Rᵀ v + …) above. Both gradients are zero by default.
 
@@ -38,7 +38,7 @@ from gnio_jax.config.schema import ABOVE_ZERO, FINITE, Number
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.geometry import hat, matmul
-from gnio_jax.types import GRAVITY, NONHOLONOMIC_LOG_FACTOR, Array
+from gnio_jax.types import NONHOLONOMIC_LOG_FACTOR, Array
 
 THRESHOLD = 13.816
 """99.9 % of χ² with two degrees of freedom."""
@@ -62,9 +62,9 @@ class NonHolonomic(NamedTuple):
     lever_y: Annotated[Number, FINITE] = 0.0
     lever_z: Annotated[Number, FINITE] = 0.0
     pitch_gradient: Annotated[Number, FINITE] = 0.0
-    """γ_p: pitch of the car on its springs, nose up, for an acceleration ahead, rad per m/s²."""
+    """γ_p: pitch of the car on its springs, nose up, for a specific force ahead, rad per m/s²."""
     sideslip_gradient: Annotated[Number, FINITE] = 0.0
-    """γ_s: angle by which the rear tyres slip outwards in a curve, for an acceleration towards its
+    """γ_s: angle by which the rear tyres slip outwards in a bend, for a specific force towards its
     inside, rad per m/s²."""
     name = "nonholonomic"
 
@@ -82,27 +82,27 @@ class NonHolonomic(NamedTuple):
             log_factor = step.diagnostics[NONHOLONOMIC_LOG_FACTOR].astype(dtype)
             finite = jnp.isfinite(log_factor).all()
             std = std * jnp.exp(jnp.where(finite, log_factor, 0.0))
-        ahead, *across = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)
+        axes = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)
+        ahead, across = axes[0], axes[1:]
         lever = jnp.stack([jnp.asarray(x, dtype) for x in self.lever])
         velocity, present = velocity_of_point(state, step, lever)
-        # Rows for the left and up: the angle for an acceleration in the body.
+        # The rows are those of the left and up, as for `across`.
         gradients = jnp.stack([self.sideslip_gradient * across[0], self.pitch_gradient * ahead])
-        force = jnp.mean(step.imu.accel, axis=0) - state.accel_bias
-        force = force - GRAVITY * state.rotation[2]
-        angles = matmul(gradients, force[:, None])
-        across = jnp.stack(across) + angles * ahead[None]
-        of_velocity = matmul(across, state.rotation.T)
-        of_force = jnp.sum(ahead * velocity) * gradients
-        gravity = jnp.array([[0.0, 0.0, GRAVITY]], dtype)
-        of_tilt = jnp.cross(gravity, matmul(of_force, state.rotation.T))
+        angles = matmul(gradients, mean_force(state, step)[:, None])[:, 0]
+        speed = jnp.sum(ahead * velocity)
+        speeds = jnp.stack([jnp.abs(speed), speed])
+        slopes = jnp.stack([jnp.sign(speed), jnp.ones_like(speed)])  # of `speeds` by the speed
+        predicted = matmul(across, velocity[:, None])[:, 0] + angles * speeds
+        of_body_velocity = across + (angles * slopes)[:, None] * ahead[None]
+        of_velocity = matmul(of_body_velocity, state.rotation.T)
         linear = linearise(
             state,
-            jnp.where(present, -matmul(across, velocity[:, None])[:, 0], jnp.nan),
+            jnp.where(present, -predicted, jnp.nan),
             jnp.diag(std**2),
             velocity=of_velocity,
-            rotation=matmul(of_velocity, hat(state.velocity)) + of_tilt,
-            gyro_bias=matmul(across, hat(lever)),
-            accel_bias=-of_force,
+            rotation=matmul(of_velocity, hat(state.velocity)),
+            gyro_bias=matmul(of_body_velocity, hat(lever)),
+            accel_bias=-speeds[:, None] * gradients,
         )
         return measure(state, linear, step, THRESHOLD)
 
@@ -116,6 +116,17 @@ def velocity_of_point(
         present = ~step.imu.gap.missing[-1]
     velocity = matmul(state.rotation.T, state.velocity[:, None])[:, 0] + jnp.cross(rate, lever)
     return velocity, present
+
+
+def mean_force(state: FilterState, step: Step) -> Float[Array, "3"]:
+    """Mean specific force of the samples of the interval that were measured, without the bias; the
+    negative bias if there is none."""
+    imu = step.imu
+    if imu.gap is None:
+        return jnp.mean(imu.accel, axis=0) - state.accel_bias
+    measured = ~imu.gap.missing
+    sums = jnp.sum(jnp.where(measured[:, None], imu.accel, 0.0), axis=0)
+    return sums / jnp.maximum(jnp.sum(measured), 1) - state.accel_bias
 
 
 def car_axes(yaw: Number, pitch: Number, roll: Number) -> Float[Array, "3 3"]:

@@ -44,10 +44,9 @@ def predicted(poses, gyro, accel):
     in_body = in_body + np.cross(gyro - gyro_bias, np.array(MOUNTED.lever))
     mounting = Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix()
     ahead, leftward, upward = np.moveaxis(in_body @ mounting, -1, 0)
-    force = accel - accel_bias - 9.81 * rotation[..., 2, :]
-    accel_ahead, accel_left, _ = np.moveaxis(force @ mounting, -1, 0)
-    leftward = leftward + MOUNTED.sideslip_gradient * accel_left * ahead
-    upward = upward + MOUNTED.pitch_gradient * accel_ahead * ahead
+    force_ahead, force_left, _ = np.moveaxis((accel - accel_bias) @ mounting, -1, 0)
+    leftward = leftward + MOUNTED.sideslip_gradient * force_left * abs(ahead)
+    upward = upward + MOUNTED.pitch_gradient * force_ahead * ahead
     return np.stack([ahead, leftward, upward], axis=-1)
 
 
@@ -150,6 +149,32 @@ def test_the_gradients_take_away_what_springs_and_tyres_do():
         whitened = np.linalg.solve(spread, error[..., None])[..., 0]
         nees[name] = np.mean(np.sum(error * whitened, axis=-1)) / 3
     assert nees["sprung"] < 1.5 < 3 < nees["rigid"]
+
+
+@pytest.mark.parametrize("speed", [8.0, -8.0])
+def test_tyres_slip_outwards_in_either_direction_and_springs_bend_with_the_direction(speed):
+    """On a hill of 10 % at constant speed, in a bend to the left of 2 m/s²."""
+    car = NonHolonomic(pitch_gradient=0.005, sideslip_gradient=0.01)
+    force = np.array([0.981, 2.0, 9.76])
+    true = np.array([speed, -0.01 * 2.0 * abs(speed), -0.005 * 0.981 * speed])
+    state = filtering.initial_state(filtering.Filter(CONFIG), np.eye(3), true, np.zeros(3))
+    imu = Imu(jnp.zeros((N, 3)), jnp.tile(force, (N, 1)), None)
+    _, outcome, _ = car.update(state, filtering.Step(imu, 0, 1, CONFIG, NOISE))
+    np.testing.assert_allclose(outcome.residual, 0.0, atol=1e-12)
+
+
+def test_samples_that_are_missing_have_no_part_in_the_force():
+    force = np.tile([2.0, 1.0, 9.81], (N, 1))
+    missing = np.array([True, False, True, False, False])
+    state = filtering.initial_state(
+        filtering.Filter(CONFIG), np.eye(3), np.array([9.0, 0.4, -0.3]), np.zeros(3)
+    )
+    residuals = []
+    for samples in (force, np.where(missing[:, None], 1e3, force)):
+        gap = Gap(*jnp.zeros((2, N)), jnp.ones(N), jnp.asarray(missing))
+        step = filtering.Step(Imu(jnp.zeros((N, 3)), samples, gap), 0, 1, CONFIG, NOISE)
+        residuals.append(MOUNTED.update(state, step)[1].residual)
+    np.testing.assert_array_equal(*residuals)
 
 
 def test_a_car_that_slides_is_not_believed_to_go_straight():

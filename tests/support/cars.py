@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from tests.support.walks import GRAVITY, Runs
 
 ROUNDS = 12
-"""An acceleration to the left turns the direction of motion, which is an acceleration again: so
-often, until nothing changes."""
+"""A force to the left turns the direction of motion, which takes a force again: so often, until
+nothing changes."""
 
 
 def drive(seed, runs, intervals, n, dt, noise, std, constraint, left_std, up_std, slide=0.0):
@@ -45,7 +45,8 @@ def drive(seed, runs, intervals, n, dt, noise, std, constraint, left_std, up_std
         in_body = of_point @ mounting.as_matrix().T - np.cross(rate_before, lever)
         velocity = np.einsum("rkij,rkj->rki", body, in_body)
         force = np.diff(velocity, axis=1) / dt
-        of_car = np.einsum("rkji,rkj->rki", body[:, :-1], force) @ mounting.as_matrix()
+        of_body = np.einsum("rkji,rkj->rki", body[:, :-1], force - GRAVITY)
+        of_car = of_body @ mounting.as_matrix()
         ahead_left = of_car.reshape(runs, intervals, n, 3)[..., :2].mean(axis=2)
         angles[:, 1:] = gradients * ahead_left[..., ::-1]
     position = np.cumsum(0.5 * dt * (velocity[:, 1:] + velocity[:, :-1]), axis=1)
