@@ -74,8 +74,8 @@ DISPLACEMENT_ERROR = CorrelatedError(share=0.95, seconds=20.0)
 """How long these errors last: the filter learns them from the fixes."""
 
 HEIGHT_STD = 0.5
-"""Smallest standard deviation of a vertical displacement with a barometer, m in a second: on stairs
-a walker rises by about that."""
+"""Standard deviation of the surest vertical displacement with a barometer, m in a second: on stairs
+a walker rises by about that. Those of all others are raised by the same factor."""
 
 
 class SensorUse(NamedTuple):
@@ -256,7 +256,10 @@ def _try(refused: dict[str, str], sensor: str, make: Callable[[], Any]) -> dict[
 
 
 def _for_heights(ekf: Filter) -> Filter:
-    """The filter whose vertical displacements have at least the error of stairs."""
+    """The filter whose vertical displacements have at least the error of stairs. Velocities in the
+    body have no vertical axis, so they remain."""
+    if ekf.config.measures == "velocity":
+        return ekf
     noise, config = ekf.noise, ekf.config
     least = math.exp(config.log_std_min) * math.sqrt(noise.measurement_scale)
     *level, vertical = noise.std_factor
@@ -271,11 +274,13 @@ def _heights(readings: Readings, ready: PreparedRecording, ekf: Filter) -> Measu
 
 def _with_offset(estimate: SequenceEstimate, heights: Measurement) -> SequenceEstimate:
     """The estimate whose variance of the height has that of the barometer's offset, which wanders
-    with the weather and has no state in the filter."""
+    with the weather and has no state in the filter. Where the pressures have ended it stays, since
+    from there on the filter's own variance grows."""
     assert isinstance(heights, Barometer) and estimate.filtered is not None
-    variance = np.square(heights.std)
+    growth = np.square(heights.std) - np.square(heights.std[0])
+    growth = np.maximum.accumulate(np.where(np.isfinite(heights.height), growth, 0.0))
     covariance = estimate.filtered.covariance.copy()
-    covariance[1:, 2, 2] += variance - variance[0]
+    covariance[1:, 2, 2] += growth
     return estimate._replace(filtered=estimate.filtered._replace(covariance=covariance))
 
 

@@ -8,7 +8,8 @@ With the rotation C (car ← body) and the lever l from the IMU to the point, in
 
 A car that the road pushes is not aimed where it goes. Pushed ahead, its springs raise the nose by
 the angle γ_p f_ahead. Pushed to the left, its rear tyres slip by the angle γ_s f_left, driving
-backwards, too. With the specific force f = C (f̄ − b_a), f̄ its mean over the interval, the constraint is
+backwards, too. With the specific force f = C (f_m − b_a), f_m its mean over the interval, the
+constraint is
 
     0 = u_{left, up} + [γ_s f_left |u_ahead|, γ_p f_ahead u_ahead] + w
 

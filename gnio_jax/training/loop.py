@@ -124,7 +124,7 @@ def train_all(
     for workdir, resume in zip(workdirs, resumes, strict=True):
         if resume and (workdir / WEIGHTS).exists() and not checkpoint.exists(workdir):
             problem = "has weights, and no checkpoint to continue from"
-            remedy = f"begin with its weights: --init-from {workdir} and another --workdir"
+            remedy = f"remove it, or begin with it: --init-from {workdir} and another --workdir"
             raise InputError(workdir, problem, remedy)
     through_filter = bool(configs[0].through_filter.learn)
     if through_filter and devices is not None:

@@ -64,7 +64,8 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     # The path of the data may change, but not that of the weights to begin with: others would make
     # another run of one that has no checkpoint yet, and would have no effect on the others.
     ours, theirs = (
-        configuration.flatten(configuration.without_paths(run)) | {"init_from": run.init_from}
+        configuration.flatten(configuration.without_paths(run))
+        | {"init_from": run.init_from and _spelled_out(run.init_from)}
         for run in (config, configuration.load(file))
     )
     network = models.from_config(config.model)
@@ -74,6 +75,11 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
             problem = f"'{name}' was {theirs.get(name)} and is now {ours.get(name)}"
             raise InputError(file, problem, "resume with the same settings")
     return workdir
+
+
+def _spelled_out(network: str) -> str:
+    """The whole path of a folder; a name as it is."""
+    return str(Path(network).resolve()) if Path(network).exists() else network
 
 
 @contextmanager

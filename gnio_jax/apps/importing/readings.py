@@ -58,12 +58,12 @@ _UNITS = {
         "psi": 6894.76,
     },
     _MAP[0]: {
-        "° º deg degree degrees decimaldegrees dd °n °e wgs84": 1.0,
+        "° º deg degree degrees decimaldegrees dd n e °n °e wgs84": 1.0,
         "rad radian radians": math.degrees(1.0),
         "dege7 1e7deg 1e7°": 1e-7,
     },
     _MAP[1]: {
-        "m metre metres meter meters msl amsl asl wgs84": 1.0,
+        "m metre metres meter meters msl amsl asl hae abovesealevel wgs84": 1.0,
         "km": 1e3,
         "cm": 1e-2,
         "mm": 1e-3,

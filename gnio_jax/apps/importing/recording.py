@@ -36,6 +36,9 @@ IN_TURN = 2.0
 """Ratio of the steps between neighbouring samples and between every second one, of gyro and accel,
 beyond which two devices take turns (ours). Walks have 0.5 to 0.8 and the drones of EuRoC up to 1.6;
 two walks in turn have 2.7 and more."""
+LEAST_APART = 0.01
+"""Distance of the mean specific forces of two devices, of their mean: their biases and the way in
+which they are held differ."""
 
 
 class Track(NamedTuple):
@@ -90,7 +93,7 @@ def as_sequence(
     Raises `InputError`."""
     notes, sensors = raw.notes, (raw.gyro, raw.accel)
     gyro, accel = (read_clock(one, options.time_unit, notes, raw.warnings) for one in sensors)
-    _check_one_device(gyro, accel)
+    _check_one_device(gyro, accel, raw.warnings)
     delay = float(accel.start - gyro.start)
     accel = accel._replace(time=accel.time + delay, row_time=accel.row_time + delay)
     gyro, accel = _in_si(raw, options, gyro, accel)
@@ -116,16 +119,26 @@ def as_sequence(
     return Imported(sequence, tuple(notes), tuple(dict.fromkeys(raw.warnings)))
 
 
-def _check_one_device(gyro: Clocked, accel: Clocked) -> None:
-    """Raise `InputError` if the samples of two devices take turns in both sensors."""
+def _check_one_device(gyro: Clocked, accel: Clocked, warnings: list[str]) -> None:
+    """Raise `InputError` if the samples of two devices take turns in both sensors; a warning, if
+    this may be a vibration."""
 
     def step(values: Float[np.ndarray, "n 3"], count: int) -> float:
         return float(np.median(np.linalg.norm(values[count:] - values[:-count], axis=1)))
 
+    if len(accel.values) <= 2:
+        return
+    # A part that vibrates at half of the rate turns back and forth about one mean.
+    apart = np.linalg.norm(accel.values[::2].mean(axis=0) - accel.values[1::2].mean(axis=0))
     if all(step(one.values, 1) > IN_TURN * step(one.values, 2) for one in (gyro, accel)):
-        problem = "holds two sensors in turn: in gyro and accel, samples differ far more from the"
-        problem += " next one than from the second next"
-        remedy = "keep the rows of one sensor, by --where COLUMN=VALUE if a column names it"
+        problem = "in gyro and accel, samples differ far more from the next one than from the"
+        problem += " second next"
+        if apart < LEAST_APART * np.linalg.norm(accel.values.mean(axis=0)):
+            text = f"{gyro.file.name}: {problem}: it vibrates at about half of its rate, or two"
+            warnings.append(f"{text} devices take turns, whose track is wrong")
+            return
+        problem = f"holds two sensors in turn: {problem}"
+        remedy = "keep the samples of one sensor, in a table whose column names it by --where"
         raise InputError(gyro.file, problem, remedy)
 
 

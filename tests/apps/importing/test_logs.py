@@ -899,13 +899,23 @@ def test_rows_of_two_imus_are_chosen_by_a_column(tmp_path):
 
 @pytest.mark.parametrize("delay", [0, 4, 5])
 def test_two_devices_in_turn_without_a_column_are_refused(tmp_path, delay):
-    """The other one is turned by a quarter, and has the same stamps or those between."""
-    turned = Rotation.from_euler("z", 90, degrees=True).apply(WALK.reshape(-1, 3)).reshape(-1, 6)
+    """The other one is held otherwise, and has the same stamps or those between."""
+    turn = Rotation.from_euler("zx", [90, 20], degrees=True)
+    turned = turn.apply(WALK.reshape(-1, 3)).reshape(-1, 6)
     header, others = rows(table([f"{n * 10}" for n in ROWS]))
     second = rows(table([f"{n * 10 + delay}" for n in ROWS], values=turned))[1]
     path = put(tmp_path, lines(header, *interleaved(others, second)))
-    refused(path, "two sensors in turn: .* far more from the next .*; keep the rows of one sensor")
+    refused(
+        path, "two sensors in turn: .* far more from the next .*; keep the samples of one sensor"
+    )
     check(put(tmp_path, lines(header, *interleaved(others, second)[::2])))
+
+
+def test_a_part_that_vibrates_at_half_of_the_rate_is_no_second_device(tmp_path):
+    vibration = np.cos(2 * np.pi * 0.45 * ROWS)[:, None] * np.repeat([1.0, 5.0], 3)
+    path = put(tmp_path, table([f"{n * 10}" for n in ROWS], values=WALK + vibration))
+    _, notes = import_recording(path)
+    assert any("it vibrates at about half of its rate" in note for note in notes)
 
 
 # --- sensors that contradict each other
