@@ -276,7 +276,9 @@ def _with_offset(estimate: SequenceEstimate, heights: Measurement) -> SequenceEs
     """The estimate whose variance of the height has that of the barometer's offset, which wanders
     with the weather and has no state in the filter. Where the pressures have ended it stays, since
     from there on the filter's own variance grows."""
-    assert isinstance(heights, Barometer) and estimate.filtered is not None
+    assert isinstance(heights, Barometer)
+    if estimate.filtered is None:
+        return estimate
     growth = np.square(heights.std) - np.square(heights.std[0])
     growth = np.maximum.accumulate(np.where(np.isfinite(heights.height), growth, 0.0))
     covariance = estimate.filtered.covariance.copy()
