@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from gnio_jax.config import FilterSettings
 from gnio_jax.errors import InputError, did_you_mean
@@ -88,9 +89,8 @@ def load_corrector(
     name = settings.corrector
     if name is None:
         return None
-    if network is not None and network.corrector is not None:
-        if network.config.filter.corrector == name:
-            return Corrector(network.corrector)
+    if (carried := _carried_corrector(name, network)) is not None:
+        return Corrector(carried)
     trained = load(name)
     if trained.config.model.corrector == "none":
         problem = f"names '{name}', a network without a corrector"
@@ -106,8 +106,17 @@ def digest_corrector(settings: FilterSettings, network: TrainedNetwork) -> str |
     """SHA-256 of the weights of the network that the settings of a filter name for its corrector;
     None if they name none, or if its corrector comes with `network`, whose digest has it, too."""
     name = settings.corrector
-    carried = network.corrector is not None and network.config.filter.corrector == name
-    return None if name is None or carried else read_settings(find_network(name)).digest
+    if name is None or _carried_corrector(name, network) is not None:
+        return None
+    return read_settings(find_network(name)).digest
+
+
+def _carried_corrector(name: str, network: TrainedNetwork | None) -> Any:
+    """The parts of the corrector of this name that were written with `network`; None if none
+    were."""
+    if network is None or network.config.filter.corrector != name:
+        return None
+    return network.corrector
 
 
 def with_corrector(network: TrainedNetwork) -> TrainedNetwork:

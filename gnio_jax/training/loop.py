@@ -337,8 +337,8 @@ def finish_epoch(
     improved = math.isfinite(merit) and better
     plateau = optimizer.update_plateau(position.plateau, row["val_mse"], optim)
     best = merit if improved else best
-    position = RunPosition(
-        position.epoch + 1, position.step, best, {}, position.seconds, plateau, row, improved
+    position = position._replace(
+        epoch=position.epoch + 1, best=best, sums={}, plateau=plateau, row=row, improved=improved
     )
     return position, row
 

@@ -17,8 +17,10 @@ from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import SequenceEstimate, prepare
+from gnio_jax.evaluation.metrics import Filtered
 from gnio_jax.evaluation.trajectory import Trajectory, read_tum
 from gnio_jax.filtering import magnetometer, make_filter
+from gnio_jax.filtering.barometer import Barometer
 from gnio_jax.networks import read_network
 from gnio_jax.types import Readings
 from tests.support import drawn_run, phone_walk, tiny_run
@@ -122,6 +124,19 @@ def test_a_barometer_is_heard_beside_a_network_that_is_sure_of_level_ground(runs
     assert np.abs(height).max() < 2.0 and (np.abs(height) < 3 * std)[50:].all()
     assert share_of(result, "barometer") > 0.95
     assert not any("that is drift" in line for line in result.summary.warnings)
+
+
+def test_the_drift_of_a_barometer_is_added_while_there_are_pressures():
+    """Two seconds of a filter at 10 Hz, of which the first and the last half second have none."""
+    path = Trajectory(np.arange(21) / 10, np.zeros((21, 3)), np.tile([1.0, 0, 0, 0], (21, 1)))
+    filtered = Filtered(np.tile(np.eye(3), (21, 1, 1)), np.zeros(21), np.ones(21))
+    estimate = SequenceEstimate("walk", path, path, filtered=filtered)
+    height = np.where((np.arange(20) < 5) | (np.arange(20) >= 15), np.nan, 0.0)
+    heights = Barometer(height, np.sqrt(4.0 + np.arange(20)), np.zeros(20))
+    covariance = sensors._with_offset(estimate, heights).filtered.covariance
+    growth = np.concatenate([np.zeros(6), np.arange(5, 15), np.full(5, 14)])
+    np.testing.assert_allclose(covariance[:, 2, 2], 1 + growth)
+    np.testing.assert_array_equal(covariance[:, :2], filtered.covariance[:, :2])
 
 
 def test_the_magnetometer_alone_holds_the_heading_of_a_raw_gyro(runs, tmp_path):

@@ -189,6 +189,7 @@ def _nearest_sample(stamps: Num[np.ndarray, " m"], sensor: Sensor) -> Int[np.nda
     """The sample in each row of a table with these `stamps`. For a row without one it is the sample
     before or after it, whichever has the nearer stamp, so that it is of the same start of the
     clock."""
+    assert sensor.index is not None
     after = np.searchsorted(sensor.index, np.arange(len(stamps)))
     after = np.minimum(after, len(sensor.stamps) - 1)
     before = np.maximum(after - 1, 0)

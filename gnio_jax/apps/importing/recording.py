@@ -128,11 +128,11 @@ def _check_one_device(gyro: Clocked, accel: Clocked, warnings: list[str]) -> Non
 
     if len(accel.values) <= 2:
         return
-    # A part that vibrates at half of the rate turns back and forth about one mean.
-    distance = np.linalg.norm(accel.values[::2].mean(axis=0) - accel.values[1::2].mean(axis=0))
     if all(step(one.values, 1) > IN_TURN * step(one.values, 2) for one in (gyro, accel)):
         problem = "in gyro and accel, samples differ far more from the next one than from the"
         problem += " second next"
+        # A part that vibrates at half of the rate turns back and forth about one mean.
+        distance = np.linalg.norm(accel.values[::2].mean(axis=0) - accel.values[1::2].mean(axis=0))
         if distance < LEAST_APART * np.linalg.norm(accel.values.mean(axis=0)):
             text = f"{gyro.file.name}: {problem}: it vibrates at about half of its rate, or two"
             warnings.append(f"{text} devices take turns, whose track is wrong")

@@ -67,7 +67,7 @@ def read_bag(path: Path, kind: str, options: ImportOptions) -> RawRecording:
     if of_gyro.by_headers != of_accel.by_headers or delay > DELAY:
         problem = f"topics {imu.name} and {other.name} are stamped by different clocks"
         raise InputError(path, problem, "name other topics")
-    frames = (one.first.header.frame_id.lstrip("/") for one in (of_gyro, of_accel))
+    frames = of_gyro.frame, of_accel.frame
     accel = accel._replace(values=_turn(accel.values, *frames, other.name, mounts, path, notes))
     clock = "headers" if of_gyro.by_headers else "bag: its headers have no time"
     if of_gyro.has_headers and not of_gyro.by_headers:
@@ -134,7 +134,7 @@ def _other_readings(
         headers = logged + round(imu.lead * 1e9)
     stamps = headers if is_stamped else logged
     if sensor == MAGNETOMETER:
-        frames = imu.first.header.frame_id.lstrip("/"), rows[0].frame.lstrip("/")
+        frames = imu.frame, rows[0].frame.lstrip("/")
         values = _turn(values, *frames, topic.name, mounts, path, notes)
     file = path / topic.name.strip("/")
     return RawReadings(sensor, file, stamps, values.astype(float), std.astype(float), "ns")
@@ -229,6 +229,11 @@ class _Imu(NamedTuple):
         """Time that passes by the headers in a second of the bag, without the outermost stamps."""
         spans = [np.ptp(np.percentile(stamps, [5, 95])) for stamps in (self.headers, self.logged)]
         return float(spans[0] / max(spans[1], 1.0))
+
+    @property
+    def frame(self) -> str:
+        """Name of the frame of the axes."""
+        return self.first.header.frame_id.lstrip("/")
 
     @property
     def lead(self) -> float:

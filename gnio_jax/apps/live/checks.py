@@ -173,14 +173,8 @@ class _Turning:
         self._due.pop(0)
         rows = np.array(self._rows)
         imu = physics.ImuSamples(rows[:, 0] - rows[0, 0], rows[:, 1:4], rows[:, 4:7])
-        try:
-            warnings = physics.check_turning(imu, self._name)
-        except InputError as error:
-            _, problem, remedy = error.parts
-            raise InputError(self._name, problem, _for_streams(remedy)) from None
-        yield from (
-            Arrival(arrival.clock, notice=f"warning: {_for_streams(text)}") for text in warnings
-        )
+        warnings = physics.check_turning(imu, self._name, _for_streams)
+        yield from (Arrival(arrival.clock, notice=f"warning: {text}") for text in warnings)
         if warnings or physics.is_supported(*physics.agreement(imu)):
             self._due.clear()
         if not self._due:
