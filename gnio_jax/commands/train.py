@@ -71,11 +71,12 @@ def train(request: TrainOptions, call: options.Call) -> None:
     """
     config = experiment(request, call)
     check_names([config.model.name], config.datasets)
-    if not request.resume:
-        config.refuse_unused(Location("config"))
     from gnio_jax import data, filtering, parallel  # late: mistakes do not wait for JAX
     from gnio_jax.training import loop
 
+    if not request.resume:
+        loop.refuse_untrainable(config)  # first, since its network may need the part left empty
+        config.refuse_unused(Location("config"))
     if config.through_filter.learn:
         filtering.cores_as_devices()  # the filter's operations are too small for several cores
     if request.strict:

@@ -57,6 +57,10 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
             "config: field 'filter.measurements.zero_velocity.sdt' is unknown; known numbers: std",
         ),
         (["--resume", "--workdir", "none"], "none: holds no run to resume"),
+        (
+            ["--config", "vehicles", "--dataset", "kitti", "--set", "through_filter.learn=[]"],
+            "through_filter.learn: is empty, and 'ai_imu' is trained in the filter's loop alone",
+        ),
     ],
 )
 def test_mistakes(monkeypatch, capsys, tmp_path, arguments, expected):
