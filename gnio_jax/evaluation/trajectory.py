@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from gnio_jax.data.parsing.tables import Table, read_text
 from gnio_jax.data.validation import check_increasing
@@ -27,6 +27,8 @@ TUM = "t x y z qx qy qz qw"
 TXY = "t x y"
 SAME_MOMENT = 0.01
 """Largest difference of matching stamps of an estimate and a reference, s, as in evo."""
+PACE = 0.1
+"""Largest relative error of a time that is counted in rows (ours)."""
 SCATTERED = 100
 """Mean number of steps per shared stamp above which two files are not of the same walk (ours)."""
 NEAR = 0.2
@@ -153,9 +155,11 @@ def pair(
     reference with the nearest one of the estimate, as evo matches them.
 
     The step of the rows is the median step of the shared stamps, halved until no two stamps fall in
-    one row. Rows without a shared stamp are ignored: the reference is NaN there, and the estimate
-    keeps its last pose. Raises `Undefined` for fewer than two shared stamps, or where they are
-    scattered over more than a hundred times as many rows.
+    one row and the rows keep the time of the stamps to `PACE`; then it is their mean. Rows are
+    counted from stamp to stamp, so that a rate which is not quite constant leaves no row without a
+    stamp. Such rows are ignored: the reference is NaN there, and the estimate keeps its last pose.
+    Raises `Undefined` for fewer than two shared stamps, or where they are scattered over more than
+    a hundred times as many rows.
     """
     if len(reference.time) < 2:
         raise Undefined("the reference has a single pose")
@@ -168,13 +172,16 @@ def pair(
     if len(estimate_rows) < 2:
         raise Undefined(f"fewer than two stamps are the same to {most:g} s")
     time = reference.time[matches]
-    step, rows = 2 * float(np.median(np.diff(time))), np.zeros(len(time), int)
-    while (np.diff(rows) == 0).any():
-        step /= 2
-        rows = np.round((time - time[0]) / step).astype(int)
+    step, rows = float(np.median(np.diff(time))), np.zeros(len(time), int)
+    while True:
+        rows[1:] = np.cumsum(np.round(np.diff(time) / step))
         if rows[-1] > SCATTERED * len(rows):
             span = f"{time[-1] - time[0]:.0f} s"
             raise Undefined(f"only {len(rows)} stamps in {span}, unevenly spaced, are the same")
+        if (np.diff(rows) > 0).all() and _keep_time(rows, time):
+            break
+        step /= 2
+    step = float((time[-1] - time[0]) / rows[-1])
     shared = np.isin(np.arange(rows[-1] + 1), rows)
     clock = time[0] + step * np.arange(rows[-1] + 1)
     poses = [np.full((len(clock), width), np.nan) for width in (3, 4)]
@@ -183,6 +190,16 @@ def pair(
     latest = estimate_rows[np.cumsum(shared) - 1]
     path = Trajectory(clock, estimate.position[latest], estimate.orientation[latest])
     return path, Trajectory(clock, *poses)
+
+
+def _keep_time(rows: Int[np.ndarray, "n"], time: Float[np.ndarray, "n"]) -> bool:
+    """Whether every second that is counted in rows, or every ten rows if they are longer, is as
+    long by the stamps, to `PACE`."""
+    step = (time[-1] - time[0]) / rows[-1]
+    stop = np.searchsorted(rows, rows + max(10.0, 1.0 / step) - 1e-6)
+    begin = np.flatnonzero(stop < len(rows))
+    counted, passed = step * (rows[stop[begin]] - rows[begin]), time[stop[begin]] - time[begin]
+    return bool((np.abs(counted - passed) <= PACE * passed).all())
 
 
 def align_if_possible(

@@ -75,6 +75,66 @@ def test_every_pose_counts_if_stamps_are_uneven(files):
     assert f"{len(time):,} poses" in report.settings["split"]
 
 
+def pieces_by_frames(estimate, truth):
+    """KITTI's errors (%, °/m) by its own loop over frames, ten apart, whatever their stamps."""
+    poses = []
+    for path in (estimate, truth):
+        matrices = np.tile(np.eye(4), (len(path.time), 1, 1))
+        turns = Rotation.from_quat(path.orientation, scalar_first=True)
+        matrices[:, :3, :3], matrices[:, :3, 3] = turns.as_matrix(), path.position
+        poses.append(matrices)
+    sides = np.linalg.norm(np.diff(truth.position, axis=0), axis=1)
+    walked, errors = np.concatenate([[0.0], np.cumsum(sides)]), []
+    for i in range(0, len(walked), 10):
+        for length in range(100, 801, 100):
+            further = np.flatnonzero(walked > walked[i] + length)
+            if len(further):
+                motions = [np.linalg.solve(path[i], path[further[0]]) for path in poses]
+                error = np.linalg.solve(*motions)
+                cosine = np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)
+                shares = np.linalg.norm(error[:3, 3]), np.degrees(np.arccos(cosine))
+                errors.append(np.array(shares) / length)
+    return np.mean(errors, axis=0) * [100, 1]
+
+
+@pytest.mark.parametrize("kind", ["as KITTI's", "jitter", "slower towards the end"])
+def test_a_rate_that_is_not_constant_breaks_no_stretch(files, kind):
+    """Stamps whose median step is not their mean, as KITTI's of 10 Hz, are consecutive rows."""
+    rng, rows = np.random.default_rng(3), 1500
+    step = {
+        "as KITTI's": rng.choice([0.1033, 0.1034, 0.1039], rows),
+        "jitter": 0.1 + np.diff(rng.uniform(-0.02, 0.02, rows + 1)),
+        "slower towards the end": np.linspace(0.1, 0.108, rows),
+    }[kind]
+    time = np.cumsum(step)
+    yaw = 0.3 * np.sin(0.05 * time)
+    attitude = Rotation.from_euler("ZYX", np.stack([yaw, 0.02 * np.sin(time), 0 * yaw], 1))
+    position = np.cumsum(attitude.apply([9.0, 0.0, 0.0]) * step[:, None], axis=0)
+    position[700:800] = position[700]  # it stands still
+    position[800:] += position[700] - position[799]
+    poses = np.roll(attitude.as_quat(), 1, axis=1)
+    truth = Trajectory(time, position, poses)
+    estimate = perturbed(truth, scale=0.05)
+    values = score_files(*files(truth, estimate)).scores["odometry"].values
+    translation, rotation = pieces_by_frames(estimate, truth)
+    assert values["t_rel"] == pytest.approx(translation, rel=1e-4)
+    assert values["r_rel"] == pytest.approx(rotation, rel=1e-4)
+    assert values["duration"] == pytest.approx(time[-1] - time[0])
+    moved = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    walked = np.concatenate([[0.0], np.cumsum(moved)])
+    stops = np.searchsorted(walked, walked + 10.0 - 1e-9)
+    starts = np.flatnonzero(stops < rows)
+    turn = Rotation.from_quat(truth.orientation[0], scalar_first=True)
+    turn = turn * Rotation.from_quat(estimate.orientation[0], scalar_first=True).inv()
+    _, _, z, w = turn.as_quat()
+    turn = Rotation.from_euler("z", 2 * np.arctan2(z, w))
+    error = turn.apply(estimate.position) - truth.position
+    of_pieces = error[stops[starts]] - error[starts]
+    rms = np.sqrt(np.mean(np.sum(of_pieces**2, axis=1)))
+    assert values["rte_10m"] == pytest.approx(rms, rel=1e-4)
+    assert values["stationary_drift"] is not None
+
+
 def test_metrics_over_time_use_the_stamps(files):
     """A second has as many rows as the stamps say, also where poses are missing. A constant error
     of the heading does not change displacements."""
