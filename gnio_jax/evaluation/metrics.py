@@ -38,6 +38,8 @@ LEAST_PATH = 1.0
 """Length of the reference below which `drift` and `path_length_ratio` are undefined, m."""
 LEAST_LEG = 1.0
 """Length of a leg below which the ratio of lengths is not meaningful, m."""
+APART = 0.25
+"""Largest relative error of the time between two rows that are compared (ours)."""
 LEAST_SECONDS = 10.0
 """Time below which `yaw_drift` is undefined, s."""
 
@@ -68,7 +70,7 @@ def rte(estimate: Positions, reference: Positions, step: float, seconds: float =
     span less than `seconds`, it is the error at their end relative to their start, scaled to
     `seconds` (RoNIN's rule).
     """
-    error, lag = estimate - reference, round(seconds / step)
+    error, lag = estimate - reference, _rows_apart(seconds, step)
     rows = np.flatnonzero(finite_rows(reference))
     if len(rows) < 2:
         raise Undefined("a single trusted row" if len(rows) else "no trusted reference")
@@ -126,7 +128,7 @@ def rpe(
         turn = true @ np.swapaxes(ours, 1, 2)
     else:
         turn = rotation_z(-relative_yaw(estimate.orientation, reference.orientation))
-    lag = round(seconds / step)
+    lag = _rows_apart(seconds, step)
     if lag >= len(estimate.time):
         raise Undefined(f"no two trusted rows {seconds:g} s apart")
     displacement, true = (
@@ -135,6 +137,15 @@ def rpe(
     error = (np.einsum("nij,nj->ni", turn[:-lag], displacement) - true)[:, :dims]
     oriented = finite_rows(reference.orientation[:-lag])
     return _rms_of_pairs(error, finite_rows(reference.position), lag, seconds, oriented)
+
+
+def _rows_apart(seconds: float, step: float) -> int:
+    """Number of rows, `step` s apart, in `seconds`. Raises `Undefined` if no whole number of rows
+    is that long, to `APART`."""
+    rows = round(seconds / step)
+    if abs(rows * step - seconds) > APART * seconds * (1 + 1e-9):
+        raise Undefined(f"no two rows are {seconds:g} s apart, because each takes {step:g} s")
+    return rows
 
 
 def _rms_of_pairs(

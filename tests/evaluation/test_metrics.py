@@ -116,6 +116,24 @@ def test_rpe_equals_a_loop():
     assert value == pytest.approx(rms(errors_se3), rel=1e-9)
 
 
+@pytest.mark.parametrize("step", [0.4, 0.7, 1.9, 3.0, 150.0])
+def test_an_error_over_a_time_is_of_rows_that_are_so_far_apart(step):
+    """An estimate that errs by 0.1 m in each second, with rows from 0.4 s to minutes apart."""
+    rows = np.arange(60.0)
+    position = np.outer(rows * step, [1.0, 0.0, 0.0])
+    truth = Trajectory(rows * step, position, np.tile([1.0, 0, 0, 0], (60, 1)))
+    estimate = truth._replace(position=1.1 * position)
+    measures = metrics.measure(estimate, truth)
+    for name, seconds in {"rpe_1s": 1, "rpe_se3": 1, "rpe_10s": 10, "rte_60s": 60}.items():
+        apart = max(round(seconds / step), 1) * step
+        if abs(apart - seconds) <= 0.25 * seconds:
+            assert measures.values[name] == pytest.approx(0.1 * apart), name
+        else:
+            assert measures.values[name] is None, name
+            assert f"{seconds} s apart, because each takes {step:g} s" in measures.reasons[name]
+    assert measures.values["ate"] > 0 and not measures.diverged
+
+
 def test_path_length_of_a_scaled_circle_and_of_noise():
     angle = np.linspace(0, 2 * np.pi, 1201)
     circle = 10 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)  # 62.8 m in 120 s
