@@ -21,6 +21,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import SequenceEstimate
 from gnio_jax.evaluation.estimate import BatchInputs
 from gnio_jax.evaluation.prepare import Start
+from gnio_jax.evaluation.trajectory import Trajectory, relative_yaw
 from gnio_jax.filtering import (
     ConsideredStd,
     Filter,
@@ -40,6 +41,7 @@ from gnio_jax.filtering.settings import (
     with_written_parameters,
 )
 from gnio_jax.filtering.state import arc_of, yaw_lever
+from gnio_jax.numerics import matrix_from_quaternion, rotation_z, yaw_rotation
 from gnio_jax.training.filter_losses import gaussian_nll, normalised_squares
 from gnio_jax.training.optimizer import FILTER_PARTS
 from gnio_jax.types import Array
@@ -98,14 +100,33 @@ LEAST_FACTOR = 1e-3
 """Smallest factor of an axis (ours)."""
 
 
+def true_displacements(estimate: SequenceEstimate, windows: DataConfig) -> Float[np.ndarray, "m 3"]:
+    """The true displacements of the windows that end at the last m rows of an estimate, m, in the
+    yaw frame of the filter at their starts, turned there by the error of its yaw; NaN without a
+    reference.
+
+    The displacements of the network are expressed in this frame. The yaw frame of the reference is
+    another one where the x axis of the device is steep: a tilt of the filter turns it by far more
+    than the tilt, and that is no error of the network.
+    """
+    clones = windows.window // windows.stride
+    path, reference = (
+        Trajectory(*(part[:-clones] for part in trajectory))
+        for trajectory in (estimate.trajectory, estimate.reference)
+    )
+    moved = estimate.reference.position[clones:] - reference.position
+    turn = rotation_z(relative_yaw(path.orientation, reference.orientation))
+    to_frame = np.swapaxes(yaw_rotation(matrix_from_quaternion(path.orientation)), 1, 2)
+    return np.einsum("kij,kjl,kl->ki", to_frame, turn, moved)
+
+
 def fit_std_factors(
     estimates: list[SequenceEstimate], truths: list[Float[np.ndarray, "m 3"]]
 ) -> Float[np.ndarray, "3"]:
     """Root mean square of error over standard deviation, for each axis, over all windows.
 
-    `truths` are the true displacements of the windows, in the yaw frame of the reference at their
-    starts, or the true velocities in the body. The displacements of the network are expressed in
-    the filter's own yaw frame. Raises `ValueError` if too few windows have both.
+    `truths` are the true displacements of the windows (`true_displacements`), or the true
+    velocities in the body. Raises `ValueError` if too few windows have both.
     """
     errors = []
     for estimate, truth in zip(estimates, truths, strict=True):

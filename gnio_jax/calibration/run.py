@@ -22,6 +22,7 @@ from gnio_jax.calibration.fit import (
     fit_innovations,
     fit_std_factors,
     start_of_fit,
+    true_displacements,
 )
 from gnio_jax.calibration.predictions import OnStage, choose_networks, load_network, predict
 from gnio_jax.config import CalibrateConfig, ConsideredStd, FilterSettings
@@ -108,7 +109,12 @@ def calibrate(
     start_of_fit(uncalibrated, paths)  # finds mistakes before reading data
     recordings, estimates = predict(split, networks, config, uncalibrated, progress, workers)
     try:
-        truths = [recording.truth(uncalibrated.measures) for recording in recordings]
+        truths = [
+            recording.velocity
+            if uncalibrated.measures == "velocity"
+            else true_displacements(estimate, windows)
+            for recording, estimate in zip(recordings, estimates, strict=True)
+        ]
         factors = fit_std_factors(estimates, truths)
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None

@@ -34,7 +34,7 @@ from gnio_jax.numerics import (
     rotations,
     yaw_rotation,
 )
-from gnio_jax.types import Array, Quantity, Sequence, Waypoints
+from gnio_jax.types import Array, Sequence, Waypoints
 from gnio_jax.windows import true_displacement, window_starts
 
 REFERENCE_BIAS_SECONDS = 10.0
@@ -126,10 +126,6 @@ class PreparedRecording(NamedTuple):
     def strides(self) -> int:
         """K."""
         return len(self.time) - 1
-
-    def truth(self, measures: Quantity) -> Float[np.ndarray, "m 3"]:
-        """The true value for each window of what a filter measures of its network."""
-        return self.displacement if measures == "displacement" else self.velocity
 
 
 def prepare(

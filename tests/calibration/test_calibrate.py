@@ -164,6 +164,55 @@ def test_the_factors_are_those_of_the_errors():
         fitting.fit_std_factors([estimate(error, std)], [truth])
 
 
+@pytest.mark.parametrize("pitch", [0.0, 80.0])
+def test_a_tilt_of_the_filter_is_no_error_of_the_network(
+    pitch, run, splits_read, tmp_path, monkeypatch
+):
+    """Displacements with errors of their standard deviation have factors of 1, whether the x axis
+    of the phone is level or steep. The filter's attitude errs by a tilt of a degree and a yaw of
+    40°, and the network answers in its yaw frame."""
+    held = Rotation.from_euler("y", pitch, degrees=True)
+    level, walks = Rotation.identity(), data.load("synthetic", None, "val")
+    if pitch:
+        level = Rotation.from_quat(np.roll(walks[0].orientation[1], -1)).inv() * held
+    recordings, _ = prepare(walks, DATA)
+    random, estimates, spun = np.random.default_rng(0), [], Rotation.from_euler("z", 0.7)
+    tilt = Rotation.from_rotvec([0.6 * np.radians(1.0), 0.8 * np.radians(1.0), 0.0])
+    for recording in recordings:
+        path = recording.reference
+        attitude = Rotation.from_quat(np.roll(path.orientation, -1, axis=1)) * level
+        own = tilt * spun * attitude
+        value = np.full(path.position.shape, np.nan)
+        for row in range(CLONES + 1, len(value)):
+            x_axis = own[row - CLONES].as_matrix()[:, 0]
+            moved = spun.apply(path.position[row] - path.position[row - CLONES])
+            value[row] = Rotation.from_euler("z", -np.arctan2(x_axis[1], x_axis[0])).apply(moved)
+        value += 0.01 * random.standard_normal(value.shape)
+        rows = Displacements(value, np.tile(1e-4 * np.eye(3), (len(value), 1, 1)))
+        reference, estimated = (
+            path._replace(orientation=np.roll(turns.as_quat(), 1, axis=1))
+            for turns in (attitude, own)
+        )
+        moved = spun.apply(path.position)
+        estimates.append(
+            SequenceEstimate(recording.name, estimated._replace(position=moved), reference, rows)
+        )
+    pairs = predictions.Predictions(recordings, estimates)
+    monkeypatch.setattr(calibrating, "predict", lambda *_: pairs)
+
+    class Fitted(Exception):
+        pass
+
+    def fit_innovations(walks, windows, settings, *_):
+        raise Fitted(settings)
+
+    monkeypatch.setattr(calibrating, "fit_innovations", fit_innovations)
+    with pytest.raises(Fitted) as caught:
+        calibration.calibrate(CalibrateConfig(str(run), out=str(tmp_path / "calibrated")))
+    (settings,) = caught.value.args
+    np.testing.assert_allclose(settings.noise.std_factor, 1.0, rtol=0.1)
+
+
 @pytest.fixture(scope="module")
 def fold_runs(run, tmp_path_factory):
     """Copies of the run as the folds of one experiment, whose networks differ by a factor."""
