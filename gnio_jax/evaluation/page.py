@@ -168,8 +168,12 @@ def _collect_columns(run: PageRun, sequences: list[str], rows: int) -> list[Colu
 
 
 def make_columns(view: View, rows: int) -> Columns:
-    """The curves of a sequence in float32, in at most `rows` rows, evenly spaced in time."""
-    step = -(-len(view.time) // rows)
+    """The curves of a sequence in float32, in at most `rows` rows, evenly spaced in time, and
+    besides in the last row and in those that are nearest in time to the waypoints."""
+    count = len(view.time)
+    nearest = np.abs(view.time[:, None] - view.waypoints.time).argmin(axis=0)
+    even = np.arange(0, count, -(-count // rows))
+    shown = np.unique(np.concatenate([even, nearest, [count - 1]]))
     path, reference = view.position, view.reference
     curves = {
         "time": view.time,
@@ -186,20 +190,16 @@ def make_columns(view: View, rows: int) -> Columns:
     for name in STRIPS:
         if name in quantities and np.isfinite(values := quantities[name]).any():
             curves |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(drawing.AXES)}
-    curves = {name: values[::step] for name, values in curves.items()}
-    if len(view.at_waypoints):
-        # A waypoint is in the row that is nearest in time; other rows are NaN.
-        rows = np.abs(curves["time"][:, None] - view.waypoints.time).argmin(0)
+    curves = {name: values[shown] for name, values in curves.items()}
+    if len(view.at_waypoints):  # rows without one are NaN
         x, y = view.waypoints.position.T
         at_waypoints = {"waypoint_x": x, "waypoint_y": y, "waypoint_error": view.errors}
         for name, values in at_waypoints.items():
-            curves[name] = np.full(len(curves["time"]), np.nan)
-            curves[name][rows] = values
+            curves[name] = np.full(len(shown), np.nan)
+            curves[name][np.searchsorted(shown, nearest)] = values
     if np.isfinite(nis := view.filtered.nis).any():
-        # The largest of each `step` rows is used, so that a thinned curve keeps its peaks.
-        peaks = np.full(-(-len(nis) // step) * step, -np.inf)
-        peaks[: len(nis)] = np.where(np.isnan(nis), -np.inf, nis)
-        largest = peaks.reshape(-1, step).max(axis=1)
+        # The largest from a row to the next one is used, so that a thinned curve keeps its peaks.
+        largest = np.maximum.reduceat(np.where(np.isnan(nis), -np.inf, nis), shown)
         curves["nis"] = np.where(np.isneginf(largest), np.nan, largest)
     return {name: values.astype(np.float32) for name, values in curves.items()}
 

@@ -335,7 +335,12 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[RowResult
         report = result.reports[0]
         views = read_views(result.folders[0], report)
         runs.append(page.describe_report(report, views, name=result.row.label))
+    settings = results[0].reports[0].settings
     available = [view.name for view in runs[0].views if view.has_reference]
+    if not available:
+        subject = f"{settings['dataset']} {settings['split']}"
+        problem = "has no sequence with poses, over which trajectories could be drawn"
+        raise InputError(subject, problem, "name another --dataset or --split")
     names = _words(options.sequences) if options.sequences else available[:8]
     for name in names:
         if name not in available:
@@ -343,7 +348,6 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[RowResult
             raise InputError("--sequences", problem, f"there are: {', '.join(available)}")
     figure = plots.trajectories(names, {run.name: run.views for run in runs})
     plots.save(with_ending(path, ".png"), figure)
-    settings = results[0].reports[0].settings
     title = f"{settings['dataset']} {options.split}: {options.estimator} of all methods"
     page.write(with_ending(path, ".html"), title, runs)
     return f"picture: {path}.png\npage: {path}.html"

@@ -11,6 +11,7 @@ import pytest
 
 from gnio_jax.evaluation import SequenceEstimate, Trajectory, page
 from gnio_jax.evaluation.views import ellipses, make_view
+from gnio_jax.types import Waypoints
 from tests.support.estimates import estimate, reported, with_covariance
 
 EVIL = "</script><script>alert('x')</script><b onmouseover=alert(1)>&amp; $$x$$"
@@ -60,6 +61,25 @@ def test_thinned_curves_keep_the_largest_innovation(walks):
     assert curves["nis"][67] == 70.0 and curves["nis"][0] == 2.0 and np.isnan(curves["nis"][1])
     assert "scale_x" not in curves and np.isfinite(curves["gate_x"][-1])
     assert all(len(values) == 134 and values.dtype == np.float32 for values in curves.values())
+
+
+def test_a_thinned_page_has_the_end_of_a_path_and_every_waypoint(walks):
+    """Twelve taps, which are 0.5 s apart, of a walk of 40 s in ten rows: each is joined to the
+    place of the estimate at its time."""
+    walk = walks[0]
+    rows = np.arange(101, 161, 5)
+    waypoints = Waypoints(walk.reference.time[rows], walk.reference.position[rows, :2])
+    blind = walk.reference._replace(position=walk.reference.position * np.nan)
+    view = make_view(walk._replace(reference=blind, waypoints=waypoints))
+    curves = page.make_columns(view, 10)
+    tapped = np.isfinite(curves["waypoint_x"])
+    assert tapped.sum() == 12 and len(curves["time"]) <= 10 + 12 + 1
+    np.testing.assert_allclose(curves["time"][tapped], 0.1 * rows, atol=1e-4)
+    np.testing.assert_allclose(curves["waypoint_x"][tapped], waypoints.position[:, 0], rtol=1e-6)
+    drawn = np.hypot(*(curves[x][tapped] - curves[f"waypoint_{x}"][tapped] for x in "xy"))
+    np.testing.assert_allclose(drawn, curves["waypoint_error"][tapped], atol=1e-5)
+    assert curves["time"][-1] == pytest.approx(39.9)
+    np.testing.assert_allclose(curves["x"][-1], view.position[-1, 0], rtol=1e-6)
 
 
 def test_the_map_has_the_size_of_the_paths_or_of_the_ellipses(walks):

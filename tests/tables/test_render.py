@@ -5,11 +5,15 @@ import csv
 import numpy as np
 import pytest
 
+from gnio_jax.config import TablesConfig
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation import tabulate
+from gnio_jax.evaluation.views import make_view
 from gnio_jax.tables import make, plots
 from gnio_jax.tables.cost import RunCost
 from gnio_jax.tables.experiments import Experiment, TableRow
 from gnio_jax.tables.runs import RowResult
+from tests.support.estimates import estimate
 from tests.support.reports import BASE, LOST, measures, report_of
 
 COST = RunCost(12_345, 1.234, "cpu")
@@ -79,3 +83,14 @@ def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == ["A", "B\n(2 of 3 diverged)", "C\n(3 of 3 diverged)"]
     assert [bar.get_width() for bar in axes.patches] == [pytest.approx(7 / 3), 8.0, 0.0]
+
+
+def test_trajectories_need_a_sequence_with_poses(tmp_path, monkeypatch):
+    """Of a split whose recordings have waypoints alone nothing is drawn or written."""
+    row = result("a", [[1.0, 2.0]])
+    views = [make_view(estimate(name, 0, truth=False)) for name in row.reports[0].scores]
+    monkeypatch.setattr(make, "read_views", lambda *_: views)
+    options = TablesConfig(table="trajectories", out=tmp_path)
+    with pytest.raises(InputError, match="has no sequence with poses"):
+        make.make_trajectories(tmp_path / "trajectories", options, [row])
+    assert not any(tmp_path.iterdir())
