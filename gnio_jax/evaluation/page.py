@@ -173,7 +173,7 @@ def make_columns(view: View, rows: int) -> Columns:
     count = len(view.time)
     nearest = np.abs(view.time[:, None] - view.waypoints.time).argmin(axis=0)
     even = np.arange(0, count, -(-count // rows))
-    shown = np.unique(np.concatenate([even, nearest, [count - 1]]))
+    numbers = np.unique(np.concatenate([even, nearest, [count - 1]]))
     path, reference = view.position, view.reference
     curves = {
         "time": view.time,
@@ -190,16 +190,16 @@ def make_columns(view: View, rows: int) -> Columns:
     for name in STRIPS:
         if name in quantities and np.isfinite(values := quantities[name]).any():
             curves |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(drawing.AXES)}
-    curves = {name: values[shown] for name, values in curves.items()}
+    curves = {name: values[numbers] for name, values in curves.items()}
     if len(view.at_waypoints):  # rows without one are NaN
         x, y = view.waypoints.position.T
         at_waypoints = {"waypoint_x": x, "waypoint_y": y, "waypoint_error": view.errors}
         for name, values in at_waypoints.items():
-            curves[name] = np.full(len(shown), np.nan)
-            curves[name][np.searchsorted(shown, nearest)] = values
+            curves[name] = np.full(len(numbers), np.nan)
+            curves[name][np.searchsorted(numbers, nearest)] = values
     if np.isfinite(nis := view.filtered.nis).any():
         # The largest from a row to the next one is used, so that a thinned curve keeps its peaks.
-        largest = np.maximum.reduceat(np.where(np.isnan(nis), -np.inf, nis), shown)
+        largest = np.maximum.reduceat(np.where(np.isnan(nis), -np.inf, nis), numbers)
         curves["nis"] = np.where(np.isneginf(largest), np.nan, largest)
     return {name: values.astype(np.float32) for name, values in curves.items()}
 

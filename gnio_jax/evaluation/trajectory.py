@@ -198,8 +198,8 @@ def _keep_time(rows: Int[np.ndarray, "n"], time: Float[np.ndarray, "n"]) -> bool
     step = (time[-1] - time[0]) / rows[-1]
     stop = np.searchsorted(rows, rows + max(10.0, 1.0 / step) - 1e-6)
     begin = np.flatnonzero(stop < len(rows))
-    counted, passed = step * (rows[stop[begin]] - rows[begin]), time[stop[begin]] - time[begin]
-    return bool((np.abs(counted - passed) <= PACE * passed).all())
+    of_rows, of_stamps = (part[stop[begin]] - part[begin] for part in (step * rows, time))
+    return bool((np.abs(of_rows - of_stamps) <= PACE * of_stamps).all())
 
 
 def align_if_possible(

@@ -181,17 +181,17 @@ def test_a_tilt_of_the_filter_is_no_error_of_the_network(
     for recording in recordings:
         path = recording.reference
         attitude = Rotation.from_quat(np.roll(path.orientation, -1, axis=1)) * level
-        own = tilt * spun * attitude
+        filter_attitude = tilt * spun * attitude
         value = np.full(path.position.shape, np.nan)
         for row in range(CLONES + 1, len(value)):
-            x_axis = own[row - CLONES].as_matrix()[:, 0]
+            x_axis = filter_attitude[row - CLONES].as_matrix()[:, 0]
             moved = spun.apply(path.position[row] - path.position[row - CLONES])
             value[row] = Rotation.from_euler("z", -np.arctan2(x_axis[1], x_axis[0])).apply(moved)
         value += 0.01 * random.standard_normal(value.shape)
         rows = Displacements(value, np.tile(1e-4 * np.eye(3), (len(value), 1, 1)))
         reference, estimated = (
             path._replace(orientation=np.roll(turns.as_quat(), 1, axis=1))
-            for turns in (attitude, own)
+            for turns in (attitude, filter_attitude)
         )
         moved = spun.apply(path.position)
         estimates.append(

@@ -125,9 +125,9 @@ def test_an_error_over_a_time_is_of_rows_that_are_so_far_apart(step):
     estimate = truth._replace(position=1.1 * position)
     measures = metrics.measure(estimate, truth)
     for name, seconds in {"rpe_1s": 1, "rpe_se3": 1, "rpe_10s": 10, "rte_60s": 60}.items():
-        apart = max(round(seconds / step), 1) * step
-        if abs(apart - seconds) <= 0.25 * seconds:
-            assert measures.values[name] == pytest.approx(0.1 * apart), name
+        interval = max(round(seconds / step), 1) * step
+        if abs(interval - seconds) <= 0.25 * seconds:
+            assert measures.values[name] == pytest.approx(0.1 * interval), name
         else:
             assert measures.values[name] is None, name
             assert f"{seconds} s apart, because each takes {step:g} s" in measures.reasons[name]
