@@ -250,7 +250,7 @@ class SegmentValidation(NamedTuple):
     axis_normalised: Float[jax.Array, "3"]
     """(e/σ)² of each axis."""
     predicted: Float[jax.Array, ""]
-    """Component of the predicted displacements along the true ones, m."""
+    """Component of the predicted displacements along the true ones, in the plane, m."""
     walked: Float[jax.Array, ""]
     """Length of the true displacements in the plane, m."""
 
@@ -305,8 +305,9 @@ def measure(
         prediction, segment = jax.tree.map(lambda leaf: leaf[None], (prediction, segment))
         figures = task.figures_of_batch(prediction, segment, stage)
         error = segment.displacement - prediction.displacement
-        length = jnp.sqrt(jnp.sum(segment.displacement[..., :2] ** 2, axis=-1) + 1e-12)
-        along = jnp.sum(prediction.displacement * segment.displacement, axis=-1) / length
+        level = segment.displacement[..., :2]
+        length = jnp.sqrt(jnp.sum(level**2, axis=-1) + 1e-12)
+        along = jnp.sum(prediction.displacement[..., :2] * level, axis=-1) / length
         return SegmentValidation(
             **figures,
             axis_mse=jnp.mean(error**2, axis=(0, 1)),

@@ -169,9 +169,9 @@ def test_a_run_names_its_recordings_and_what_is_left_out_of_them(tmp_path, capsy
         support_vectors.train(config, tmp_path / "run", Lines())
     learnt = training_recordings(tmp_path / "run", config, "tlio")
     assert learnt == {"a", "b", "c"}
-    told = capsys.readouterr().err
-    assert "LEFT OUT of val: d: " in told and "warning: c in train and in val" in told
-    assert "train: 3 sequences" in told and " windows" in told
+    text = capsys.readouterr().err
+    assert "LEFT OUT of val: d: " in text and "warning: c in train and in val" in text
+    assert "train: 3 sequences" in text and " windows" in text
 
 
 def test_a_placement_with_too_few_windows_is_refused():
