@@ -32,8 +32,9 @@ from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.initial import load_initial_network
 from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.segment_task import SegmentTask
+from gnio_jax.training.segment_task import HORIZON_WINDOWS, SegmentTask, horizon_lengths
 from gnio_jax.training.task import DispatchSums, Row, Task, TrainState
+from gnio_jax.training.walk_segments import grid_of
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
@@ -163,8 +164,8 @@ def refuse_untrainable(config: TrainConfig) -> None:
 
 def choose_task(config: TrainConfig) -> type[Task]:
     """The task of an experiment. Raises `InputError` for segments without a network with memory,
-    for strides that do not fit such a network, and for choices by the error of a displacement that
-    the network does not predict."""
+    for strides that do not fit such a network, for choices by the error of a displacement that the
+    network does not predict, and for a loss over longer times than a segment has."""
     model = models.from_experiment(config)
     remembers = isinstance(model, NetworkWithMemory)
     if config.segments.seconds and not remembers:
@@ -181,7 +182,15 @@ def choose_task(config: TrainConfig) -> type[Task]:
     if not models.predicts_displacement(model):
         problem = f"is empty, and '{config.model.name}' is trained in the filter's loop alone"
         raise InputError("through_filter.learn", problem, "name the parts, e.g. [all]")
-    return SegmentTask if config.segments.seconds else WindowTask
+    if not config.segments.seconds:
+        return WindowTask
+    grid = grid_of(config)
+    if config.segments.horizon_weight and not horizon_lengths(grid.predictions, grid.window):
+        least = ((HORIZON_WINDOWS[0] + 2) * grid.window - 1) * config.data.stride_seconds
+        problem = f"has no effect on segments of {config.segments.seconds:g} s"
+        remedy = f"set segments.seconds to {least:g} or more, or the weight to 0"
+        raise InputError("segments.horizon_weight", problem, remedy)
+    return SegmentTask
 
 
 def _refuse_errors_of_displacement(config: TrainConfig) -> None:

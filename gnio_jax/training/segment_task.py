@@ -211,13 +211,18 @@ def _with_bins(prediction: Prediction) -> Prediction:
     )
 
 
+def horizon_lengths(predictions: int, window: int) -> list[int]:
+    """Those of `HORIZON_WINDOWS` for which a segment is long enough, by the number of its
+    predictions and of the clone intervals in a window."""
+    return [length for length in HORIZON_WINDOWS if length < predictions // window]
+
+
 def horizon_error(
     error: Float[jax.Array, "b m d"], moved: Float[jax.Array, "b m"], window: int
 ) -> Float[jax.Array, ""]:
     """Mean of ‖Σ e‖² / (distance² + floor²) over the displacements of `HORIZON_WINDOWS` windows,
     each a sum of windows that do not overlap; 0 if the segment is shorter than two of them."""
-    count = error.shape[1] // window
-    lengths = [length for length in HORIZON_WINDOWS if length < count]
+    count, lengths = error.shape[1] // window, horizon_lengths(error.shape[1], window)
     if not lengths:
         return jnp.float32(0)
 

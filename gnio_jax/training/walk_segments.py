@@ -120,7 +120,13 @@ class SegmentGrid(NamedTuple):
 
     @property
     def samples(self) -> int:
+        """Samples in the segment."""
         return self.stride * self.intervals
+
+    @property
+    def predictions(self) -> int:
+        """Windows that end with a clone interval of the segment."""
+        return self.intervals - self.window + 1
 
 
 def grid_of(config: TrainConfig) -> SegmentGrid:
