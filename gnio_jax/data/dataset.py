@@ -33,7 +33,8 @@ class RecordingSource(NamedTuple):
     """The files from which its sequences are made; some may be absent. A folder stands for all that
     is in it."""
     slow: bool = False
-    """Whether `read` is slow. Then the cache keeps its result, and processes share the work."""
+    """Whether `read` is slow. Then processes share the work, and where there are `files` the cache
+    keeps its result until one of them, or the module of `read`, changes."""
     attributes: dict[str, Any] = {}
     """Attributes from lists and splits, which are added to those of its sequences."""
     form: str = ""

@@ -203,14 +203,16 @@ def cache_entry(name: str, files: Iterable[str | os.PathLike[str]]) -> Path:
     """The file that keeps the reading of the recording `name` (with its form) from these files.
 
     Its name changes if a file has another path, size or modification time, is added or removed, or
-    if a source file of the package on which reading depends has changed. The part before the "-"
-    identifies the recording by its name and its first file.
+    if a source file of the package on which reading depends has changed. A folder stands for all
+    files in it. The part before the "-" identifies the recording by its name and its first file.
     """
-    states = []
+    states: list[list[str | int]] = []
     for path in (Path(file).absolute() for file in files):
+        inside = sorted(path.rglob("*")) if path.is_dir() else []
         states.append([str(path)])
-        with contextlib.suppress(OSError):  # a file that is absent
-            states[-1] += [path.stat().st_size, path.stat().st_mtime_ns]
+        for file in inside or [path]:
+            with contextlib.suppress(OSError):  # a file that is absent
+                states[-1] += [str(file), file.stat().st_size, file.stat().st_mtime_ns]
     recording, state = (
         hashlib.sha256(json.dumps(key).encode()).hexdigest()[:32]
         for key in ([name, [path for path, *_ in states[:1]]], [_sources(), states])

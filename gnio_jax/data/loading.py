@@ -3,11 +3,13 @@ by several processes, and checked."""
 
 from __future__ import annotations
 
+import functools
 import os
+import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from gnio_jax.data.dataset import Dataset, RecordingSource, Refusal
 from gnio_jax.data.hdf5 import Reading, cache_entry, read_reading, write_reading
@@ -196,7 +198,7 @@ def _read_all(
     slow = [
         recording
         for recording in recordings
-        if workers > 1 and recording.slow and not _entry(recording).is_file()
+        if workers > 1 and recording.slow and not _is_cached(recording)
     ]
     readings = in_processes(read_recording, [(recording,) for recording in slow], workers, progress)
     in_pool, died = {id(recording) for recording in slow}, False
@@ -240,10 +242,9 @@ def _read_form(form: RecordingSource) -> Reading:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            if form.slow:
-                entry = _entry(form)
-                if (cached := read_reading(entry)) is not None:
-                    return cached
+            entry = _entry(form)
+            if entry is not None and (cached := read_reading(entry)) is not None:
+                return cached
             reading = Reading(form.read())
         except Refusal as refusal:
             reading = Reading([], refusals=(str(refusal),))
@@ -255,6 +256,24 @@ def _read_form(form: RecordingSource) -> Reading:
     return reading
 
 
-def _entry(form: RecordingSource) -> Path:
-    """The file of this form of a recording in the cache."""
-    return cache_entry(f"{form.name} {form.form}", form.files)
+def _is_cached(form: RecordingSource) -> bool:
+    entry = _entry(form)
+    return entry is not None and entry.is_file()
+
+
+def _entry(form: RecordingSource) -> Path | None:
+    """The file of this form of a recording in the cache; None for a recording that is quick to
+    read, or that names no files, by which a change could be seen."""
+    if not form.slow or not form.files:
+        return None
+    return cache_entry(f"{form.name} {form.form}", (*form.files, *_reader_file(form.read)))
+
+
+def _reader_file(read: Callable[..., Any]) -> tuple[Path, ...]:
+    """The source file of a plugin's reader. Those of the package are part of every entry."""
+    while isinstance(read, functools.partial):
+        read = read.func
+    module = sys.modules.get(read.__module__)
+    file = getattr(module, "__file__", None)
+    is_ours = read.__module__.partition(".")[0] == __name__.partition(".")[0]
+    return () if is_ours or file is None else (Path(file),)

@@ -134,18 +134,25 @@ class Fold(NamedTuple):
 
     def select(self, sequences: Iterable[Sequence]) -> list[Sequence]:
         """The split's sequences that belong to the fold. All sequences must be given, because a
-        fold depends on the lengths of all. Raises `InputError` for a fold without a sequence."""
+        fold depends on the lengths of all. Raises `InputError` if none does, and for a fold without
+        a sequence."""
         members = list(sequences)
         fold_of = folds(members, self.count)
         if self.number not in fold_of.values():
             problem = f"has nothing in fold {self.number} of {self.count}"
             remedy = f"there are {len(fold_of)} people or sessions to share; take fewer folds"
             raise InputError(f"split '{self.split}'", problem, remedy)
-        return [
+        chosen = [
             sequence
             for sequence in members
             if (fold_of[group(sequence)] == self.number) != self.left_out
         ]
+        if not chosen:
+            problem = f"has nothing beside fold {self.number} of {self.count}"
+            remedy = f"there are {len(fold_of)} people or sessions to share; take two folds or more"
+            remedy = remedy if len(fold_of) > 1 else "it is of one person or session; add others"
+            raise InputError(f"split '{self.split}'", problem, remedy)
+        return chosen
 
 
 def parse_fold(split: str) -> Fold | None:

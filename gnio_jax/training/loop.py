@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from gnio_jax import config as configuration
 from gnio_jax import models, parallel
-from gnio_jax.config import TrainConfig
+from gnio_jax.config import OptimConfig, TrainConfig
 from gnio_jax.config.schema import Location
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.measurements import create_measurements
@@ -32,8 +32,9 @@ from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.initial import load_initial_network
 from gnio_jax.training.recordings import TrainingData, set_up
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.segment_task import SegmentTask
+from gnio_jax.training.segment_task import HORIZON_WINDOWS, SegmentTask, horizon_lengths
 from gnio_jax.training.task import DispatchSums, Row, Task, TrainState
+from gnio_jax.training.walk_segments import grid_of
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
@@ -163,7 +164,8 @@ def refuse_untrainable(config: TrainConfig) -> None:
 
 def choose_task(config: TrainConfig) -> type[Task]:
     """The task of an experiment. Raises `InputError` for segments without a network with memory,
-    and for strides that do not fit such a network."""
+    for strides that do not fit such a network, for choices by the error of a displacement that the
+    network does not predict, and for a loss over longer times than a segment has."""
     model = models.from_experiment(config)
     remembers = isinstance(model, NetworkWithMemory)
     if config.segments.seconds and not remembers:
@@ -173,12 +175,33 @@ def choose_task(config: TrainConfig) -> type[Task]:
         problem = f"is {config.data.stride} samples; '{config.model.name}' takes {model.multiple}"
         remedy = f"make it a multiple of {model.multiple / config.data.rate:g} s"
         raise InputError("data.stride_seconds", problem, remedy)
+    if not models.predicts_displacement(model):
+        _refuse_errors_of_displacement(config)
     if config.through_filter.learn:
         return FilterTask
     if not models.predicts_displacement(model):
         problem = f"is empty, and '{config.model.name}' is trained in the filter's loop alone"
         raise InputError("through_filter.learn", problem, "name the parts, e.g. [all]")
-    return SegmentTask if config.segments.seconds else WindowTask
+    if not config.segments.seconds:
+        return WindowTask
+    grid = grid_of(config)
+    if config.segments.horizon_weight and not horizon_lengths(grid.predictions, grid.window):
+        least = ((HORIZON_WINDOWS[0] + 2) * grid.window - 1) * config.data.stride_seconds
+        problem = f"has no effect on segments of {config.segments.seconds:g} s"
+        remedy = f"set segments.seconds to {least:g} or more, or the weight to 0"
+        raise InputError("segments.horizon_weight", problem, remedy)
+    return SegmentTask
+
+
+def _refuse_errors_of_displacement(config: TrainConfig) -> None:
+    """Raise `InputError` where the error of a displacement would choose the best epoch or reduce
+    the learning rate of a network that predicts none: every epoch has an error of 0."""
+    optim, usual = config.optim, OptimConfig()
+    for name, choice in (("best_by", "squared_error"), ("schedule", "plateau")):
+        if getattr(optim, name) == choice:
+            problem = f"is {choice}, and '{config.model.name}' predicts no displacement"
+            remedy = f"set it to {getattr(usual, name)}"
+            raise InputError(f"optim.{name}", f"{problem}, whose error would decide", remedy)
 
 
 def _train(
@@ -370,8 +393,8 @@ def _describe_progress(position: RunPosition, task: Task, rate: float) -> str:
 def describe_epoch(row: Row, improved: bool, task: Task) -> Iterator[str]:
     """The line of a finished epoch, with the error of each dataset if there are several, and a
     warning if a layer of the head no longer learns."""
-    names = task.config.datasets
-    errors = ", ".join(f"{name} {row[f'val_rmse/{name}']:.4f}" for name in names if len(names) > 1)
+    names = [name for name in task.config.datasets if f"val_rmse/{name}" in row]
+    errors = ", ".join(f"{name} {row[f'val_rmse/{name}']:.4f}" for name in names)
     rmse = f"val rmse {row['val_rmse']:.4f} m  " if "val_rmse" in row else ""
     yield (
         f"epoch {row['epoch'] + 1:4d}/{task.config.optim.epochs}  "

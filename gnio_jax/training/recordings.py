@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 from gnio_jax import config as configuration
@@ -57,6 +57,48 @@ def set_up(
         problem = f"is {size}, which {devices} devices cannot share evenly"
         remedy = f"make it a multiple of {devices}, or use fewer --devices"
         raise InputError("optim.batch_size", problem, remedy)
+    sources, held_out, splits = read_splits(
+        config,
+        reporter,
+        workers,
+        lambda sequences, training: task.source_of(sequences, config, training),
+        lambda source: f"{task.count(source):,} {task.unit}",
+    )
+    held_out = {name: parallel.copy_to_devices(source) for name, source in held_out.items()}
+    parts = tuple(map(task.count, sources))
+    epoch = sum(map(visit_count, parts, config.data.weights or [1.0] * len(parts)))
+    if epoch < size:
+        problem = f"is {size}, but there are only {epoch} {task.unit}"
+        raise InputError("optim.batch_size", problem, "lower it")
+    training_data = TrainingData(parallel.copy_to_devices(task.join(sources)), held_out, splits)
+    portable = dataclasses.replace(configuration.without_paths(config), seed=0)
+    return task(model, portable, epoch // size, parts), training_data
+
+
+class SplitSources(NamedTuple):
+    """What was made of the recordings of both splits: windows or segments."""
+
+    training: list[Any]
+    """Of the training split of each dataset."""
+    held_out: dict[str, Any]
+    """Of the validation split of each dataset, by its name."""
+    splits: dict[str, dict[str, int] | list[str]]
+    """See `TrainingData.splits`."""
+
+
+def read_splits(
+    config: TrainConfig,
+    reporter: Reporter,
+    workers: int,
+    make: Callable[[Iterable[Sequence], bool], Any],
+    describe: Callable[[Any], str],
+) -> SplitSources:
+    """Read the training and the validation split of every dataset, and tell what they hold, what is
+    left out of them, and whether they share recordings.
+
+    `make` makes a source of the recordings of a split, and is told whether it is for training;
+    `describe` gives its size in words.
+    """
     train, val = config.data.train_split, config.data.val_split
     names, pose_network = config.datasets, load_pose_network(config, reporter)
     reporter.line(f"reading {', '.join(names)}: {train} and {val}")
@@ -70,14 +112,14 @@ def set_up(
             sequences = read_split(
                 config, name, split, reporter, workers, samples, pose_network, left_out
             )
-            source = task.source_of(sequences, config, training)
+            source = make(sequences, training)
             if training:
                 sources.append(source)
             else:
-                held_out[name] = parallel.copy_to_devices(source)
+                held_out[name] = source
             splits[split] |= {label + sequence: count for sequence, count in samples.items()}
             hours = sum(samples.values()) / config.data.rate / 3600
-            contents = f"{hours:.2f} h, {task.count(source):,} {task.unit}"
+            contents = f"{hours:.2f} h, {describe(source)}"
             reporter.line(f"  {label}{split}: {len(samples)} sequences, {contents}")
             for recording, reason in left_out.items():
                 reporter.line(f"  warning: LEFT OUT of {label}{split}: {recording}: {reason}")
@@ -90,14 +132,7 @@ def set_up(
         )
     if pose_network is not None:
         splits["data.poses_by"] = [pose_network.digest]
-    parts = tuple(map(task.count, sources))
-    epoch = sum(map(visit_count, parts, config.data.weights or [1.0] * len(parts)))
-    if epoch < size:
-        problem = f"is {size}, but there are only {epoch} {task.unit}"
-        raise InputError("optim.batch_size", problem, "lower it")
-    training_data = TrainingData(parallel.copy_to_devices(task.join(sources)), held_out, splits)
-    portable = dataclasses.replace(configuration.without_paths(config), seed=0)
-    return task(model, portable, epoch // size, parts), training_data
+    return SplitSources(sources, held_out, splits)
 
 
 def read_split(

@@ -113,11 +113,16 @@ def open_run(
         if path.exists():
             _refuse_other_recordings(path, data.splits)
         else:
-            text = yaml.safe_dump(data.splits, sort_keys=False, allow_unicode=True)
-            write_text(path, text)
+            write_splits(workdir, data.splits)
         yield workdir
     finally:
         os.close(folder)
+
+
+def write_splits(workdir: Path, splits: dict[str, dict[str, int] | list[str]]) -> None:
+    """Write the names of the recordings of a run (`TrainingData.splits`)."""
+    text = yaml.safe_dump(splits, sort_keys=False, allow_unicode=True)
+    write_text(workdir / SPLITS, text)
 
 
 def _refuse_other_recordings(path: Path, splits: dict[str, dict[str, int] | list[str]]) -> None:

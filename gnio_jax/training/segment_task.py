@@ -211,13 +211,18 @@ def _with_bins(prediction: Prediction) -> Prediction:
     )
 
 
+def horizon_lengths(predictions: int, window: int) -> list[int]:
+    """Those of `HORIZON_WINDOWS` for which a segment is long enough, by the number of its
+    predictions and of the clone intervals in a window."""
+    return [length for length in HORIZON_WINDOWS if length < predictions // window]
+
+
 def horizon_error(
     error: Float[jax.Array, "b m d"], moved: Float[jax.Array, "b m"], window: int
 ) -> Float[jax.Array, ""]:
     """Mean of ‖Σ e‖² / (distance² + floor²) over the displacements of `HORIZON_WINDOWS` windows,
     each a sum of windows that do not overlap; 0 if the segment is shorter than two of them."""
-    count = error.shape[1] // window
-    lengths = [length for length in HORIZON_WINDOWS if length < count]
+    count, lengths = error.shape[1] // window, horizon_lengths(error.shape[1], window)
     if not lengths:
         return jnp.float32(0)
 
@@ -250,7 +255,7 @@ class SegmentValidation(NamedTuple):
     axis_normalised: Float[jax.Array, "3"]
     """(e/σ)² of each axis."""
     predicted: Float[jax.Array, ""]
-    """Component of the predicted displacements along the true ones, m."""
+    """Component of the predicted displacements along the true ones, in the plane, m."""
     walked: Float[jax.Array, ""]
     """Length of the true displacements in the plane, m."""
 
@@ -305,8 +310,9 @@ def measure(
         prediction, segment = jax.tree.map(lambda leaf: leaf[None], (prediction, segment))
         figures = task.figures_of_batch(prediction, segment, stage)
         error = segment.displacement - prediction.displacement
-        length = jnp.sqrt(jnp.sum(segment.displacement[..., :2] ** 2, axis=-1) + 1e-12)
-        along = jnp.sum(prediction.displacement * segment.displacement, axis=-1) / length
+        level = segment.displacement[..., :2]
+        length = jnp.sqrt(jnp.sum(level**2, axis=-1) + 1e-12)
+        along = jnp.sum(prediction.displacement[..., :2] * level, axis=-1) / length
         return SegmentValidation(
             **figures,
             axis_mse=jnp.mean(error**2, axis=(0, 1)),

@@ -23,8 +23,9 @@ from gnio_jax.errors import InputError, require_packages
 from gnio_jax.models.ridi import features
 from gnio_jax.networks import TrainedNetwork, write_network
 from gnio_jax.reporting import Reporter
-from gnio_jax.training.recordings import read_split
-from gnio_jax.training.windows import gather, window_source
+from gnio_jax.training.recordings import read_splits
+from gnio_jax.training.run_folder import write_splits
+from gnio_jax.training.windows import gather, refuse_no_window, usable_starts, window_source
 from gnio_jax.types import Sequence
 
 GRID = {"C": [1.0, 10.0], "epsilon": [0.001, 0.01]}
@@ -48,16 +49,27 @@ class LabelledWindows(NamedTuple):
 
 def labelled_windows(sequences: Iterable[Sequence], config: TrainConfig) -> LabelledWindows:
     """The windows of recordings, all at the network's rate, `data.train_stride_seconds` apart. The
-    placement is that of the recording's attributes."""
-    parts, names = [], []
+    placement is that of the recording's attributes. Raises `InputError` if no window fits."""
+    parts, names, stride = [], [], config.data.train_stride
     for sequence in sequences:
-        source = window_source([sequence], config.data, config.data.train_stride)
+        if not usable_starts(sequence, config.data, stride).size:
+            continue
+        source = window_source([sequence], config.data, stride)
         source = jax.tree.map(jnp.asarray, source)
         part = jax.device_get(gather(source, source.visited, config.data.input_samples))
         parts.append(part)
         names += [str(sequence.attributes.get("placement", ""))] * len(part.imu)
+    if not parts:
+        refuse_no_window(config.data)
     windows, displacement = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     return LabelledWindows(windows, displacement[:, :2], names)
+
+
+def join_windows(parts: list[LabelledWindows]) -> LabelledWindows:
+    """The windows of several datasets, one after the other."""
+    windows, displacement, placements = zip(*parts, strict=True)
+    placement = list(itertools.chain.from_iterable(placements))
+    return LabelledWindows(np.concatenate(windows), np.concatenate(displacement), placement)
 
 
 def train(config: TrainConfig, workdir: Path, reporter: Reporter, workers: int = 1) -> float:
@@ -65,15 +77,16 @@ def train(config: TrainConfig, workdir: Path, reporter: Reporter, workers: int =
     the validation split, m², summed over both axes. Raises `InputError` as `fit` does, and for
     missing data."""
     require_library()
-    parts = []
-    for split in (config.data.train_split, config.data.val_split):
-        sequences = itertools.chain.from_iterable(
-            read_split(config, name, split, reporter, workers, {}) for name in config.datasets
-        )
-        parts.append(labelled_windows(sequences, config))
-        reporter.line(f"  {split}: {len(parts[-1].placement):,} windows")
-    network = fit(parts[0], parts[1], config)
+    training, held_out, splits = read_splits(
+        config,
+        reporter,
+        workers,
+        lambda sequences, _: labelled_windows(sequences, config),
+        lambda source: f"{len(source.placement):,} windows",
+    )
+    network = fit(join_windows(training), join_windows(list(held_out.values())), config)
     workdir.mkdir(parents=True, exist_ok=True)
+    write_splits(workdir, splits)
     write_network(workdir, network)
     log_std = np.asarray(network.variables["batch_stats"]["uncertainty"]["log_std"])
     return float(np.sum(np.exp(2 * log_std[:2])))

@@ -164,7 +164,11 @@ class Task(ABC):
             values = [figures[figure] for figures in rows.values() if figure in figures]
             row[figure] = sum(values) / len(values)
         for figure in ("val_loss", "val_mse", "val_rmse"):
-            row |= {f"{figure}/{name}": figures[figure] for name, figures in rows.items()}
+            row |= {
+                f"{figure}/{name}": figures[figure]
+                for name, figures in rows.items()
+                if figure in figures
+            }
         return state, row
 
     def select_visits(self, key: PRNGKeyArray, entries: Int[jax.Array, "m"]) -> Int[jax.Array, "n"]:

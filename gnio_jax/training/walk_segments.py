@@ -120,7 +120,13 @@ class SegmentGrid(NamedTuple):
 
     @property
     def samples(self) -> int:
+        """Samples in the segment."""
         return self.stride * self.intervals
+
+    @property
+    def predictions(self) -> int:
+        """Windows that end with a clone interval of the segment."""
+        return self.intervals - self.window + 1
 
 
 def grid_of(config: TrainConfig) -> SegmentGrid:
@@ -149,8 +155,9 @@ def cut_walks(
     count = samples + 2 * margin + 1
     row_offset = pace.stretch[:, None] * jnp.arange(count, dtype=jnp.float32)[None, :]
     before = jnp.floor(row_offset).astype(jnp.int32)
-    share = (row_offset - before)[:, :, None]
+    # A segment may end at the last row of all, which has none after it.
     index = jnp.clip(rows[:, None] + before, 0, len(source.imu) - 2)
+    share = (row_offset - (index - rows[:, None]))[:, :, None]
 
     def interpolate(signal: Array) -> jax.Array:
         signal = jnp.asarray(signal)

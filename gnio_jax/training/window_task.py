@@ -6,6 +6,7 @@ step is `task.train_steps`.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Iterable, Iterator
@@ -277,7 +278,8 @@ def validate(
     state: TrainState, source: WindowSource, stage: Stage, *, task: WindowTask
 ) -> Validation:
     """Mean losses and errors over every window of `source`, without augmentation and in inference
-    mode."""
+    mode. The balance of experts is that of a batch and not of a window, where it would be the
+    larger the surer the router is; it is left out."""
     config, model, axes = task.config, task.model, predicted_axes(task.model)
     count = source.visited.shape[0]
     # Batches are whole, so that each device has the same share: the last one is filled up with
@@ -292,8 +294,11 @@ def validate(
     def one_window(prediction: Prediction, windows: Windows) -> Validation:
         prediction, windows = jax.tree.map(lambda x: x[None], (prediction, windows))
         error = windows.displacement - prediction.displacement
+        loss = config.loss
+        if "router" in prediction.diagnostics:
+            loss = dataclasses.replace(loss, balance_weight=0.0)
         return Validation(
-            losses(prediction, windows, config.loss, stage, axes, 1 / config.data.rate),
+            losses(prediction, windows, loss, stage, axes, 1 / config.data.rate),
             prediction.along_axes(error)[0] ** 2,
             prediction.normalise(error, None)[0][0],
         )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -88,9 +88,24 @@ def window_source(
         if part.start.size:
             parts.append(part)
     if not parts:
-        length = f"{config.context_seconds + config.window_seconds:g} s"
-        raise InputError("data", f"no window of {length} with a valid reference in any sequence")
+        refuse_no_window(config)
     return join_windows(parts)
+
+
+def refuse_no_window(config: DataConfig) -> NoReturn:
+    """Raise `InputError` for recordings in which no window fits."""
+    length = f"{config.context_seconds + config.window_seconds:g} s"
+    raise InputError("data", f"no window of {length} with a valid reference in any sequence")
+
+
+def usable_starts(sequence: Sequence, config: DataConfig, spacing: int) -> Int[np.ndarray, "m"]:
+    """First samples of the windows of a recording, `spacing` samples apart, that have a reference
+    and no sample across a gap of the IMU."""
+    start = window_starts(len(sequence.time), config.input_samples, spacing)
+    start = start[without_any(~sequence.valid, start, config.input_samples + 1)]
+    if sequence.imu_valid is not None:
+        start = start[without_any(~sequence.imu_valid, start, config.input_samples)]
+    return start
 
 
 def join_windows(sources: list[WindowSource]) -> WindowSource:
@@ -115,11 +130,8 @@ def _recording_windows(
 ) -> WindowSource:
     """One recording's windows `spacing` samples apart, of which an epoch visits those at `stride`;
     rows and numbers count from 0."""
-    start = window_starts(len(sequence.time), config.input_samples, spacing)
-    start = start[without_any(~sequence.valid, start, config.input_samples + 1)]
-    usable = sequence.valid
+    start, usable = usable_starts(sequence, config, spacing), sequence.valid
     if sequence.imu_valid is not None:
-        start = start[without_any(~sequence.imu_valid, start, config.input_samples)]
         usable = usable & sequence.imu_valid
     # Stretches without an invalid sample begin and end where this changes.
     changes = np.flatnonzero(np.diff(usable, prepend=False, append=False)).reshape(-1, 2)

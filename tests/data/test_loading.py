@@ -1,9 +1,11 @@
 """Recordings are read one way, whoever reads; the cache is anew when files or readers change."""
 
 import dataclasses
+import importlib.util
 import multiprocessing
 import operator
 import os
+import sys
 import time
 import warnings
 from functools import partial
@@ -397,6 +399,48 @@ def test_a_changed_file_or_package_is_read_again(source, tmp_path, monkeypatch):
     assert call(reader, source, other) == call(reader, source, other) == 5
     monkeypatch.setattr(hdf5, "_sources", lambda: "of another version")
     assert call(reader, source, other) == 6
+
+
+def test_a_change_of_any_file_in_a_folder_is_read_again(cache):
+    """The files of comma2k19 lie some folders below that of a minute, whose own time does not
+    change with them."""
+    folder, reader = cache.parent / "minute", Reader()
+    inner = folder / "processed_log" / "IMU" / "gyro"
+    inner.mkdir(parents=True)
+    (inner / "value").write_text("1,2,3")
+    status = (inner / "value").stat()
+    assert call(reader, folder) == call(reader, folder) == 1
+    (inner / "value").write_text("1,2,4")
+    os.utime(inner / "value", ns=(status.st_atime_ns, status.st_mtime_ns + 1))
+    assert call(reader, folder) == call(reader, folder) == 2
+    (inner / "t").write_text("0")
+    assert call(reader, folder) == call(reader, folder) == 3
+    (inner / "t").unlink()
+    assert call(reader, folder) == 4 and len(list(cache.iterdir())) == 1
+
+
+def test_a_changed_reader_of_a_plugin_is_read_again(cache, source, monkeypatch):
+    """A sign that is corrected in a plugin must show."""
+    plugin = cache.parent / "mine.py"
+    code = "from tests.support.circle import circle\n\n\ndef read(path):\n    return [CIRCLE]\n"
+    turns = []
+    for number, change in enumerate(("", "", "._replace(gyro=-circle(seconds=1.0).gyro)")):
+        plugin.write_text(code.replace("CIRCLE", f"circle(seconds=1.0){change}"))
+        os.utime(plugin, ns=(0, 10**9 * (number // 2)))
+        spec = importlib.util.spec_from_file_location("gnio_jax_plugin_mine", plugin)
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, "gnio_jax_plugin_mine", module)
+        exec(compile(plugin.read_text(), plugin, "exec"), module.__dict__)
+        recording = RecordingSource("walk", partial(module.read, source), (source,), slow=True)
+        (sequence,) = read_recording(recording).sequences
+        turns.append(sequence.gyro[0, 2])
+    assert turns[0] == turns[1] == -turns[2] != 0
+
+
+def test_a_recording_that_names_no_files_is_read_every_time(cache):
+    """Otherwise it would be taken for another one of this name, in any folder."""
+    reader = Reader()
+    assert (call(reader), call(reader)) == (1, 2) and not cache.exists()
 
 
 def test_a_new_entry_takes_the_place_of_those_of_the_same_recording(source, cache, monkeypatch):

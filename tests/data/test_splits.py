@@ -89,9 +89,12 @@ def test_a_split_may_be_a_fold_or_all_but_that_in_training_too(monkeypatch):
         ("train-2of2", r"split 'train-2of2': has no such fold; they are numbered 0 to 1"),
         ("trian-0of2", r"unknown split 'trian'; did you mean 'train'"),
         ("train-6of9", r"split 'train': has nothing in fold 6 of 9; there are 5 people or"),
+        ("train-0of1", r"has nothing beside fold 0 of 1; there are 5 people or .* two folds or"),
+        ("val-0of4", r"has nothing beside fold 0 of 4; it is of one person or session; add others"),
     ],
 )
 def test_a_fold_that_is_not_there_is_a_mistake(monkeypatch, split, problem):
-    monkeypatch.setattr(loading, "read_split", lambda *_: iter(RECORDINGS))
+    count = 2 if split.startswith("val") else None  # both of one session
+    monkeypatch.setattr(loading, "read_split", lambda *_: iter(RECORDINGS[:count]))
     with pytest.raises(InputError, match=problem):
         data.load("synthetic", None, split)

@@ -36,7 +36,8 @@ def zipped(folder, name, columns, time, values):
 def write(root, seconds=known_walk.SECONDS):
     """The folder of a drive."""
     folder, time = root / DRIVE, np.arange(0, seconds, 0.01)
-    signals = known_walk.rate(time) @ FLIP, known_walk.force(time) @ FLIP
+    middle = time - 0.005  # of the time before the stamp, to which the increments belong
+    signals = known_walk.rate(middle) @ FLIP, known_walk.force(middle) @ FLIP
     increments = np.concatenate([0.01 * signal @ TO_CASE for signal in signals], axis=1)
     names = [f"Delta{part}[{axis}]" for part in ("Theta", "Velocity") for axis in range(3)]
     zipped(folder, "imu-nav", names, time, increments)

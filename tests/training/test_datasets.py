@@ -12,7 +12,16 @@ import yaml
 from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.calibration import predictions
-from gnio_jax.config import CalibrateConfig, DataConfig, EvaluateConfig, TrainConfig
+from gnio_jax.config import (
+    CalibrateConfig,
+    DataConfig,
+    EvaluateConfig,
+    FilterSettings,
+    ModelConfig,
+    OptimConfig,
+    ThroughFilter,
+    TrainConfig,
+)
 from gnio_jax.data.readers import DATASETS
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import resolve
@@ -162,6 +171,25 @@ def test_the_mean_is_over_the_datasets_that_have_a_figure(run):
     held_out = {"a": {"val_loss": 3.0}, "b": {"val_waypoint_error": 0.2}, "c": {}}
     _, row = task.validate(TrainState(jnp.int32(0), {}, None), held_out, jax.random.key(0))
     assert row["val_waypoint_error"] == 0.2 and row["val_loss"] == pytest.approx(5 / 3)
+
+
+def test_networks_without_displacements_learn_from_several_datasets_too(tmp_path):
+    """They have no error of a displacement, neither in the log nor in the line of an epoch."""
+    config = TrainConfig(
+        dataset=BOTH,
+        workdir=str(tmp_path / "run"),
+        data=DataConfig(rate=50.0, window_seconds=0.4, window_rotation="body_axes"),
+        model=ModelConfig(name="ai_imu"),
+        optim=OptimConfig(epochs=1, batch_size=4),
+        filter=FilterSettings(measurements={"nonholonomic": {"lateral_std": 0.3}}),
+        through_filter=ThroughFilter(("encoder", "uncertainty"), piece_seconds=2.0),
+    )
+    loop.train(config)
+    (row,) = tiny_run.rows(tmp_path / "run")
+    for figure in ("val_loss", "val_mse"):
+        mean = (row[f"{figure}/tlio"] + row[f"{figure}/other"]) / 2
+        assert row[figure] == pytest.approx(mean, rel=1e-6)
+    assert not any("rmse" in name for name in row)
 
 
 def test_an_evaluation_says_of_which_dataset(run):

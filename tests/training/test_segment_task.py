@@ -23,8 +23,8 @@ from gnio_jax.reporting import Silence
 from gnio_jax.training import initial, loop
 from gnio_jax.training.losses import loss_stage
 from gnio_jax.training.recordings import set_up
-from gnio_jax.training.segment_task import BANDS, SegmentTask, horizon_error, validate
-from gnio_jax.training.task import gradient_of
+from gnio_jax.training.segment_task import BANDS, SegmentTask, horizon_error, measure, validate
+from gnio_jax.training.task import TrainState, gradient_of
 from gnio_jax.training.walk_segments import (
     SegmentGrid,
     cut_walks,
@@ -34,7 +34,7 @@ from gnio_jax.training.walk_segments import (
     with_errors,
 )
 from gnio_jax.training.walkway import unchanged_pace
-from gnio_jax.types import Sequence
+from gnio_jax.types import Prediction, Sequence
 from tests.support import tiny_run
 from tests.support.tiny_run import assert_same_runs, rows
 from tests.support.tlio_files import write_splits
@@ -105,6 +105,38 @@ def test_segments_are_cut_with_the_attitude_of_the_reference():
         signals, displacement = reference_segment(sequence, row % 700, intervals)
         np.testing.assert_allclose(cut.signals[i], signals, atol=2e-5)
         np.testing.assert_allclose(cut.displacement[i], displacement, atol=2e-5)
+
+
+def test_a_segment_may_end_at_the_last_row_of_all():
+    sequence = walk(20 * N + 1)._replace(valid=np.ones(20 * N + 1, bool))
+    sequence = sequence._replace(position=np.nan_to_num(sequence.position))
+    source = walk_source([sequence], experiment(None, "unused"), training=False)
+    np.testing.assert_array_equal(source.earliest, [0])
+    grid = SegmentGrid(N, 20, W, RATE)
+    source, rows = jax.device_put(source), jnp.zeros(1, jnp.int32)
+    cut = jax.device_get(cut_walks(source, rows, unchanged_pace(1), grid))
+    _, displacement = reference_segment(sequence, 0, 20)
+    np.testing.assert_allclose(cut.displacement[0], displacement, atol=2e-5)
+
+
+def test_the_ratio_of_predicted_and_walked_is_that_in_the_plane(prepared):
+    """On stairs, too: a perfect prediction has a ratio of 1."""
+    task, held, _ = prepared
+    segments = cut_walks(
+        held.source, held.source.earliest[:2], unchanged_pace(2), grid_of(task.config)
+    )
+    climbed = segments.displacement.at[..., 2].set(2.0)
+    segments = segments._replace(displacement=climbed)
+    prediction = Prediction(climbed, jnp.zeros_like(climbed))
+
+    class Perfect(SegmentTask):
+        def predict(self, variables, segments, dropout_key=None):
+            return prediction, {}
+
+    perfect = Perfect(task.model, task.config, 1)
+    state = TrainState(jnp.int32(1), {}, None)
+    figures = measure(state, segments, perfect.last_stage(state), jnp.ones(2), perfect)
+    assert float(figures.predicted / figures.walked) == pytest.approx(1.0, rel=1e-5)
 
 
 def test_a_segment_that_does_not_fit_is_refused():
@@ -397,7 +429,7 @@ def test_validation_is_a_loop_over_segments(root, prepared):
         predicted = np.asarray(prediction.displacement)[0, W - 1 :]
         squares.append(((displacement - predicted) ** 2).sum(1))
         lengths.append(np.linalg.norm(displacement[:, :2], axis=1))
-        along.append((displacement * predicted).sum(1) / lengths[-1])
+        along.append((displacement * predicted)[:, :2].sum(1) / lengths[-1])
     assert float(plain.mse) == pytest.approx(np.mean(squares), rel=1e-4)
     assert float(plain.walked) == pytest.approx(np.mean(lengths), rel=1e-4)
     assert float(plain.predicted) == pytest.approx(np.mean(along), rel=1e-3)

@@ -9,11 +9,16 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from gnio_jax import config as configuration
+from gnio_jax import data
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import ridi
+from gnio_jax.networks.folder import training_recordings
+from gnio_jax.reporting import Lines
 from gnio_jax.training import run_folder, support_vectors
 from gnio_jax.training.support_vectors import LabelledWindows
+from tests.support.circle import circle
+from tests.support.tlio_files import spoil, write_sequence, write_splits
 
 RNG = np.random.default_rng(10)
 CONFIG = TrainConfig(data=DataConfig(rate=10.0), model=ModelConfig(name="ridi"))
@@ -138,6 +143,35 @@ def score(machine, x, y):
         error = y[part] - machine.fit(x[others], y[others]).predict(x[part])
         scores.append(1 - np.sum(error**2) / np.sum((y[part] - y[part].mean()) ** 2))
     return np.mean(scores)
+
+
+def test_a_recording_without_a_window_is_no_error_beside_others():
+    short, walk = (circle(seconds=seconds, rate=10.0)._replace(name="a") for seconds in (0.8, 5.0))
+    windows, displacement, placement = support_vectors.labelled_windows([short, walk], CONFIG)
+    alone = support_vectors.labelled_windows([walk], CONFIG)
+    np.testing.assert_array_equal(windows, alone.windows)
+    assert len(windows) == len(displacement) == len(placement) == 40
+    with pytest.raises(InputError, match="no window of 1 s with a valid reference in any"):
+        support_vectors.labelled_windows([short], CONFIG)
+
+
+def test_a_run_names_its_recordings_and_what_is_left_out_of_them(tmp_path, capsys):
+    """So an evaluation on what it was trained on is seen."""
+    pytest.importorskip("sklearn")
+    root = write_splits(tmp_path / "tlio")
+    for split, names in (("train", ["a", "b", "c"]), ("val", ["c", "d"])):
+        (root / f"{split}_list.txt").write_text("\n".join(names))
+    write_sequence(root / "d", spoil=spoil("pos_World_Device", 5, np.nan))
+    config = dataclasses.replace(
+        CONFIG, dataset="tlio", data_root=str(root), workdir=str(tmp_path / "run")
+    )
+    with pytest.warns(data.DamagedRecording, match="d: left out"):
+        support_vectors.train(config, tmp_path / "run", Lines())
+    learnt = training_recordings(tmp_path / "run", config, "tlio")
+    assert learnt == {"a", "b", "c"}
+    text = capsys.readouterr().err
+    assert "LEFT OUT of val: d: " in text and "warning: c in train and in val" in text
+    assert "train: 3 sequences" in text and " windows" in text
 
 
 def test_a_placement_with_too_few_windows_is_refused():

@@ -500,6 +500,15 @@ def test_a_network_without_displacements_is_trained_from_random_weights(recordin
     with pytest.raises(InputError, match=r"'ai_imu' is trained in the filter's loop alone; name"):
         elsewhere = str(tmp_path / "elsewhere")
         loop.train(dataclasses.replace(config, workdir=elsewhere, through_filter=ThroughFilter()))
+    for name, choice, usual in (
+        ("best_by", "squared_error", "loss"),
+        ("schedule", "plateau", "cosine"),
+    ):
+        optim = dataclasses.replace(config.optim, **{name: choice})
+        expected = f"optim.{name}: is {choice}, and 'ai_imu' predicts no displacement, .* {usual}$"
+        with pytest.raises(InputError, match=expected):
+            loop.refuse_untrainable(dataclasses.replace(config, optim=optim))
+        loop.refuse_untrainable(tiny(recording, run, optim=optim))  # others have such an error
 
 
 def test_mistakes(recording, tmp_path):

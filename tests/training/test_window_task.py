@@ -103,6 +103,20 @@ def test_the_loss_of_a_corrector_is_in_the_log(training, recording):
     assert f" preintegration {row['val_preintegration']:.4g}  " in remark
 
 
+def test_validation_leaves_the_balance_of_experts_out(training, recording):
+    """A router that is sure of each window, and takes all experts alike, is not out of balance."""
+    rows = []
+    for weight in (0.0, 50.0):
+        changes = {"model": ModelConfig("experts", width=2), "loss": LossConfig(nll_weight=0.0)}
+        changes["loss"] = dataclasses.replace(changes["loss"], balance_weight=weight)
+        experiment = config(recording, "", **changes)
+        experts = WindowTask(models.from_experiment(experiment), experiment, 1)
+        state = drawn_state(experts.model, experiment, 1)
+        rows.append(experts.figures_of(state, training[1].held_out["tlio"], KEY))
+    assert rows[0]["val_loss"] == rows[1]["val_loss"] > 0
+    assert rows[1]["val_loss"] == pytest.approx(100 * rows[1]["val_mse"], rel=1e-5)
+
+
 class Flat(Tiny):
     """Its displacements have no vertical."""
 

@@ -1,11 +1,14 @@
 """Blackbird: an aggressive quadrotor in a motion-capture room (Antonini et al., IJRR 2020), as
 learned inertial odometry uses it.
 
-Layout: <root>/{train,val,test}.txt name folders, one a line, lines with '#' being comments;
-<folder>/data.hdf5 holds at 100 Hz `ts` s (unix), `gyro_calib` rad/s and `accel_calib` m/s² (the raw
-ones minus one bias each) and `traj_target`, position m and quaternion xyzw of the IMU;
-`stamped_groundtruth_imu.txt` beside it repeats the poses (stamp, position, quaternion xyzw) and
-adds the velocity, whose three columns its header does not name.
+Layout: <root>/{train,val,test}.txt name folders, one a line, lines with '#' being comments: pieces
+of a flight, as <trajectory>/<yaw>/<speed>/<piece>, or <trajectory>/<yaw>/<speed>/imo/<piece> where
+the authors' program wrote them. What comes before the piece names the flight, which is the `group`:
+flights of several trajectories have the same speed. <folder>/data.hdf5 holds at 100 Hz `ts` s
+(unix), `gyro_calib` rad/s and `accel_calib` m/s² (the raw ones minus one bias each) and
+`traj_target`, position m and quaternion xyzw of the IMU; `stamped_groundtruth_imu.txt` beside it
+repeats the poses (stamp, position, quaternion xyzw) and adds the velocity, whose three columns its
+header does not name.
 
 The body is front, right, *down*: level at rest the accelerometer reads −9.81 on z. This is not
 changed, because the orientation describes it. The direction of the world's z axis is found from the
@@ -44,17 +47,19 @@ def recordings(root: Path, split: str) -> list[RecordingSource]:
         root,
         DATASET.layout,
     )
-    names = ["_".join(folder.relative_to(root).parts) for folder in folders]
     return [
         RecordingSource(
-            name, partial(read, folder, name), (file_in(folder, _TABLE), file_in(folder, _TRUTH))
+            "_".join(folder.relative_to(root).parts),
+            partial(read, folder, folder.relative_to(root)),
+            (file_in(folder, _TABLE), file_in(folder, _TRUTH)),
         )
-        for name, folder in zip(names, folders, strict=True)
+        for folder in folders
     ]
 
 
-def read(folder: Path, name: str | None = None) -> list[Sequence]:
-    """Read the sequence of a folder, in a z-up world. Raises `InputError` naming file and field."""
+def read(folder: Path, piece: Path | None = None) -> list[Sequence]:
+    """Read the sequence of a folder, in a z-up world. `piece` is its path in the dataset. Raises
+    `InputError` naming file and field."""
     path = file_in(folder, _TABLE)
     table = read_hdf5_fields(path, ("ts", "gyro_calib", "accel_calib", "traj_target"))
     time, start, _ = table.clock("ts", "s")
@@ -65,9 +70,11 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
 
     upside_down = attitude.apply(accel).mean(axis=0)[2] < 0
     turn = Rotation.from_rotvec([np.pi if upside_down else 0.0, 0.0, 0.0])
+    piece = piece or Path(folder.name)
+    flight = "/".join(piece.parts[:-1]) or folder.name
     attributes = {
-        "group": folder.parent.name,
-        "session": "/".join(folder.parts[-4:-1]),
+        "group": flight,
+        "session": flight,
         "placement": "quadrotor",
         "body": "front-right-down",
         "native_world": "z-down, turned" if upside_down else "z-up",
@@ -76,7 +83,7 @@ def read(folder: Path, name: str | None = None) -> list[Sequence]:
     }
     velocity = velocity if velocity is None else turn.apply(velocity)
     poses = Poses(time, turn * attitude, turn.apply(pose[:, :3]), velocity, source=str(path))
-    streams = Streams.of_imu(name or folder.name, path, time, gyro, accel)
+    streams = Streams.of_imu("_".join(piece.parts), path, time, gyro, accel)
     streams = streams._replace(attributes=attributes, start=start, poses=poses)
     return assemble(streams, RATE)
 
@@ -108,7 +115,7 @@ DATASET = Dataset(
     rate=RATE,
     source="https://github.com/mit-aera/Blackbird-Dataset",
     layout="<root>/{train,val,test}.txt and "
-    "<root>/<trajectory>/<yaw>/<speed>/<split>/{data.hdf5,stamped_groundtruth_imu.txt}",
+    "<root>/<trajectory>/<yaw>/<speed>/[imo/]<split>/{data.hdf5,stamped_groundtruth_imu.txt}",
     licence="as stated by the authors (github.com/mit-aera/Blackbird-Dataset)",
     pedestrian=False,
 )

@@ -31,6 +31,7 @@ from gnio_jax.data.dataset import Dataset, RecordingSource
 from gnio_jax.data.parsing.tables import damage_error, parsing_as
 from gnio_jax.data.splits import draw_share
 from gnio_jax.errors import InputError
+from gnio_jax.files import file_in
 from gnio_jax.types import Sequence
 
 RATE = 104.0
@@ -140,6 +141,7 @@ def level_axes(position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 def _array(path: Path, width: int | None = None) -> np.ndarray:
     """The numbers of a NumPy file without a suffix: (n,), or (n, width)."""
+    path = file_in(path.parent, path.name)
     if not path.is_file():
         raise InputError(path, "no such file", f"expected layout: {DATASET.layout}")
     with parsing_as(path, "a NumPy array"):

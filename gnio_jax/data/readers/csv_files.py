@@ -4,7 +4,8 @@ A CSV has a header that names, in any order, `time` s, `gyro_x..z` rad/s, `accel
 (specific force), and optionally a reference: `qw..qz` (body→world), `px..pz` m, `vx..vz` m/s in a
 z-up world; other columns are ignored. Any rate is allowed. Without a reference the sequence has NaN
 there and `valid` is False; velocities that are not given are those of the smoothed positions. The
-reference may be empty in some rows: gaps up to 0.1 s are bridged, and longer ones are not valid.
+reference may be empty in some rows: gaps up to 0.1 s, or 2.5 usual intervals between poses if that
+is longer, are bridged, and longer ones are not valid.
 
 `gnio data import` brings the files of a phone's logger into this form.
 """

@@ -3,9 +3,11 @@ licence is not stated).
 
 Layout: `<root>/.../<drive>/n380-{imu-nav,position,velocity,attitude}.csv.zip`, each with one CSV:
 
-- `imu-nav`: increments of angle (rad) and velocity (m/s) over 0.01 s in the sensor's axes. The
-  case's axes, which are the sequence's body, point ahead, right and down:
-  x, y, z of the case are −z, y, x of the sensor.
+- `imu-nav`: increments of angle (rad) and velocity (m/s) over the 0.01 s before the stamp, in the
+  sensor's axes. The turns between the published attitudes show when. A sample of a sequence drives
+  the time after its stamp, so it has the stamp at which its increments begin. The case's axes,
+  which are the sequence's body, point ahead, right and down: x, y, z of the case are −z, y, x of
+  the sensor.
 - `position`: latitude and longitude in rad, height in m; `velocity`: north, east, down;
   `attitude`: roll, pitch and heading of the case, rad.
 
@@ -96,7 +98,8 @@ def read(drive: Path) -> list[Sequence]:
     latitude, longitude = np.degrees(geodetic[:, 0]), np.degrees(geodetic[:, 1])
     position = project(latitude, longitude, geodetic[:, 2])
     to_world = TO_EAST_NORTH_UP @ Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()
-    start = float(stamps[0])
+    beginnings = stamps - 1 / RATE
+    start = float(beginnings[0])
     poses = Poses(
         time - start,
         Rotation.from_matrix(to_world),
@@ -111,7 +114,7 @@ def read(drive: Path) -> list[Sequence]:
         "truth": "INS with GNSS (HGuide n380)",
         "imu_compensated": "reference",
     }
-    streams = Streams.of_imu(drive.name, paths["imu-nav"], stamps - start, gyro, accel)
+    streams = Streams.of_imu(drive.name, paths["imu-nav"], beginnings - start, gyro, accel)
     streams = streams._replace(poses=poses, attributes=attributes)
     return assemble(streams, RATE, divide=True, max_drift=LARGEST_JUMP)
 

@@ -25,7 +25,14 @@ def test_a_drive_comes_back(tmp_path):
         orientation=(attitude * Rotation.from_matrix(files.FLIP)).as_quat(scalar_first=True),
     )
     origin = known_walk.position(np.zeros(1))
-    known_walk.compare(level, sequence.time, speed=2e-2, origin=origin)
+    known_walk.compare(level, sequence.time, speed=2e-2, origin=origin, imu=0.3)
+    # A sample drives the time after its stamp, on average at its middle.
+    middle = sequence.time[:-1] + 0.005
+    np.testing.assert_allclose(level.gyro[:-1], known_walk.rate(middle), atol=1e-3)
+    np.testing.assert_allclose(level.accel[:-1], known_walk.force(middle), atol=1e-3)
+    reference = Rotation.from_quat(level.orientation, scalar_first=True)
+    turns = (reference[:-1].inv() * reference[1:]).as_rotvec() / 0.01
+    np.testing.assert_allclose(level.gyro[:-1], turns, atol=2e-3)
 
 
 def test_tables_that_share_no_stamp_are_refused(tmp_path):
