@@ -80,20 +80,20 @@ def wrong():
         with unchecked():
             ekf = filtering.Filter(**parts)
         yield f"ekf.{part}: must be a {kind}, e.g. ", {"ekf": ekf}
-    rest, constraint = filtering.ZeroVelocity(0.1), filtering.NonHolonomic(lateral_std=NAN)
+    standstill, constraint = filtering.ZeroVelocity(0.1), filtering.NonHolonomic(lateral_std=NAN)
     for measurements, problem in (
         ((filtering.ZeroVelocity(-0.1),), r"\[0\].std: must be positive"),
         ((filtering.ZeroVelocity("a"),), r"\[0\].std: must be a number, found 'a'"),
-        ((rest, constraint), r"\[1\].lateral_std: must be positive"),
+        ((standstill, constraint), r"\[1\].lateral_std: must be positive"),
         ((filtering.ZeroVelocity,), r"\[0\]: is the class ZeroVelocity"),
         ({"zero_velocity": {"std": 0.1}}, r": must be a tuple .* dict; write \(\) for none$"),
-        (rest, r": must be a tuple .* ZeroVelocity; write \(zero_velocity,\) for one$"),
+        (standstill, r": must be a tuple .* ZeroVelocity; write \(zero_velocity,\) for one$"),
     ):
         with unchecked():
             ekf = filtering.Filter(CONFIG, NOISE, measurements=measurements)
         yield f"ekf.measurements{problem}", {"ekf": ekf}
     alone = r"measurements\[0\].std: must have a row .* is a part of the Filter$"
-    yield alone, {"measurements": (rest,)}
+    yield alone, {"measurements": (standstill,)}
     for nothing in (None, "rows", GYRO.astype(object), [[0.0, 0.0, 0.0], [0.0]]):
         yield "gyro: must be an array of numbers, found", {"gyro": nothing}
     yield "covariance: must be an array of numbers, found NoneType", {"covariance": None}
@@ -311,7 +311,8 @@ def test_a_network_that_is_no_function_of_windows_is_refused():
     with unchecked(), pytest.raises(ValueError, match=r"^predict: log_std must .* found NoneType"):
         filtering.run_odometry(lambda _: prediction, ekf, *rows)
     reference = np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3))
-    listed = filtering.displacements(*(part.tolist() for part in reference), CONFIG)
+    rotation, position = (part.tolist() for part in reference)
+    listed = filtering.displacements(rotation, position, CONFIG)
     assert listed.shape == (3, 3)
     for rotation, position in (
         (reference[0][:3], reference[1]),
