@@ -27,7 +27,7 @@ def did_you_mean(
 ) -> str:
     """The beginning of a remedy that names the closest of the known words, as `shown` writes it;
     empty if none is close."""
-    close = difflib.get_close_matches(word, list(words), n=1, cutoff=cutoff)
+    close = difflib.get_close_matches(str(word), list(words), n=1, cutoff=cutoff)
     return f"did you mean '{shown(close[0])}'? " if close else ""
 
 

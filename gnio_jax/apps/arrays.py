@@ -101,6 +101,9 @@ def track(
             network sees no heading that could be left out. It is a `ValueError`.
     """
     time, gyro, accel = _checked_samples(time, gyro, accel)
+    if not isinstance(sensors, Mapping):
+        remedy = "give a dict such as {'barometer': (time, pressure)}, or leave it out"
+        raise InputError("sensors", f"is a {type(sensors).__name__}", remedy)
     others = tuple(_checked_readings(name, parts, time) for name, parts in sensors.items())
     recording = RawRecording(
         Path(SOURCE),

@@ -14,6 +14,7 @@ The field in a car is that of its steel and its currents, so a magnetometer is l
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -101,6 +102,10 @@ def is_drive(sequence: Sequence, readings: dict[str, Readings]) -> bool:
 def load_filter(carrier: str) -> TrainConfig:
     """The configuration of a car's filter: "car" is configs/drive.yaml, others are files or names
     of experiments. Raises `InputError` if it cannot be read, or is none of a car."""
+    is_name = carrier in configuration.experiment_names()
+    if carrier != "car" and not is_name and not Path(carrier).exists():
+        problem = f"'{carrier}' is neither person nor car, and no such file"
+        raise InputError("--carrier", problem, "give person, car, or a file as configs/drive.yaml")
     config = configuration.load("drive" if carrier == "car" else carrier)
     config = configuration.validate(config, carrier)
     if NonHolonomic.name not in config.filter.measurements:

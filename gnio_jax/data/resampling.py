@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.decimation import decimation_factor, low_pass
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import convolve, finite_rows, quaternions, rotations, stretches
 from gnio_jax.types import Sequence
 
@@ -77,8 +78,10 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
     velocity by splines, and attitudes by slerp along the shorter arc. `valid` is False between
     samples of which one is invalid, and in gaps of the IMU, where `imu_valid` is also False. A
     reference value next to a NaN is NaN. Waypoints and the readings of other sensors have stamps of
-    their own and do not change.
+    their own and do not change. Raises `InputError` for a rate that is not a number above 0.
     """
+    if not (isinstance(rate, int | float | np.number) and 0 < rate < np.inf):
+        raise InputError("rate", f"found {rate!r}", "give a number above 0, Hz")
     time, valid = sequence.time, sequence.valid
     if is_uniform(time, rate):
         return sequence

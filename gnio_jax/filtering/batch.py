@@ -116,7 +116,13 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
 
     def run_shared(*arguments: object) -> T:
         sequences = arguments[shared:]
-        count = jax.tree.leaves(sequences)[0].shape[0]
+        lengths = [jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(sequences)]
+        if not lengths or len(set(lengths)) > 1 or lengths[0] in ((), (0,)):
+            problem = "arguments must have the sequences as their leading axis, at least one"
+            sizes = ", ".join(str(length[0]) if length else "none" for length in lengths)
+            remedy = f"`shared` ({shared}) counts those at the front that have none"
+            raise ValueError(f"over_sequences: {problem}, found {sizes or 'none'}; {remedy}")
+        count = lengths[0][0]
         # Every process takes part, even if there are fewer sequences than devices.
         devices = jax.devices() if jax.process_count() > 1 else jax.devices()[:count]
         if len(devices) == 1:

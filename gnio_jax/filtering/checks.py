@@ -19,6 +19,7 @@ from jax.core import Tracer
 from jax.tree_util import keystr, tree_map_with_path
 from jaxtyping import Int
 
+from gnio_jax.config import ConsideredStd, CorrelatedError, InitialStd, NoiseModel
 from gnio_jax.config.files import bounds, iterate_settings
 from gnio_jax.config.schema import Bound
 from gnio_jax.filtering.barometer import Barometer
@@ -75,14 +76,39 @@ def checked_array(
 
 
 def checked_shape(name: str, value: Any, shape: tuple[int, ...]) -> jax.Array:
-    """`value` as a JAX array of this shape, which shares no memory with it. `jnp.asarray` would
-    compile a program for each shape of NumPy's arrays."""
-    array = isinstance(value, np.ndarray)
-    value = jax.device_put(np.array(value)) if array else jnp.asarray(value)
+    """`value` as a JAX array of this shape, which shares no memory with it."""
+    value = as_array(name, value)
     if value.shape != shape:
-        remedy = "for a batch of sequences use jax.vmap"
-        raise ValueError(f"{name}: the shape must be {shape}, found {value.shape}; {remedy}")
+        problem = f"the shape must be {shape}, found {value.shape}"
+        batched = value.ndim == len(shape) + 1 and value.shape[1:] == shape
+        remedy = "; for a batch of sequences use jax.vmap" if batched else ""
+        raise ValueError(f"{name}: {problem}{remedy}")
     return value
+
+
+def as_array(name: str, value: Any) -> jax.Array:
+    """`value` as a JAX array, which shares no memory with it. `jnp.asarray` would compile a program
+    for each shape of NumPy's arrays."""
+    try:
+        if isinstance(value, np.ndarray):
+            return jax.device_put(np.array(value))
+        return jnp.asarray(value)
+    except (TypeError, ValueError):
+        kind = type(value).__name__
+        raise ValueError(f"{name}: must be an array of numbers, found {kind}") from None
+
+
+def count_rows(value: jax.Array) -> int:
+    """The number of samples (n, 3) of a sequence, or of each sequence of a batch (b, n, 3), which
+    `checked_shape` then refuses."""
+    return value.shape[-2] if value.ndim > 1 else value.size
+
+
+def check_kind(name: str, value: Any, kind: type, example: str) -> None:
+    """Refuse a value of another type; `example` is what to write."""
+    if not isinstance(value, kind):
+        problem = f"must be a {kind.__name__}, e.g. {example}, found {type(value).__name__}"
+        raise ValueError(f"{name}: {problem}")
 
 
 def check_rows(
@@ -138,6 +164,8 @@ def check_number(name: str, value: Any, least: float, unit: str) -> None:
 
 def check_bounds(name: str, number: Any, limits: Iterable[Bound]) -> None:
     """Refuse anything but None, or one number within the limits."""
+    if isinstance(number, str):
+        raise ValueError(f"{name}: must be a number, found {number!r}")
     if np.shape(number) != ():
         raise ValueError(f"{name}: must be one number, found shape {np.shape(number)}")
     for bound in limits:
@@ -145,12 +173,15 @@ def check_bounds(name: str, number: Any, limits: Iterable[Bound]) -> None:
             raise ValueError(f"{name}: {bound.problem}, found {float(number)}")
 
 
-def check_numbers(name: str, settings: Any) -> None:
+def check_numbers(name: str, settings: Any, bounded_only: bool = False) -> None:
     """Refuse a tuple of settings (`NoiseModel`, `InitialStd`, `ConsideredStd`) with a number
-    outside the bounds of its field."""
+    outside the bounds of its field. With `bounded_only`, as for a measurement of anybody's, fields
+    without bounds may hold anything."""
     for field, hint, value in iterate_settings(settings, f"{name}."):
-        for number in value if isinstance(value, tuple | list) else (value,):
-            check_bounds(field, number, bounds(hint))
+        limits = tuple(bounds(hint))
+        if limits or not bounded_only:
+            for number in value if isinstance(value, tuple | list) else (value,):
+                check_bounds(field, number, limits)
 
 
 # The arguments of a run
@@ -172,7 +203,8 @@ def checked_inputs(
     check_filter(ekf)
     config, state = ekf.config, checked_state(state, ekf)
     dtype, n = state.offset.dtype, config.samples_per_clone
-    samples = jnp.shape(gyro)[0] if jnp.ndim(gyro) else 0
+    gyro, accel = as_array("gyro", gyro), as_array("accel", accel)
+    samples = count_rows(gyro)
     if samples < n or samples % n:
         raise ValueError(
             f"gyro: the samples must be a multiple of samples_per_clone = {n}, found {samples}"
@@ -196,8 +228,11 @@ def checked_inputs(
     accel = checked_signal("accel", accel, STRONGEST_FORCE, "m/s²")
 
     def checked_rows(path: Any, value: Any) -> jax.Array:
-        shape = (samples // n, *np.shape(value)[1:])
-        value = checked_shape(f"measurements{keystr(path)}", value, shape)
+        name = f"measurements{keystr(path)}"
+        if not np.ndim(value):
+            remedy = "a measurement of single numbers is a part of the Filter"
+            raise ValueError(f"{name}: must have a row for each of the clone intervals; {remedy}")
+        value = checked_shape(name, value, (samples // n, *np.shape(value)[1:]))
         return value.astype(dtype) if jnp.issubdtype(value.dtype, jnp.floating) else value
 
     check_measurements("measurements", measurements, ekf.measurements)
@@ -216,14 +251,17 @@ def check_measurements(argument: str, measurements: Any, others: tuple[Any, ...]
     """Refuse anything but a tuple of objects, each with a method `update` and a name that no other
     one of them and none of the `others` has. A single `Fix` is refused, because it is a tuple of
     arrays."""
-    alone = callable(getattr(measurements, "update", None))
+    alone = isinstance(getattr(measurements, "name", None), str)
     if alone or not isinstance(measurements, tuple | list):
         kind = type(measurements).__name__
-        remedy = "write (fix,) for one" if alone else "write () for none"
+        remedy = f"write ({measurements.name},) for one" if alone else "write () for none"
         raise ValueError(f"{argument}: must be a tuple of measurements, found {kind}; {remedy}")
     names = {Displacement.name, *(measurement.name for measurement in others)}
     for number, measurement in enumerate(measurements):
         kind, name = type(measurement).__name__, getattr(measurement, "name", None)
+        if isinstance(measurement, type):
+            problem = f"is the class {measurement.__name__}"
+            raise ValueError(f"{argument}[{number}]: {problem}; make a measurement of it")
         if not callable(getattr(measurement, "update", None)):
             raise ValueError(f"{argument}[{number}]: {kind} has no method update(state, step)")
         if not isinstance(name, str):
@@ -271,18 +309,28 @@ def check_fix(name: str, fix: Fix) -> None:
 
 def check_filter(ekf: Any) -> None:
     """Refuse anything but a `Filter`, and a filter with impossible parts."""
-    if not isinstance(ekf, Filter):
-        kind = type(ekf).__name__
-        raise ValueError(f"ekf: must be a Filter, e.g. Filter(FilterConfig(...)), found {kind}")
+    check_kind("ekf", ekf, Filter, "Filter(FilterConfig(...))")
+    check_kind("ekf.config", ekf.config, FilterConfig, "FilterConfig(dt=0.005, ...)")
+    check_kind("ekf.noise", ekf.noise, NoiseModel, "NoiseModel()")
+    check_kind("ekf.start", ekf.start, InitialStd, "InitialStd()")
+    if ekf.considered is not None:
+        check_kind("ekf.considered", ekf.considered, ConsideredStd, "ConsideredStd(scale=0.03)")
+    if ekf.noise.correlation is not None:
+        example = "CorrelatedError(share=0.8, seconds=0.5)"
+        check_kind("ekf.noise.correlation", ekf.noise.correlation, CorrelatedError, example)
+    factors = ekf.noise.std_factor
+    if not (isinstance(factors, tuple | list) and len(factors) == 3):
+        problem = f"must be a tuple of three numbers, for x, y and z, found {factors}"
+        raise ValueError(f"ekf.noise.std_factor: {problem}")
     check_numbers("ekf.noise", ekf.noise)
-    if len(ekf.noise.std_factor) != 3:
-        raise ValueError("ekf.noise.std_factor: must be three numbers, for x, y and z")
     check_measurements("ekf.measurements", ekf.measurements)
     for number, measurement in enumerate(ekf.measurements):
         of_sensor = isinstance(measurement, Barometer | Fix | Magnetometer | WheelSpeed)
         if of_sensor and min(map(np.ndim, measurement)) > 0:
             problem = f"{type(measurement).__name__} has rows; pass it as `measurements` of the run"
             raise ValueError(f"ekf.measurements[{number}]: {problem}")
+        if hasattr(measurement, "_fields"):
+            check_numbers(f"ekf.measurements[{number}]", measurement, bounded_only=True)
 
 
 def converted_filter(ekf: Filter, dtype: Any) -> Filter:
@@ -298,6 +346,7 @@ def checked_state(state: FilterState, ekf: Filter) -> FilterState:
 
     A state without a temporally correlated error gets one where the noise has one.
     """
+    check_kind("state", state, FilterState, "initial_state(ekf, rotation, velocity, position)")
     config, noise = ekf.config, ekf.noise
     if noise.correlation is not None:
         state = with_correlated_error(state)

@@ -35,7 +35,7 @@ from jaxtyping import Float
 
 from gnio_jax import geometry
 from gnio_jax.config import ConsideredStd
-from gnio_jax.filtering.checks import check_numbers
+from gnio_jax.filtering.checks import check_kind, check_numbers
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.history import FilterHistory
 from gnio_jax.filtering.scan import Measure
@@ -65,6 +65,7 @@ def considered_covariance(
     deviation `std.raw_gyro_bias`, and zeros where the gyro is not raw. None: no gyro is raw. Raises
     `ValueError` for a standard deviation that is negative or not finite.
     """
+    check_kind("considered", std, ConsideredStd, "ConsideredStd(scale=0.03)")
     check_numbers("considered", std)
     stds = (std.gyro_bias, std.gyro_bias, std.gyro_bias, std.scale, std.heading, std.slope)
     root = sensitivity * jnp.stack([jnp.asarray(value) for value in stds])[None, None]

@@ -18,7 +18,7 @@ entries instead of 3 W.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -202,19 +202,19 @@ def _predict_displacement(
     return moved, jacobian, defined
 
 
-def displacements(
-    rotation: Float[np.ndarray, "k 3 3"], position: Float[np.ndarray, "k 3"], config: FilterConfig
-) -> Float[np.ndarray, "k-1 3"]:
+def displacements(rotation: Any, position: Any, config: FilterConfig) -> Float[np.ndarray, "k 3"]:
     """Displacements of a known trajectory as `run_filter` takes them, m, e.g. of a reference.
 
     rotation (K + 1, 3, 3) body → world and position (K + 1, 3), m, are those at the start and at
     the end of each clone interval: every n-th row of a reference at the rate of the IMU. Row k of
     the K rows is from clone k − W to clone k, the rows k + 1 − W and k + 1 of the trajectory,
     expressed in the yaw frame of clone k − W; NaN for k < W, before there are W + 1 clones. Raises
-    `ValueError` if there is no row, or the two have not the same number of rows.
+    `ValueError` if there is no row, or a shape differs.
     """
-    if not len(rotation) == len(position) > 0:
-        shapes = f"{np.shape(rotation)} and {np.shape(position)}"
+    rotation, position = np.asarray(rotation), np.asarray(position)
+    rows = len(position) if position.ndim else 0
+    if not rows or rotation.shape != (rows, 3, 3) or position.shape != (rows, 3):
+        shapes = f"{rotation.shape} and {position.shape}"
         raise ValueError(
             f"rotation and position: must be (K + 1, 3, 3) and (K + 1, 3), found {shapes}"
         )

@@ -43,7 +43,7 @@ def register(measurement: type) -> None:
     parts = isinstance(name, str), hasattr(measurement, "_fields"), hasattr(measurement, "update")
     if not all(parts):
         problem = "is not a NamedTuple with a `name` and a method `update(state, step)`"
-        raise InputError(measurement.__name__, problem)
+        raise InputError(getattr(measurement, "__name__", repr(measurement)), problem)
     if name in _PUBLISHED:
         problem = "is a measurement of gnio-jax"
         raise InputError(f"measurement '{name}'", problem, "choose another name")

@@ -86,8 +86,17 @@ def find_mounting(
         source: The recording, for messages.
 
     Raises:
-        InputError: The IMU hardly moves, or it does not turn and brake enough.
+        InputError: A shape or a number cannot be, the IMU hardly moves, or it does not turn and
+            brake enough.
     """
+    gyro, accel = np.asarray(gyro, np.float64), np.asarray(accel, np.float64)
+    if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
+        problem = f"gyro and accel must be (n, 3), found {gyro.shape} and {accel.shape}"
+        raise InputError(source, problem, "pass one row for each sample")
+    if not (np.isfinite(gyro).all() and np.isfinite(accel).all()):
+        raise InputError(source, "gyro or accel is not finite", "fill or leave out these samples")
+    if not 0 < rate < np.inf:
+        raise InputError(source, f"rate: found {rate:g}", "give samples per second, above 0")
     remedy = "state yaw, pitch and roll in filter.measurements.nonholonomic of the settings"
     length = round(PIECE_SECONDS * rate)
     count = len(gyro) // length

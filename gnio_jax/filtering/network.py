@@ -191,6 +191,11 @@ def network_measurement(
     `ValueError` if `predict` does not return what the filter needs.
     """
 
+    unbound = hasattr(predict, "apply") and getattr(predict, "scope", None) is None
+    if unbound or not callable(predict):
+        problem = f"must be a function from windows to a Prediction, found {type(predict).__name__}"
+        remedy = "models.Network.of(model, variables).predict() makes one of a network"
+        raise ValueError(f"predict: {problem}; {remedy}")
     config = ekf.config
     shape = jax.ShapeDtypeStruct((1, config.input_samples, config.channels), jnp.float32)
 
@@ -243,9 +248,9 @@ def _check(prediction: Any) -> None:
         value, log_std = prediction.velocity
         vectors = (*vectors, ("velocity", value, 3), ("velocity.log_std", log_std, 3))
     for name, value, size in (*vectors, *axes):
-        if value.shape != (1, size):
-            shapes = f"must be (1, {size}) for one window, found {value.shape}"
-            raise ValueError(f"predict: {name} {shapes}")
+        shape = getattr(value, "shape", type(value).__name__)
+        if shape != (1, size):
+            raise ValueError(f"predict: {name} must be (1, {size}) for one window, found {shape}")
     for name, value in prediction.diagnostics.items():
         if value.shape[:1] != (1,):
             problem = f"must have a leading axis of one window, found {value.shape}"

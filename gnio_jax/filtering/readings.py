@@ -27,8 +27,12 @@ def interval_ends(
     sensor: str, intervals: int, config: FilterConfig, start: float
 ) -> Float[np.ndarray, "k"]:
     """Stamps of the ends of the clone intervals, s; `start` is that of the first IMU sample. Raises
-    `InputError` naming the sensor if there is no interval."""
-    if not intervals > 0:
+    `InputError` naming the sensor if there is no interval, or if one of the two is something
+    else."""
+    if not isinstance(config, FilterConfig):
+        problem = f"config: must be a FilterConfig, found {type(config).__name__}"
+        raise InputError(sensor, problem, "give ekf.config")
+    if not isinstance(intervals, int | np.integer) or not intervals > 0:
         remedy = "give the number of clone intervals of the run, at least 1"
         raise InputError(sensor, f"intervals: found {intervals}", remedy)
     return start + config.clone_seconds * np.arange(1, intervals + 1)

@@ -27,11 +27,13 @@ from jaxtyping import Float
 from gnio_jax import geometry
 from gnio_jax.config.schema import NOT_NEGATIVE
 from gnio_jax.filtering.checks import (
+    as_array,
     check_bounds,
     check_filter,
     check_numbers,
     check_rotation,
     checked_array,
+    count_rows,
 )
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.settings import FilterConfig
@@ -96,7 +98,8 @@ def initial_state(
     parts = {"velocity": velocity, "position": position}
     biases = {"gyro_bias": gyro_bias, "accel_bias": accel_bias}
     for name, value in biases.items():
-        parts[name] = value if jnp.ndim(value) else jnp.full(3, value, rotation.dtype)
+        bias = as_array(name, value)
+        parts[name] = bias if bias.ndim else jnp.full(3, bias, rotation.dtype)
     vectors = [
         checked_array(name, value, (3,), config).astype(rotation.dtype)
         for name, value in parts.items()
@@ -124,7 +127,8 @@ def level_state(ekf: Filter, gyro: Any, accel: Any) -> FilterState:
     """
     check_filter(ekf)
     config, std = ekf.config, ekf.start
-    samples = jnp.shape(accel)[0] if jnp.ndim(accel) else 0
+    gyro, accel = as_array("gyro", gyro), as_array("accel", accel)
+    samples = count_rows(accel)
     gyro = checked_array("gyro", gyro, (samples, 3), config)
     accel = checked_array("accel", accel, (samples, 3), config)
     if samples < 2:

@@ -170,6 +170,8 @@ class Tracker:
         """Why the samples before the start were no rest; empty if they were."""
         self._corrector = corrector
         self._stream = self._open_stream(hole, imu_rate)
+        if state is not None:
+            state = checked_state(state, ekf)
         dtype = jax.dtypes.canonicalize_dtype(np.float64) if state is None else state.offset.dtype
         self._ekf = converted_filter(ekf, dtype)
         start = state

@@ -90,12 +90,17 @@ def speeds_on_intervals(
 
     Raises:
         InputError: Shapes do not fit, no car is so fast, stamps do not increase, no reading is
-            within the recording, `std` is not above 0, or a number of the mounting is not finite.
+            within the recording, `std` is not above 0, or `mounting` is no `NonHolonomic` or has a
+            number that is not finite.
     """
     time, speed = np.asarray(time, np.float64), np.asarray(speed, np.float64)
     if time.ndim != 1 or speed.shape != time.shape:
         problem = f"time and speed must be (f,), found {time.shape} and {speed.shape}"
         raise InputError("wheel speed", problem, "pass one speed for each stamp")
+    if not isinstance(mounting, NonHolonomic):
+        problem = f"mounting: must be a NonHolonomic, found {type(mounting).__name__}"
+        remedy = "write NonHolonomic(yaw=mounting.yaw, pitch=mounting.pitch, roll=mounting.roll)"
+        raise InputError("wheel speed", problem, remedy)
     check_numbers("wheel speed", ABOVE_ZERO, std=std)
     check_numbers("wheel speed", FINITE, **mounting._asdict())
     time, speed = finite_readings("wheel speed", time, speed)

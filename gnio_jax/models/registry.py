@@ -99,8 +99,11 @@ def register(name: str, network: type[nn.Module]) -> None:
     `network(**options).apply(variables, windows, train=False)` must give a `Prediction`. Its fields
     are its options. The names of its modules say what trains through the filter and what inference
     folds: docs/networks.md has them. A second registration replaces the first. Raises `InputError`
-    for the name of a network of this package.
+    for the name of a network of this package, and for anything but a class of Flax modules.
     """
+    if not (isinstance(network, type) and issubclass(network, nn.Module)):
+        remedy = "give the class itself, not one of its modules or a function"
+        raise InputError(f"model '{name}'", "is no class of Flax modules", remedy)
     if name in _PUBLISHED:
         raise InputError(f"model '{name}'", "is a network of gnio-jax", "choose another name")
     _MODELS[name] = network

@@ -52,6 +52,9 @@ def find_network(network: str | Path | None = None) -> Path:
     if network is None:
         shipped = [path for path in networks.values() if path.parent == SHIPPED]
         return shipped[0] if shipped else newest_run()
+    if not isinstance(network, str | os.PathLike):
+        kind = type(network).__name__
+        raise InputError("network", f"is a {kind}", "give its folder, its zip or its name")
     path = Path(network)
     if is_network(path):
         return path

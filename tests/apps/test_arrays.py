@@ -12,6 +12,7 @@ from gnio_jax.apps.track import track
 from gnio_jax.config import DataConfig, ImportOptions, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from tests.support import known_walk, tiny_run
+from tests.support.checks import unchecked
 
 CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
 EPOCH = 1.7e9
@@ -159,5 +160,10 @@ def test_what_is_refused(message, runs, samples):
 def test_a_network_that_does_not_exist_or_sees_no_heading(runs, samples):
     with pytest.raises(InputError, match="did you mean 'pedestrian'"):
         gnio_jax.track(*samples, network="pedestrain")
+    network = networks.load(runs / "walker")
+    with unchecked(), pytest.raises(InputError, match=r"^network: is a TrainedNetwork; give its"):
+        gnio_jax.track(*samples, network=network)
+    with unchecked(), pytest.raises(InputError, match=r"^sensors: is a NoneType; give a dict"):
+        gnio_jax.track(*samples, network=runs / "walker", sensors=None)
     with pytest.raises(InputError, match=r"heading gait: walker does not use the heading"):
         gnio_jax.track(*samples, network=runs / "walker", heading="gait")

@@ -278,7 +278,8 @@ def test_the_command_takes_a_car_or_recognises_it(tmp_path, gnio, mistake):
     assert (out / "trajectory.geojson").exists() and len(read_tum(out / "trajectory.txt").time)
     settings.write_text("data: {rate: 100.0, window_seconds: 0.2}\nfilter: {rest_gyro: -1}\n")
     assert "rest_gyro" in mistake("track", file, "--carrier", settings, "--out", tmp_path / "b")
-    assert "no" in mistake("track", file, "--carrier", "boat", "--out", tmp_path / "b")
+    message = mistake("track", file, "--carrier", "boat", "--out", tmp_path / "b")
+    assert message.startswith("--carrier: 'boat' is neither person nor car, and no such file; give")
     message = mistake("track", file, "--carrier", "pedestrian", "--out", tmp_path / "b")
     assert "no filter of a car; write it as configs/drive.yaml" in message
     message = mistake("track", file, "--carrier", "car", "--network", "pedestrian")

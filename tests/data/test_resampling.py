@@ -5,6 +5,8 @@ import pytest
 
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import validate
+from gnio_jax.errors import InputError
+from tests.support.checks import unchecked
 from tests.support.circle import changed, circle
 
 
@@ -111,3 +113,12 @@ def test_what_lies_across_a_gap_is_no_measurement():
     ends = circle(stamps=np.array([1.0, 1.25])).accel
     line = ends[0] + (result.time[inside, None] - 1.0) / 0.25 * (ends[1] - ends[0])
     np.testing.assert_allclose(result.accel[inside], line, atol=1e-9)
+
+
+def test_a_rate_that_is_none_is_refused():
+    for rate in (0, -100.0, np.nan, np.inf, None, "100"):
+        with (
+            unchecked(),
+            pytest.raises(InputError, match=r"^rate: found .*; give a number"),
+        ):
+            resample(circle(), rate)

@@ -91,3 +91,17 @@ def test_cores_as_devices(flags, devices):
         [sys.executable, "-c", script], env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-500:]
+
+
+def test_arguments_without_sequences_are_refused():
+    add = filtering.over_sequences(lambda row, other: row + other)
+    for arguments, sizes in (
+        ((np.zeros((0, 3)), np.zeros((0, 3))), "found 0, 0"),
+        ((np.zeros((2, 3)), np.zeros((3, 3))), "found 2, 3"),
+        ((np.zeros((2, 3)), 1.0), "found 2, none"),
+        ((), "found none"),
+    ):
+        with pytest.raises(ValueError, match=rf"^over_sequences: .*{sizes}; `shared` \(0\)"):
+            add(*arguments)
+    with_shared = filtering.over_sequences(lambda number, row: row + number, shared=1)
+    np.testing.assert_array_equal(with_shared(1.0, np.zeros((2, 3))), np.ones((2, 3)))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gnio_jax import filtering
+from gnio_jax import filtering, models, types
 from gnio_jax.filtering.checks import checked_inputs
 from gnio_jax.filtering.history import describe_failure
 from gnio_jax.filtering.state import CLONE, with_correlated_error
@@ -59,10 +59,50 @@ def wrong():
         ("accel_density", -1.0),
         ("gyro_density", np.zeros(3)),
         ("measurement_scale", 0.0),
+        ("measurement_scale", "10"),
         ("std_factor", (1.0, 0.0, 1.0)),
     ):
         noise = NOISE._replace(**{field: number})
         yield f"ekf.noise.{field}", {"ekf": filtering.Filter(CONFIG, noise)}
+    for factor in (1.0, np.ones(3), (1.0, 1.0)):
+        ekf = filtering.Filter(CONFIG, NOISE._replace(std_factor=factor))
+        yield "ekf.noise.std_factor: must be a tuple of three numbers", {"ekf": ekf}
+    for part, value, kind in (
+        ("config", {"dt": DT}, "FilterConfig"),
+        ("noise", (1e-3, 1e-2), "NoiseModel"),
+        ("noise.correlation", (0.5, 0.5), "CorrelatedError"),
+        ("start", {"yaw": 0.1}, "InitialStd"),
+        ("considered", 0.1, "ConsideredStd"),
+    ):
+        parts = {"config": CONFIG, part: value}
+        if part == "noise.correlation":
+            parts = {"config": CONFIG, "noise": NOISE._replace(correlation=value)}
+        with unchecked():
+            ekf = filtering.Filter(**parts)
+        yield f"ekf.{part}: must be a {kind}, e.g. ", {"ekf": ekf}
+    standstill, constraint = filtering.ZeroVelocity(0.1), filtering.NonHolonomic(lateral_std=NAN)
+    for measurements, problem in (
+        ((filtering.ZeroVelocity(-0.1),), r"\[0\].std: must be positive"),
+        ((filtering.ZeroVelocity("a"),), r"\[0\].std: must be a number, found 'a'"),
+        ((standstill, constraint), r"\[1\].lateral_std: must be positive"),
+        ((filtering.ZeroVelocity,), r"\[0\]: is the class ZeroVelocity"),
+        ({"zero_velocity": {"std": 0.1}}, r": must be a tuple .* dict; write \(\) for none$"),
+        (standstill, r": must be a tuple .* ZeroVelocity; write \(zero_velocity,\) for one$"),
+    ):
+        with unchecked():
+            ekf = filtering.Filter(CONFIG, NOISE, measurements=measurements)
+        yield f"ekf.measurements{problem}", {"ekf": ekf}
+    alone = r"measurements\[0\].std: must have a row .* is a part of the Filter$"
+    yield alone, {"measurements": (standstill,)}
+    for nothing in (None, "rows", GYRO.astype(object), [[0.0, 0.0, 0.0], [0.0]]):
+        yield "gyro: must be an array of numbers, found", {"gyro": nothing}
+    yield "covariance: must be an array of numbers, found NoneType", {"covariance": None}
+    for value in (None, dict(state._asdict()), POSE):
+        yield r"state: must be a FilterState, e.g. initial_state\(", {"state": value}
+    yield r"accel: the shape must be \(300, 3\), found \(300, 2\)$", {"accel": ACCEL[:, :2]}
+    yield r"gyro: the shape .*; for a batch of sequences use jax.vmap$", {"gyro": GYRO[None]}
+    batch = {"displacement": np.stack([DISPLACEMENT, DISPLACEMENT])}
+    yield r"displacement: the shape .*; for a batch of sequences use jax.vmap$", batch
     other = filtering.initial_state(filtering.Filter(filtering.FilterConfig(DT, N, 3)), *POSE)
     yield r"state.clone_rotation: the shape must be \(5, 3, 3\)", {"state": other}
     less = state.core_covariance - jnp.eye(21)
@@ -142,7 +182,11 @@ def test_an_impossible_start_is_refused_by_name():
         ("velocity", np.full(3, NAN)),
         ("position", np.zeros((1, 3))),
         ("gyro_bias", np.full(3, NAN)),
+        ("gyro_bias", None),
         ("accel_bias", np.zeros((3, 1))),
+        ("accel_bias", "zero"),
+        ("velocity", None),
+        ("position", [[0.0], 0.0]),
         ("ekf.start.tilt", -1.0),
         ("ekf.start.yaw", np.zeros(3)),
         ("level_gyro_bias", -0.05),
@@ -153,7 +197,7 @@ def test_an_impossible_start_is_refused_by_name():
         *part, name = field.split(".")
         std = filtering.InitialStd(**{name: value} if part else {})
         pose |= {} if part else {name: value}
-        with pytest.raises(ValueError, match=f"^{field}:"):
+        with unchecked(), pytest.raises(ValueError, match=f"^{field}:"):
             filtering.initial_state(filtering.Filter(CONFIG, start=std), **pose)
 
 
@@ -247,3 +291,37 @@ def test_what_a_run_in_float32_leaves_is_a_state():
     for _ in range(3):
         state, history = filtering.run_filter(**{**values, **single, "state": state})
     assert history.healthy.all() and state.clone_covariance.dtype == np.float32
+
+
+def test_a_network_that_is_no_function_of_windows_is_refused():
+    """A module without its variables, and what `networks.load` gives, cannot be called."""
+    model = models.create("tlio", width=2)
+    bound = model.bind(models.initialise(model, jax.random.key(0), N * CLONES))
+    ekf, rows = filtering.Filter(CONFIG, NOISE), (start(), GYRO[:N], ACCEL[:N])
+    jax.eval_shape(lambda: filtering.run_odometry(bound, ekf, *rows))
+    for predict in (None, model, models.Network.of(model, bound.variables)):
+        with (
+            unchecked(),
+            pytest.raises(ValueError, match=r"^predict: must be a function .*Network\.of\("),
+        ):
+            filtering.run_odometry(predict, ekf, *rows)
+        with unchecked(), pytest.raises(ValueError, match=r"^predict: must be a function"):
+            filtering.Tracker(predict, ekf)
+    prediction = types.Prediction(jnp.zeros((1, 3)), None)
+    with unchecked(), pytest.raises(ValueError, match=r"^predict: log_std must .* found NoneType"):
+        filtering.run_odometry(lambda _: prediction, ekf, *rows)
+    reference = np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3))
+    rotation, position = (part.tolist() for part in reference)
+    listed = filtering.displacements(rotation, position, CONFIG)
+    assert listed.shape == (3, 3)
+    for rotation, position in (
+        (reference[0][:3], reference[1]),
+        (np.zeros((4, 4)), reference[1]),
+        (reference[0], np.zeros((4, 2))),
+    ):
+        with unchecked(), pytest.raises(ValueError, match=r"^rotation and position: must be \(K"):
+            filtering.displacements(rotation, position, CONFIG)
+    with unchecked(), pytest.raises(ValueError, match=r"^considered: must be a ConsideredStd"):
+        filtering.considered_covariance(np.zeros((4, 15, 6)), 0.1)
+    with unchecked(), pytest.raises(ValueError, match=r"^state: must be a FilterState"):
+        filtering.Tracker(lambda _: prediction, ekf, "level")

@@ -9,6 +9,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.filtering.mounting import find_mounting
 from gnio_jax.filtering.nonholonomic import NonHolonomic
 from tests.support.cars import drive
+from tests.support.checks import unchecked
 
 RATE = 50.0
 NOISE = filtering.NoiseModel(3e-4, 3e-3, 1e-5, 1e-4)
@@ -86,3 +87,16 @@ def test_a_drive_that_does_not_show_the_mounting_is_refused(change, problem):
     signals = change(*recording(1, (0.0, 0.0, 0.0), 60))
     with pytest.raises(InputError, match=rf"^drive: .*({problem}).*; state yaw, pitch and roll"):
         find_mounting(*signals, RATE, "drive")
+
+
+def test_a_drive_that_is_none_is_refused():
+    gyro, accel = np.zeros((3000, 3)), np.tile([0.0, 0.0, 9.81], (3000, 1))
+    for arguments, words in (
+        ((gyro[:10], accel, RATE), r"must be \(n, 3\), found \(10, 3\) and \(3000, 3\)"),
+        ((gyro[:, 0], accel[:, 0], RATE), r"must be \(n, 3\), found \(3000,\)"),
+        ((gyro + np.nan, accel, RATE), "gyro or accel is not finite"),
+        ((gyro, accel, 0.0), "rate: found 0"),
+        ((gyro, accel, np.nan), "rate: found nan"),
+    ):
+        with unchecked(), pytest.raises(InputError, match=f"^drive: .*{words}"):
+            find_mounting(*arguments, "drive")

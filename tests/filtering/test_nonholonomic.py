@@ -18,6 +18,7 @@ from gnio_jax.filtering.nonholonomic import THRESHOLD, NonHolonomic, car_axes
 from gnio_jax.types import Prediction
 from tests.support import manifold
 from tests.support.cars import drive
+from tests.support.checks import unchecked
 from tests.support.compiling import optimised, quick
 from tests.support.random_walk import random_walk
 from tests.support.walks import errors
@@ -244,12 +245,19 @@ def test_a_speed_that_cannot_be_is_refused(change, words):
         ({"mounting": MOUNTED._replace(yaw=np.nan)}, "yaw: found nan; it must be finite"),
         ({"mounting": MOUNTED._replace(lever_z=np.inf)}, "lever_z: found inf; it must be finite"),
         ({"intervals": 0}, "intervals: found 0; give"),
+        ({"intervals": 5.0}, "intervals: found 5.0; give"),
+        ({"config": filtering.Filter(CONFIG)}, "config: .* found Filter; give ekf.config"),
+        (
+            {"mounting": filtering.Mounting(0.1, 0.0, 0.0, 0.01)},
+            r"mounting: .* found Mounting; write NonHolonomic\(yaw=mount",
+        ),
+        ({"mounting": None}, "mounting: must be a NonHolonomic, found NoneType"),
     ],
 )
 def test_numbers_with_which_no_speed_would_be_measured_are_refused(numbers, words):
     rows = np.linspace(0.0, 1.0, 11), np.full(11, 30.0)
     arguments = {"intervals": 5, "config": CONFIG, "mounting": MOUNTED, **numbers}
-    with pytest.raises(InputError, match=f"^wheel speed: {words}"):
+    with unchecked(), pytest.raises(InputError, match=f"^wheel speed: {words}"):
         filtering.speeds_on_intervals(*rows, **arguments)
 
 

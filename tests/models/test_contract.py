@@ -14,6 +14,7 @@ from gnio_jax.config import ModelConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry, resnet
 from gnio_jax.types import GRAVITY
+from tests.support.checks import unchecked
 from tests.support.compiling import quick
 from tests.support.networks import SMALL, count, drawn, shapes
 from tests.support.tiny_network import Tiny
@@ -203,6 +204,15 @@ def test_a_network_of_ones_own_is_created_by_its_name(monkeypatch):
     assert "own" in models.names() and models.create("own", width=5) == Tiny(width=5)
     with pytest.raises(InputError, match="model 'gnio': is a network of gnio-jax"):
         models.register("gnio", Tiny)
+    for module in (Tiny(), lambda: Tiny()):
+        with unchecked(), pytest.raises(InputError, match="model 'mine': is no class of Flax"):
+            models.register("mine", module)
+    for name in (None, 3):
+        with (
+            unchecked(),
+            pytest.raises(InputError, match=rf"^model '{name}': unknown; .*known"),
+        ):
+            models.create(name)
 
 
 def test_the_channels_that_a_memory_has_room_for_are_no_option_but_those_of_ones_own_are(

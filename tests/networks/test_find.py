@@ -14,6 +14,7 @@ from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.networks import Card, find, folder, newest_run, read_network
 from tests.support import tiny_run
+from tests.support.checks import unchecked
 from tests.support.compiling import quick
 
 FACTS = Card("walk", "tiny", "simulated walks", "CC0", 1, 0, "", "a test", {})
@@ -56,6 +57,9 @@ def test_names_are_those_of_folders_and_zips(networks, run, monkeypatch, tmp_pat
     assert gnio_jax.load_pretrained(networks / "walk").card is not None
     refused("wolk", "no such network", "did you mean 'walk'?", "known names: walk, other, small")
     refused(tmp_path, "holds no network (config.yaml is missing)")
+    network = gnio_jax.load_pretrained("small")
+    with unchecked():
+        refused(network, "network: is a TrainedNetwork; give its folder, its zip or its name")
     begun = "holds no weights (weights.safetensors is missing)"
     refused(networks / "begun", begun, "let gnio train finish its first epoch")
     monkeypatch.setenv("GNIO_WEIGHTS", str(tmp_path / "nowhere"))

@@ -23,6 +23,8 @@ UNITS = {
     "accel": TO_METRES_PER_SECOND_SQUARED | {"cm/s2": 1e-2, "mm/s2": 1e-3},
 }
 COUNTS = {"gyro": "131/deg/s", "accel": "16384/g"}
+COUNT_SIZES = {"gyro": "0.00875*deg/s", "accel": "0.061*mg"}
+"""Examples of raw counts: how many are one unit, and the size of one."""
 SIGNS = ("android", "ios", "detect")
 GRAVITY_RANGES = {"m/s2": (7.0, 13.0), "g": (0.7, 1.3), "mg": (700.0, 1300.0)}
 """Ranges of the accelerometer's median magnitude, by which its unit is recognised."""
@@ -60,7 +62,8 @@ def scale_of(stated: str, sensor: str) -> float:
         size = 0.0
     if not 0.0 < size < np.inf:
         remedy = f"known: {', '.join(sizes)}, counts in one as {COUNTS[sensor]}, or their size as"
-        raise InputError(f"{sensor}_unit", f"unknown value '{stated}'", f"{remedy} 0.061*mg")
+        remedy = f"{remedy} {COUNT_SIZES[sensor]}"
+        raise InputError(f"{sensor}_unit", f"unknown value '{stated}'", remedy)
     return size
 
 

@@ -832,6 +832,15 @@ def test_a_scale_is_a_unit_counts_in_it_or_the_size_of_one():
             units.scale_of(text, "gyro")
 
 
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_what_the_refusal_of_a_unit_names_is_taken(sensor):
+    with pytest.raises(InputError, match=f"{sensor}_unit: unknown value 'rpm'") as caught:
+        units.scale_of("rpm", sensor)
+    names, examples = str(caught.value).split("known: ")[1].split(", counts in one as ")
+    for remedy in (*names.split(", "), *examples.split(", or their size as ")):
+        assert units.scale_of(remedy, sensor) > 0
+
+
 # --- rows of several sensors
 
 
