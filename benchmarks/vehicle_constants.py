@@ -1,22 +1,24 @@
 """The error of a vehicle's filter on KITTI's held-out drives, with constants chosen without them.
 
     python -m benchmarks.vehicle_constants --data-root DIR [--folds 3] [--only 0 1 2]
-        [--low-pass 0.03 0.06 0.09]
+        [--low-pass 0.03 0.06 0.09] [--without mounting_std mounting_seconds lever_std]
 
 The drives of a fold are held out whole; without `--folds` each drive is a fold of its own. All is
 chosen by the other drives, and the held-out drives are measured once:
 
-- The filter has 16 constants (`UNITS`). The fit starts at the package's defaults and is damped
-  Gauss-Newton steps (SciPy) with the derivatives through the whole filter (JAX). What it minimises
-  is the mean of two errors, `t_rel` of all pieces and its mean over drives, plus a penalty times
-  the squared distance from the defaults in `UNITS`.
+- The filter has 19 constants (`UNITS`). The fit starts at the package's defaults, with the states
+  of `STATES`, and is damped Gauss-Newton steps (SciPy) with the derivatives through the whole filter
+  (JAX). What it minimises is the mean of two errors, `t_rel` of all pieces and its mean over
+  drives, plus a penalty times the squared distance from the start in `UNITS`.
 - The penalty and the time constant of the IMU's low-pass (`filter.low_pass_seconds`) are those with
   the smallest error of approximate leave-one-out: for each training drive one Gauss-Newton step
   from the fit goes towards the constants without it, and this drive is measured with them.
 
 Nothing is drawn, so there are no seeds. The filter starts at the reference's pose and velocity, and
 gets no displacement and no rest. `--low-pass 0` is the same protocol with the low-pass left in.
-`--only` runs some folds. The brackets are 95 % intervals of a bootstrap over drives (10,000 draws).
+`--without` names numbers of the constraint that are not fitted: gradients are zero then, and the
+mounting and the lever are no states without `mounting_std mounting_seconds lever_std`. `--only`
+runs some folds. The brackets are 95 % intervals of a bootstrap over drives (10,000 draws).
 """
 
 from __future__ import annotations
@@ -62,9 +64,14 @@ UNITS = {
     "measurements.nonholonomic.lever_z": 0.3,
     "measurements.nonholonomic.pitch_gradient": 0.3,
     "measurements.nonholonomic.sideslip_gradient": 0.3,
+    "measurements.nonholonomic.mounting_std": 1.0,
+    "measurements.nonholonomic.mounting_seconds": 1.0,
+    "measurements.nonholonomic.lever_std": 1.0,
 }
 """The constants of the fit, and how much of each free parameter is one unit of it: a factor e or 2,
 0.005 rad, 0.3 m, 0.003 rad/(m/s²) (`settings.free_parameters`; ours)."""
+STATES = {"mounting_std": 0.01, "mounting_seconds": 20.0, "lever_std": 0.3}
+"""Where the fit starts the errors of the mounting: rad, s and m (ours)."""
 PENALTIES = (0.3, 0.03, 0.003)
 """%, per squared unit. The fit with one of them starts at that with the one before."""
 ROUNDING = 0.3
@@ -77,7 +84,7 @@ PADDING = 200
 shapes, few compilations."""
 
 Point = np.ndarray
-"""(16,) a place of the fit, in units; zeros are the defaults."""
+"""(c,) a place of the fit, in units; zeros are the defaults."""
 
 
 class Choice(NamedTuple):
@@ -100,12 +107,15 @@ class FoldResult(NamedTuple):
 
 def default_settings(low_pass_seconds: float) -> FilterSettings:
     """The package's defaults with the non-holonomic constraint, whose numbers are all named."""
-    numbers = NonHolonomic()._asdict()
+    numbers = {name: value for name, value in NonHolonomic()._asdict().items() if value is not None}
+    for name, value in STATES.items():
+        if f"measurements.nonholonomic.{name}" in UNITS:
+            numbers[name] = value
     return FilterSettings(low_pass_seconds=low_pass_seconds, measurements={"nonholonomic": numbers})
 
 
 def settings_at(low_pass_seconds: float, point: Point) -> FilterSettings:
-    """The settings at a place (16,) of the fit, which may be traced."""
+    """The settings at a place (c,) of the fit, which may be traced."""
     defaults = default_settings(low_pass_seconds)
     free = free_parameters(defaults, UNITS)
     steps = zip(UNITS.items(), point, strict=True)
@@ -131,7 +141,7 @@ run_drive = jax.jit(motion_of_pieces, static_argnums=0)
 
 @partial(jax.jit, static_argnums=0)
 def differentiate_drive(low_pass_seconds, point, *drive):
-    """The derivatives (m, 3, 16) of `motion_of_pieces` by the point."""
+    """The derivatives (m, 3, c) of `motion_of_pieces` by the point."""
     return jax.jacfwd(partial(motion_of_pieces, low_pass_seconds))(point, *drive)
 
 
@@ -172,7 +182,7 @@ def relative_errors(drive: Drive, low_pass_seconds: float, point: Point) -> np.n
 
 
 def differentiate(drive: Drive, low_pass_seconds: float, point: Point) -> np.ndarray:
-    """The derivatives (m, 3, 16) of `relative_errors`."""
+    """The derivatives (m, 3, c) of `relative_errors`."""
     derivatives = np.asarray(differentiate_drive(low_pass_seconds, point, *drive.signals))
     return 100 * derivatives[: len(drive.length)] / drive.length[:, None, None]
 
@@ -328,7 +338,11 @@ def main() -> None:
     parser.add_argument("--folds", type=int, help="default: each drive is a fold of its own")
     parser.add_argument("--only", type=int, nargs="+", help="folds to run; default: all")
     parser.add_argument("--low-pass", type=float, nargs="+", default=[0.03, 0.06, 0.09])
+    parser.add_argument("--without", nargs="+", default=[], help="numbers that are not fitted")
     arguments = parser.parse_args()
+    for name in arguments.without:
+        if UNITS.pop(f"measurements.nonholonomic.{name}", None) is None:
+            parser.error(f"--without: {name} is no number of the constraint that is fitted")
     drives, fold_of = load_drives(arguments.data_root, arguments.folds)
     every = sorted({fold_of[drive.group] for drive in drives})
     numbers = every if arguments.only is None else arguments.only

@@ -28,7 +28,7 @@ from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.fix import THRESHOLDS, Fix, improper_covariances
 from gnio_jax.filtering.magnetometer import Magnetometer
 from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
-from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_error
+from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_errors
 from gnio_jax.filtering.wheel_speed import WheelSpeed
 from gnio_jax.numerics import finite_rows
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
@@ -344,17 +344,17 @@ def converted_filter(ekf: Filter, dtype: Any) -> Filter:
 def checked_state(state: FilterState, ekf: Filter) -> FilterState:
     """`state` in one precision, with the shapes that the filter needs.
 
-    A state without a temporally correlated error gets one where the noise has one.
+    A state without temporally correlated errors gets those that the filter has.
     """
     check_kind("state", state, FilterState, "initial_state(ekf, rotation, velocity, position)")
-    config, noise = ekf.config, ekf.noise
-    if noise.correlation is not None:
-        state = with_correlated_error(state)
-    elif len(state.correlated):
-        problem = "the state has a correlated error, but ekf.noise.correlation is None"
-        raise ValueError(f"state.correlated: {problem}")
+    config, count = ekf.config, len(ekf.correlation_times)
+    state = with_correlated_errors(state, count)
+    if len(state.correlated) != count:
+        problem = f"the state has {len(state.correlated)} correlated errors, and the filter {count}"
+        remedy = "the correlation of `ekf.noise` and the constraint must be those of the run before"
+        raise ValueError(f"state.correlated: {problem}; {remedy}")
     dtype = jnp.float32 if config.allow_float32 else jnp.float64
-    shapes = state_shapes(config, noise, dtype)
+    shapes = state_shapes(config, count, dtype)
     # Only the network knows the shapes of its memory (`network.first_memory`).
     memory, state = state.memory, state._replace(memory=None)
     if state.window is not None:

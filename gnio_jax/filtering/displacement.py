@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 from gnio_jax import geometry, numerics
 from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
-from gnio_jax.filtering.state import FilterState, GateState
+from gnio_jax.filtering.state import OF_DISPLACEMENT, FilterState, GateState
 from gnio_jax.filtering.update import (
     Correction,
     Linearised,
@@ -155,7 +155,8 @@ def linearise_displacement(
     if correlation is not None:
         (transposed,), _ = whiten(covariance, (covariance,))  # L⁻¹ Σ = Lᵀ
         jacobian["correlated"] = correlation.share * transposed.T
-        predicted = geometry.matmul(jacobian["correlated"], state.correlated[:, None])[:, 0]
+        errors = state.correlated[OF_DISPLACEMENT]
+        predicted = geometry.matmul(jacobian["correlated"], errors[:, None])[:, 0]
         # NaN if Σ is no covariance, which is not the same as no measurement.
         predicted = jnp.where(jnp.isnan(predicted), 0.0, predicted)
         residual, covariance = residual - predicted, (1 - correlation.share**2) * covariance

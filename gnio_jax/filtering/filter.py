@@ -8,13 +8,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.core import Tracer
+from jaxtyping import Float
 
 from gnio_jax.config import ConsideredStd, DataConfig, FilterSettings, InitialStd, NoiseModel
 from gnio_jax.config.schema import TLIO_STD, Location, Number
 from gnio_jax.filtering.measurements import create_measurements
+from gnio_jax.filtering.nonholonomic import NonHolonomic
 from gnio_jax.filtering.settings import FilterConfig, filter_config
 from gnio_jax.filtering.update import Measurement
+from gnio_jax.types import Array
 
 
 @jax.tree_util.register_dataclass
@@ -39,6 +43,24 @@ class Filter:
     measurements: tuple[Measurement, ...] = ()
     """Measurements that are taken in every clone interval after the displacement, in this order,
     e.g. `ZeroVelocity`. They have no rows: those that do are arguments of a run."""
+
+    @property
+    def correlation_times(self) -> tuple[Number, ...]:
+        """The time τ, s, of each correlated error b of `FilterState.correlated`."""
+        correlation = self.noise.correlation
+        times = () if correlation is None else 3 * (correlation.seconds,)
+        for measurement in self.measurements:
+            if isinstance(measurement, NonHolonomic):
+                times += measurement.correlation_times
+        return times
+
+    def decay(self, dtype: Any) -> Float[Array, "e"]:
+        """a = exp(−T / τ) over a clone interval T, for each correlated error b: b_{k+1} = a b_k +
+        √(1 − a²) n_k with n_k ~ N(0, 1), whose variance is 1 at all times."""
+        times = [jnp.asarray(time, dtype) for time in self.correlation_times]
+        if not times:
+            return jnp.zeros(0, dtype)
+        return jnp.exp(-self.config.clone_seconds / jnp.stack(times))
 
 
 def make_filter(windows: DataConfig, settings: FilterSettings) -> Filter:

@@ -82,4 +82,7 @@ def _create(name: str, numbers: Mapping[str, Any], location: Location) -> Measur
     for field in kind._fields:
         if field not in numbers and field not in kind._field_defaults:
             location.child(field).refuse("is missing", f"write {field}: NUMBER")
+    for field, other in getattr(kind, "needs", {}).items():
+        if field in numbers and other not in numbers:
+            location.child(field).refuse("has no effect alone", f"write {other}: NUMBER, too")
     return kind(**values)

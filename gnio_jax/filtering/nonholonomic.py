@@ -22,27 +22,46 @@ The velocities that remain are some centimetres a second and last for seconds. T
 springs, the slope of the road and an error of C. So the errors of successive intervals are not
 independent, and a σ must be several times their size.
 
-The three angles and the lever are settings, and no states (ours). Yaw and pitch of C move the
-measured velocity by the speed times the angle, as an error of the attitude does. A filter without
-positions can hardly tell the two apart in one drive. `gnio_jax.filtering.mounting` finds the angles
-in a drive.
+The three angles and the lever are settings. Their errors may be states of the filter, as in AI-IMU:
+
+    C ← exp(ε) C,   l ← l + λ,
+
+with ε in the axes of the car. λ is constant, and ε a first-order Gauss–Markov process, or constant
+too. Both are held in units of their standard deviations (`FilterState.correlated`).
+`gnio_jax.filtering.mounting` finds the angles in a whole drive.
 """
 
 from __future__ import annotations
 
+import math
+from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float
 
-from gnio_jax.config.schema import ABOVE_ZERO, FINITE, Number
-from gnio_jax.filtering.state import FilterState
+from gnio_jax.config.schema import ABOVE_ZERO, FINITE, NOT_NEGATIVE, Number
+from gnio_jax.filtering.state import OF_LEVER, OF_MOUNTING, FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
-from gnio_jax.geometry import hat, matmul
+from gnio_jax.geometry import exp, hat, matmul, right_jacobian
 from gnio_jax.types import NONHOLONOMIC_LOG_FACTOR, Array
 
 THRESHOLD = 13.816
 """99.9 % of χ² with two degrees of freedom."""
+
+
+class MountingErrors(NamedTuple):
+    """Errors of the mounting that are states of the filter."""
+
+    turn: Float[Array, "3"]
+    """ε, in the axes of the car, rad."""
+    step: Float[Array, "3"]
+    """λ, in the body, m."""
+    turn_std: Float[Array, ""]
+    """Standard deviation of each component of ε before all measurements, rad."""
+    step_std: Float[Array, ""]
+    """That of λ, m."""
 
 
 class NonHolonomic(NamedTuple):
@@ -67,11 +86,50 @@ class NonHolonomic(NamedTuple):
     sideslip_gradient: Annotated[Number, FINITE] = 0.0
     """γ_s: angle by which the rear tyres slip outwards in a bend, for a specific force towards its
     inside, rad per m/s²."""
+    mounting_std: Annotated[Number, NOT_NEGATIVE] | None = None
+    """Standard deviation of each component of ε, rad. The filter estimates ε and λ if this or
+    `lever_std` is a number; the other one is then zero."""
+    mounting_seconds: Annotated[Number, ABOVE_ZERO] | None = None
+    """Correlation time of ε, s; None: it is constant."""
+    lever_std: Annotated[Number, NOT_NEGATIVE] | None = None
+    """Standard deviation of each component of λ, m."""
     name = "nonholonomic"
+    needs = MappingProxyType({"mounting_seconds": "mounting_std"})
+    """Numbers that have no effect without another one."""
 
     @property
     def lever(self) -> tuple[Number, Number, Number]:
         return self.lever_x, self.lever_y, self.lever_z
+
+    @property
+    def estimates_mounting(self) -> bool:
+        """Whether ε and λ are states of the filter."""
+        return self.mounting_std is not None or self.lever_std is not None
+
+    @property
+    def correlation_times(self) -> tuple[Number, ...]:
+        """Those of ε and λ, s, if they are states."""
+        constant = math.inf
+        of_mounting = constant if self.mounting_seconds is None else self.mounting_seconds
+        return (*3 * (of_mounting,), *3 * (constant,)) if self.estimates_mounting else ()
+
+    def mounting_errors(self, state: FilterState) -> MountingErrors:
+        """The filter's estimate of ε and λ, which are states."""
+        dtype = state.offset.dtype
+        stds = (0.0 if std is None else std for std in (self.mounting_std, self.lever_std))
+        turn_std, step_std = (jnp.asarray(std, dtype) for std in stds)
+        turn, step = state.correlated[OF_MOUNTING], state.correlated[OF_LEVER]
+        return MountingErrors(turn_std * turn, step_std * step, turn_std, step_std)
+
+    def mounting_at(self, state: FilterState) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+        """C, car ← body, and the lever l, m, with the filter's estimate of their errors."""
+        dtype = state.offset.dtype
+        axes = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)
+        lever = jnp.stack([jnp.asarray(x, dtype) for x in self.lever])
+        if self.estimates_mounting:
+            errors = self.mounting_errors(state)
+            axes, lever = matmul(exp(errors.turn), axes), lever + errors.step
+        return axes, lever
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """Where the car slides sideways or jumps, the measurement fails a χ² test of 99.9 % and is
@@ -83,28 +141,36 @@ class NonHolonomic(NamedTuple):
             log_factor = step.diagnostics[NONHOLONOMIC_LOG_FACTOR].astype(dtype)
             finite = jnp.isfinite(log_factor).all()
             std = std * jnp.exp(jnp.where(finite, log_factor, 0.0))
-        axes = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)
-        ahead, across = axes[0], axes[1:]
-        lever = jnp.stack([jnp.asarray(x, dtype) for x in self.lever])
-        velocity, present = velocity_of_point(state, step, lever)
-        # The rows are those of the left and up, as for `across`.
-        gradients = jnp.stack([self.sideslip_gradient * across[0], self.pitch_gradient * ahead])
-        angles = matmul(gradients, mean_force(state, step)[:, None])[:, 0]
-        speed = jnp.sum(ahead * velocity)
-        speeds = jnp.stack([jnp.abs(speed), speed])
-        slopes = jnp.stack([jnp.sign(speed), jnp.ones_like(speed)])  # of `speeds` by the speed
-        predicted = matmul(across, velocity[:, None])[:, 0] + angles * speeds
-        of_body_velocity = across + (angles * slopes)[:, None] * ahead[None]
-        of_velocity = matmul(of_body_velocity, state.rotation.T)
-        linear = linearise(
-            state,
-            jnp.where(present, -predicted, jnp.nan),
-            jnp.diag(std**2),
-            velocity=of_velocity,
-            rotation=matmul(of_velocity, hat(state.velocity)),
-            gyro_bias=matmul(of_body_velocity, hat(lever)),
-            accel_bias=-speeds[:, None] * gradients,
+        axes, lever = self.mounting_at(state)
+        in_body, present = velocity_of_point(state, step, lever)
+        velocity = matmul(axes, in_body[:, None])[:, 0]
+        force = matmul(axes, mean_force(state, step)[:, None])[:, 0]
+        # Both angles times the speed, for the left and up, and their derivatives.
+        speed, slip = velocity[0], self.sideslip_gradient * jnp.abs(velocity[0])
+        rise = self.pitch_gradient * speed
+        slopes = jnp.stack(
+            [self.sideslip_gradient * force[1] * jnp.sign(speed), self.pitch_gradient * force[0]]
         )
+        predicted = velocity[1:] + jnp.stack([slip * force[1], rise * force[0]])
+        by_velocity = jnp.concatenate([slopes[:, None], np.eye(2, dtype=dtype)], axis=1)
+        by_force = jnp.zeros((2, 3), dtype).at[0, 1].set(slip).at[1, 0].set(rise)
+
+        by_body_velocity = matmul(by_velocity, axes)
+        of_velocity = matmul(by_body_velocity, state.rotation.T)
+        jacobian = {
+            "velocity": of_velocity,
+            "rotation": matmul(of_velocity, hat(state.velocity)),
+            "gyro_bias": matmul(by_body_velocity, hat(lever)),
+            "accel_bias": -matmul(by_force, axes),
+        }
+        if self.estimates_mounting:
+            errors, rate = self.mounting_errors(state), step.imu.gyro[-1] - state.gyro_bias
+            by_turn = matmul(by_velocity, hat(velocity)) + matmul(by_force, hat(force))
+            left_jacobian = right_jacobian(errors.turn).T
+            jacobian["mounting"] = -errors.turn_std * matmul(by_turn, left_jacobian)
+            jacobian["lever"] = errors.step_std * matmul(by_body_velocity, hat(rate))
+        residual = jnp.where(present, -predicted, jnp.nan)
+        linear = linearise(state, residual, jnp.diag(std**2), **jacobian)
         return measure(state, linear, step, THRESHOLD)
 
 

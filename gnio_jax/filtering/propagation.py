@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax import geometry
-from gnio_jax.config import CorrelatedError, NoiseModel
+from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.gaps import Gap, Imu, no_gap
 from gnio_jax.filtering.state import (
     ANCHOR,
@@ -161,7 +161,7 @@ class Transition(NamedTuple):
     """Rows θ, v, o of the new error, and the change of the anchor's, over θ, v, o, b_g, b_a before
     the anchor moved."""
     decay: Float[Array, "e"]
-    """Factors of the temporally correlated errors (`correlation_decay`)."""
+    """Factors of the temporally correlated errors (`Filter.decay`)."""
     anchored: Float[Array, ""]
     """1 where the anchor moved up to the position at the start of the interval, else 0."""
 
@@ -186,17 +186,6 @@ def core_transition(
         by_turn += matmul(motion[:, OFFSET], hat(shift.position))
         motion = jnp.concatenate([motion[:, THETA] - by_turn, motion[:, THETA.stop :]], axis=1)
     return Transition(motion, decay, anchored)
-
-
-def correlation_decay(
-    correlation: CorrelatedError | None, seconds: float, dtype: np.dtype
-) -> Float[Array, "e"]:
-    """a = exp(−T / τ) over a clone interval of T = `seconds`, for each correlated error b:
-    b_{k+1} = a b_k + √(1 − a²) n_k with n_k ~ N(0, 1), whose variance is 1 at all times. No
-    entries without a `correlation`."""
-    if correlation is None:
-        return jnp.zeros(0, dtype)
-    return jnp.repeat(jnp.exp(-seconds / jnp.asarray(correlation.seconds, dtype)), 3)
 
 
 def propagate(

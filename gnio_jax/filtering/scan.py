@@ -36,7 +36,6 @@ from gnio_jax.filtering.network import (
 from gnio_jax.filtering.propagation import (
     Transition,
     core_transition,
-    correlation_decay,
     integrate,
     propagate,
 )
@@ -307,8 +306,7 @@ def clone_step(
     anchored = jnp.where(jnp.asarray(slot) == 0, 1.0, 0.0).astype(dtype)
     state = move_anchor(state, anchored)
     interval = _integrate(state.mean._replace(position=state.offset), imu, noise, config.dt)
-    decay = correlation_decay(noise.correlation, config.clone_seconds, dtype)
-    transition = core_transition(interval, decay, anchored, state.shift)
+    transition = core_transition(interval, ekf.decay(dtype), anchored, state.shift)
     state = _propagate(state, interval, transition, slot)
 
     displacement, diagnostics = measure(state, oldest)

@@ -3,8 +3,9 @@ of its positions.
 
 The error state is δ = (θ, v, o, b_g, b_a, a, s, b | θ_0, o_0, θ_1, o_1, …): 21 core entries and
 those of b, then 6 for each clone. Rotation errors are in the world frame and on the left,
-R ← exp(δθ) R; everything else adds. b is the temporally correlated part of the displacements'
-errors (see `displacement`): no entries, or 3.
+R ← exp(δθ) R; everything else adds. b are temporally correlated errors of measurements, each of
+variance 1: no entries or 3 of the displacements (see `displacement`), then no entries or 6 of a
+car's mounting and lever (see `nonholonomic`).
 
 In the invariant form (`FilterConfig.error`) the covariance inside a run is not that of the error δx
 of a velocity or a position, but that of
@@ -36,7 +37,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gnio_jax.config import InitialStd, NoiseModel
+from gnio_jax.config import InitialStd
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.geometry import hat, matmul
 from gnio_jax.types import Array, Memory
@@ -52,7 +53,9 @@ BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
 LOCAL = slice(THETA.start, ANCHOR.start)
 """θ, v, o, b_g, b_a: all but the anchor, its move and b."""
 CORRELATED = slice(MOVE.stop, None)
-"""b: 0 or 3 entries."""
+"""b: 0, 3, 6 or 9 entries."""
+OF_DISPLACEMENT, OF_MOUNTING, OF_LEVER = slice(0, 3), slice(-6, -3), slice(-3, None)
+"""Those of b of the displacements, of a car's mounting and of its lever, where b has them."""
 CLONE_THETA, CLONE_OFFSET = slice(0, 3), slice(3, 6)
 """Entries of each part of a clone's error."""
 
@@ -122,15 +125,15 @@ class FilterState(NamedTuple):
     move: Float[Array, "3"]
     """From the anchor before it, m."""
     correlated: Float[Array, "e"]
-    """Temporally correlated part of the displacements' errors, in units of their standard
-    deviations: no entries, or 3."""
+    """Temporally correlated errors of measurements, in units of their standard deviations: no
+    entries or 3 of the displacements, then no entries or 6 of a car's mounting and lever."""
     clone_rotation: Float[Array, "c 3 3"]
     """Cloned rotations."""
     clone_offset: Float[Array, "c 3"]
     """Cloned positions, m, from the anchor at the time of cloning; between runs, from the present
     anchor."""
     core_covariance: Float[Array, "n n"]
-    """θ, v, o, b_g, b_a, a, s, b: n = 21, or 24 with a correlated error."""
+    """θ, v, o, b_g, b_a, a, s, b: n = 21 + e."""
     cross_covariance: Float[Array, "n 6c"]
     """Covariance of the core with the clones' θ, o."""
     clone_covariance: Float[Array, "6c 6c"]
@@ -221,25 +224,25 @@ def without_clones(
     )
 
 
-def with_correlated_error(state: FilterState) -> FilterState:
-    """The state with a correlated error of variance 1. A state that has one stays as it is."""
+def with_correlated_errors(state: FilterState, count: int) -> FilterState:
+    """The state with `count` correlated errors of variance 1. A state that has some stays as it
+    is."""
     if len(state.correlated):
         return state
-    variance = np.diag(np.repeat([0.0, 1.0], [CORE, 3])).astype(state.offset.dtype)
+    variance = np.diag(np.repeat([0.0, 1.0], [CORE, count])).astype(state.offset.dtype)
     return state._replace(
-        correlated=jnp.zeros(3, state.offset.dtype),
-        core_covariance=jnp.pad(state.core_covariance, (0, 3)) + variance,
-        cross_covariance=jnp.pad(state.cross_covariance, ((0, 3), (0, 0))),
+        correlated=jnp.zeros(count, state.offset.dtype),
+        core_covariance=jnp.pad(state.core_covariance, (0, count)) + variance,
+        cross_covariance=jnp.pad(state.cross_covariance, ((0, count), (0, 0))),
     )
 
 
-def state_shapes(config: FilterConfig, noise: NoiseModel, dtype: Any) -> FilterState:
-    """Shapes and types of the filter's state."""
+def state_shapes(config: FilterConfig, correlated: int, dtype: Any) -> FilterState:
+    """Shapes and types of the filter's state with this number of correlated errors."""
 
     def start() -> FilterState:
         pose = Mean(jnp.eye(3, dtype=dtype), *[jnp.zeros(3, dtype)] * 4)
-        state = without_clones(pose, InitialStd(), config.clones)
-        return state if noise.correlation is None else with_correlated_error(state)
+        return with_correlated_errors(without_clones(pose, InitialStd(), config.clones), correlated)
 
     return jax.eval_shape(start)
 

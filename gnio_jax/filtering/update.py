@@ -50,6 +50,9 @@ from gnio_jax.filtering.state import (
     CORRELATED,
     GYRO_BIAS,
     MOVE,
+    OF_DISPLACEMENT,
+    OF_LEVER,
+    OF_MOUNTING,
     OFFSET,
     THETA,
     VELOCITY,
@@ -63,13 +66,14 @@ from gnio_jax.geometry import contract_left, contract_right, matmul
 from gnio_jax.types import Array
 
 PARTS = (
-    *("rotation", "velocity", "position", "gyro_bias", "accel_bias", "correlated"),
-    *("oldest_rotation", "since_oldest"),
+    *("rotation", "velocity", "position", "gyro_bias", "accel_bias"),
+    *("correlated", "mounting", "lever", "oldest_rotation", "since_oldest"),
 )
 """The parts of the error on which a measurement may depend, each with 3 entries. Parts of the
 present state are the rotation δθ (rad, world frame, R ← exp(δθ) R), velocity, position, both
-biases, and the temporally correlated error of the displacements, if there is one. The others are
-the rotation of the oldest clone, and the position since that clone, p_j − p_i."""
+biases, and in units of their standard deviations the temporally correlated errors of the
+displacements, of a car's mounting and of its lever, where the filter has them. The others are the
+rotation of the oldest clone, and the position since that clone, p_j − p_i."""
 
 
 class Linearised(NamedTuple):
@@ -200,7 +204,9 @@ def measurable_errors(
         "position": lambda: core[OFFSET] + core[ANCHOR],
         "gyro_bias": lambda: core[GYRO_BIAS],
         "accel_bias": lambda: core[ACCEL_BIAS],
-        "correlated": lambda: core[CORRELATED],
+        "correlated": lambda: core[CORRELATED][OF_DISPLACEMENT],
+        "mounting": lambda: core[CORRELATED][OF_MOUNTING],
+        "lever": lambda: core[CORRELATED][OF_LEVER],
         "oldest_rotation": lambda: of_oldest[CLONE_THETA],
         "since_oldest": lambda: (
             core[OFFSET] + anchors_apart(oldest, core.dtype) * core[MOVE] - of_oldest[CLONE_OFFSET]

@@ -102,7 +102,8 @@ def speeds_on_intervals(
         remedy = "write NonHolonomic(yaw=mounting.yaw, pitch=mounting.pitch, roll=mounting.roll)"
         raise InputError("wheel speed", problem, remedy)
     check_numbers("wheel speed", ABOVE_ZERO, std=std)
-    check_numbers("wheel speed", FINITE, **mounting._asdict())
+    numbers = {name: value for name, value in mounting._asdict().items() if value is not None}
+    check_numbers("wheel speed", FINITE, **numbers)
     time, speed = finite_readings("wheel speed", time, speed)
     ends = interval_ends("wheel speed", intervals, config, start)
     at_ends = scalars_at("wheel speed", ends, time, speed, start)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import config as configuration
 from gnio_jax import filtering
 from gnio_jax.errors import InputError
+from gnio_jax.filtering.checks import checked_state
 from gnio_jax.filtering.gaps import Gap, Imu
 from gnio_jax.filtering.nonholonomic import THRESHOLD, NonHolonomic, car_axes
 from gnio_jax.types import Prediction
@@ -37,13 +38,13 @@ def test_the_axes_of_the_car_are_those_of_its_mounting(angles):
     np.testing.assert_allclose(car_axes(*angles), expected, atol=1e-12)
 
 
-def predicted(poses, gyro, accel):
+def predicted(poses, gyro, accel, car=MOUNTED):
     """Velocity of the point ahead, and across to the direction in which it goes, to the left and
     up, in NumPy, for poses with axes in front."""
     rotation, velocity, _, gyro_bias, accel_bias = poses
     in_body = np.einsum("...ji,...j->...i", rotation, velocity)
-    in_body = in_body + np.cross(gyro - gyro_bias, np.array(MOUNTED.lever))
-    mounting = Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix()
+    in_body = in_body + np.cross(gyro - gyro_bias, np.array(car.lever))
+    mounting = Rotation.from_euler("ZYX", car[2:5]).as_matrix()
     ahead, leftward, upward = np.moveaxis(in_body @ mounting, -1, 0)
     force_ahead, force_left, _ = np.moveaxis((accel - accel_bias) @ mounting, -1, 0)
     leftward = leftward + MOUNTED.sideslip_gradient * force_left * abs(ahead)
@@ -150,6 +151,147 @@ def test_the_gradients_take_away_what_springs_and_tyres_do():
         whitened = np.linalg.solve(spread, error[..., None])[..., 0]
         nees[name] = np.mean(np.sum(error * whitened, axis=-1)) / 3
     assert nees["sprung"] < 1.5 < 3 < nees["rigid"]
+
+
+ESTIMATED = MOUNTED._replace(mounting_std=0.1, lever_std=0.7)
+SMALL = 0.1, 0.1
+"""Standard deviations of the constraint that show a mounting, m/s."""
+
+
+def with_errors(turn, step):
+    """ESTIMATED with the errors ε and λ in its angles and its lever, by SciPy."""
+    axes = Rotation.from_rotvec(turn) * Rotation.from_euler("ZYX", MOUNTED[2:5]).inv()
+    return ESTIMATED._replace(
+        **dict(zip(("yaw", "pitch", "roll"), axes.inv().as_euler("ZYX"), strict=True)),
+        **dict(zip(("lever_x", "lever_y", "lever_z"), MOUNTED.lever + step, strict=True)),
+    )
+
+
+def test_an_update_of_the_mounting_is_the_textbooks_with_derivatives_by_finite_differences():
+    """From errors that are far from zero, and correlated with the others."""
+    rng = np.random.default_rng(3)
+    ekf = filtering.Filter(CONFIG, NOISE, STD, measurements=(ESTIMATED,))
+    rotation = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+    velocity = rotation @ Rotation.from_euler("ZYX", MOUNTED[2:5]).as_matrix() @ [9.0, 0.3, -0.2]
+    state = filtering.initial_state(ekf, rotation, velocity, np.ones(3))
+    errors, half = rng.normal(size=6), rng.normal(size=(27, 27)) / 20
+    state = state._replace(
+        correlated=jnp.asarray(errors),
+        core_covariance=jnp.asarray(half @ half.T),
+        cross_covariance=jnp.zeros((27, 12)),
+    )
+    gyro, accel = rng.normal(size=(2, N, 3))
+    accel = 3 * accel + [0.0, 0.0, 9.81]
+    parts = [np.asarray(part) for part in state.mean]
+
+    def predict(delta):
+        """For changes (…, 21) of the pose with its biases, and of b."""
+        rows = []
+        for row in delta.reshape(-1, 21):
+            turn, step = np.split((errors + row[15:]) * np.repeat([0.1, 0.7], 3), 2)
+            poses = manifold.plus(parts, row[:15])
+            car = with_errors(turn, step)
+            rows.append(predicted(poses, gyro[-1], accel.mean(axis=0), car)[1:])
+        return np.reshape(rows, (*delta.shape[:-1], 2))
+
+    # In the state: θ, v, o, b_g, b_a, a, s, b. The position is not measured.
+    columns = np.r_[0:15, 21:27]
+    jacobian = np.zeros((2, 27))
+    jacobian[:, columns] = manifold.differences(predict, 21)
+    residual = -predict(np.zeros(21))
+    before = np.asarray(state.core_covariance)
+    spread = jacobian @ before @ jacobian.T + np.diag(np.square(MOUNTED[:2]))
+    gain = np.linalg.solve(spread, jacobian @ before).T
+
+    @quick
+    def updated(state, gyro, accel):
+        step = filtering.Step(Imu(gyro, accel, None), 0, 1, additive, NOISE)
+        return ESTIMATED.update(state, step)[:2]
+
+    additive = dataclasses.replace(CONFIG, error="additive")
+    after, outcome = updated(state, gyro, accel)
+    np.testing.assert_allclose(outcome.residual, residual, atol=1e-12)
+    nis = residual @ np.linalg.solve(spread, residual)
+    np.testing.assert_allclose(outcome.nis, nis, rtol=1e-6)
+    assert bool(outcome.accepted)
+    np.testing.assert_allclose(after.core_covariance, before - gain @ jacobian @ before, atol=1e-8)
+    np.testing.assert_allclose(after.correlated, errors + (gain @ residual)[21:], atol=1e-8)
+    axes, lever = ESTIMATED.mounting_at(state)
+    car = with_errors(*np.split(errors * np.repeat([0.1, 0.7], 3), 2))
+    np.testing.assert_allclose(axes, car_axes(car.yaw, car.pitch, car.roll), atol=1e-12)
+    np.testing.assert_allclose(lever, car.lever, atol=1e-12)
+
+
+def test_the_mounting_is_found_while_driving_with_the_covariance_that_the_errors_have():
+    """60 cars with angles off by 0.05 rad and levers off by 0.7 m. Their roll hardly shows. With
+    constants that are as wrong, the velocity errs by several times as much."""
+    rng, stds = np.random.default_rng(7), (0.05, 0.7)
+    true = rng.normal(size=(60, 6))
+    runs = [
+        drive(seed, 1, INTERVALS, N, DT, NOISE, STD, with_errors(*np.split(scaled, 2)), *SMALL)
+        for seed, scaled in enumerate(true * np.repeat(stds, 3))
+    ]
+    rides = jax.tree.map(lambda *parts: np.concatenate(parts), *runs)
+    careful = MOUNTED._replace(
+        **dict(zip(("lateral_std", "vertical_std"), SMALL, strict=True)),
+        **dict(zip(("mounting_std", "lever_std"), stds, strict=True)),
+    )
+
+    @optimised
+    def last_states(rides):
+        def one(rotation, velocity, position, gyro, accel, displacement):
+            ekf = filtering.Filter(CONFIG, NOISE, STD, measurements=(careful,))
+            state = filtering.initial_state(ekf, rotation, velocity, position)
+            spread = jnp.tile(jnp.eye(3)[None], (len(displacement), 1, 1))
+            signals = ekf, state, gyro, accel, displacement, spread
+            return *filtering.run_filter(*signals), filtering.smooth(*signals)
+
+        return jax.vmap(one)(*rides[:6])
+
+    state, history, smoothed = last_states(rides)
+    index = np.r_[22:27]  # without the roll
+    error = (np.asarray(state.correlated) - true)[:, 1:]
+    spread = np.asarray(state.core_covariance)[:, index][:, :, index]
+    nees = np.einsum("ri,ri->r", error, np.linalg.solve(spread, error[..., None])[..., 0]) / 5
+    assert 0.7 < nees.mean() < 1.4
+    assert (np.sqrt(np.mean(error**2, axis=0)) < [0.15, 0.3, 0.6, 0.9, 1.1]).all()
+    last, middle = INTERVALS - 1, INTERVALS // 2
+    sizes = {}
+    for name, estimate, row in (
+        ("filtered", history, last),
+        ("filtered before", history, middle),
+        ("smoothed", smoothed, middle),
+    ):
+        error = errors(rides, estimate)[:, row, 3:9]
+        spread = np.asarray(estimate.covariance)[:, row, 3:9, 3:9]
+        nees = np.einsum("ri,ri->r", error, np.linalg.solve(spread, error[..., None])[..., 0]) / 6
+        assert 0.7 < nees.mean() < 1.45, (name, nees.mean())
+        sizes[name] = np.sqrt(np.mean(error[:, :3] ** 2))
+    assert sizes["smoothed"] < 0.7 * sizes["filtered before"]
+    off = errors(rides, run(rides, MOUNTED))[:, last, 3:6]
+    assert np.sqrt(np.mean(off**2)) > 3 * sizes["filtered"]
+
+
+def test_errors_of_the_mounting_forget_within_their_time_and_those_of_the_lever_never():
+    """Without a measurement the variance stays as it is, and a known error is forgotten."""
+    constraint = ESTIMATED._replace(mounting_seconds=2.0)
+    ekf = filtering.Filter(CONFIG, NOISE, STD, measurements=(constraint,))
+    seconds = CONFIG.clone_seconds
+    decay = np.repeat([np.exp(-seconds / 2.0), 1.0], 3)
+    np.testing.assert_allclose(ekf.decay(np.float64), decay)
+    start = filtering.initial_state(ekf, np.eye(3), np.array([9.0, 0.0, 0.0]), np.zeros(3))
+    known = checked_state(start, ekf)
+    known = known._replace(
+        correlated=jnp.ones(6), core_covariance=known.core_covariance.at[21:, 21:].set(0.0)
+    )
+    held = jnp.tile(jnp.asarray([[0.0, 0.0, 9.81]]), (N, 1))
+    none = jnp.full((1, 3), jnp.nan), jnp.eye(3)[None]
+    huge = constraint._replace(lateral_std=1e9, vertical_std=1e9)
+    ekf = dataclasses.replace(ekf, measurements=(huge,))
+    after, _ = filtering.run_filter(ekf, known, jnp.zeros((N, 3)), held, *none)
+    np.testing.assert_allclose(after.correlated, decay, atol=1e-9)
+    spread = np.diag(1 - decay**2)
+    np.testing.assert_allclose(after.core_covariance[21:, 21:], spread, atol=1e-9)
 
 
 @pytest.mark.parametrize("speed", [8.0, -8.0])
@@ -310,7 +452,7 @@ def test_derivatives_are_finite_at_rest_and_with_the_axis_ahead_upright():
     gradient = quick(jax.grad(loss, (0, 1)))
     for velocity in (np.zeros(3), np.array([0.0, 100.0, 0.0]), np.array([10.0, 0.5, -0.2])):
         for pitch in (0.0, np.pi / 2, np.pi):
-            numbers = np.array([*MOUNTED[:3], pitch, *MOUNTED[4:]])
+            numbers = np.array([*MOUNTED[:3], pitch, *MOUNTED[4:10]])
             for missing in (False, True):
                 slopes = gradient(numbers, velocity, missing)
                 assert all(np.isfinite(slope).all() for slope in slopes)
@@ -425,4 +567,14 @@ def test_it_is_a_measurement_of_the_settings():
     settings = configuration.parse(text, "text")
     (constraint,) = filtering.make_filter(settings.data, settings.filter).measurements
     assert constraint == NonHolonomic(lateral_std=0.5, pitch=-0.01)
+    assert not constraint.estimates_mounting
+    text = "filter: {measurements: {nonholonomic: {mounting_std: 0.01, mounting_seconds: 20}}}"
+    settings = configuration.parse(text, "text")
+    (constraint,) = filtering.make_filter(settings.data, settings.filter).measurements
+    assert constraint == NonHolonomic(mounting_std=0.01, mounting_seconds=20.0)
+    text = "filter: {measurements: {nonholonomic: {mounting_seconds: 20}}}"
+    settings = configuration.parse(text, "text")
+    problem = "mounting_seconds' has no effect alone; write mounting_std: NUMBER, too"
+    with pytest.raises(InputError, match=problem):
+        filtering.make_filter(settings.data, settings.filter)
     assert THRESHOLD == pytest.approx(-2 * np.log(0.001), abs=1e-3)

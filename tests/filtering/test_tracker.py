@@ -57,7 +57,8 @@ class Height(NamedTuple):
         return filtering.measure(state, linear, step)
 
 
-MEASUREMENTS = filtering.ZeroVelocity(0.02), filtering.NonHolonomic(2.0, 2.0, yaw=0.3), Height(2.0)
+CAR = filtering.NonHolonomic(2.0, 2.0, yaw=0.3, mounting_std=0.05, lever_std=0.5)
+MEASUREMENTS = filtering.ZeroVelocity(0.02), CAR, Height(2.0)
 """One of each kind, each loose enough to be accepted."""
 
 

@@ -69,7 +69,7 @@ def programs(network: DeployedNetwork, ekf: Filter) -> list[Program]:
         problem = "is not undone by an exported filter"
         raise InputError("filter.low_pass_seconds", problem, "set it to 0")
     deploy = functools.partial(_deploy_state, ekf=ekf, network=network)
-    shape = jax.eval_shape(deploy, state_shapes(config, ekf.noise, jnp.float64))
+    shape = jax.eval_shape(deploy, state_shapes(config, len(ekf.correlation_times), jnp.float64))
 
     def start(arrays: Arrays) -> dict[str, Array]:
         """`level_state` of a second at rest."""
