@@ -7,9 +7,9 @@ The drives of a fold are held out whole; without `--folds` each drive is a fold 
 chosen by the other drives, and the held-out drives are measured once:
 
 - The filter has 19 constants (`UNITS`). The fit starts at the package's defaults, with the states
-  of `STATES`, and is damped Gauss-Newton steps (SciPy) with the derivatives through the whole filter
-  (JAX). What it minimises is the mean of two errors, `t_rel` of all pieces and its mean over
-  drives, plus a penalty times the squared distance from the start in `UNITS`.
+  of `STATES`, and is damped Gauss-Newton steps (SciPy) with the derivatives through the whole
+  filter (JAX). What it minimises is the mean of two errors, `t_rel` of all pieces and its mean
+  over drives, plus a penalty times the squared distance from the start in `UNITS`.
 - The penalty and the time constant of the IMU's low-pass (`filter.low_pass_seconds`) are those with
   the smallest error of approximate leave-one-out: for each training drive one Gauss-Newton step
   from the fit goes towards the constants without it, and this drive is measured with them.

@@ -11,7 +11,7 @@ import pytest
 from gnio_jax import filtering, models, types
 from gnio_jax.filtering.checks import checked_inputs
 from gnio_jax.filtering.history import describe_failure
-from gnio_jax.filtering.state import CLONE, with_correlated_error
+from gnio_jax.filtering.state import CLONE, with_correlated_errors
 from tests.support.checks import unchecked
 from tests.support.random_walk import random_walk
 
@@ -137,9 +137,12 @@ def wrong():
     ):
         yield f"measurements{problem}", {"measurements": measurements}
     yield "state.rotation", {"state": state._replace(rotation=2 * jnp.eye(3))}
-    lost = with_correlated_error(state)._replace(correlated=np.array([0.0, NAN, 0.0]))
+    lost = with_correlated_errors(state, 3)._replace(correlated=np.array([0.0, NAN, 0.0]))
     correlated = filtering.Filter(CONFIG, correlated)
     yield "state.correlated", {"state": lost, "ekf": correlated}
+    car = filtering.Filter(CONFIG, measurements=(filtering.NonHolonomic(lever_std=0.5),))
+    problem = "state.correlated: the state has 3 correlated errors, and the filter 6"
+    yield problem, {"state": with_correlated_errors(state, 3), "ekf": car}
     for field in (
         *("velocity", "offset", "gyro_bias", "accel_bias", "anchor", "move", "clone_rotation"),
         *("clone_offset", "cross_covariance", "clone_covariance"),

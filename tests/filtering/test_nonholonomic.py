@@ -232,7 +232,7 @@ def test_the_mounting_is_found_while_driving_with_the_covariance_that_the_errors
         for seed, scaled in enumerate(true * np.repeat(stds, 3))
     ]
     rides = jax.tree.map(lambda *parts: np.concatenate(parts), *runs)
-    careful = MOUNTED._replace(
+    constraint = MOUNTED._replace(
         **dict(zip(("lateral_std", "vertical_std"), SMALL, strict=True)),
         **dict(zip(("mounting_std", "lever_std"), stds, strict=True)),
     )
@@ -240,7 +240,7 @@ def test_the_mounting_is_found_while_driving_with_the_covariance_that_the_errors
     @optimised
     def last_states(rides):
         def one(rotation, velocity, position, gyro, accel, displacement):
-            ekf = filtering.Filter(CONFIG, NOISE, STD, measurements=(careful,))
+            ekf = filtering.Filter(CONFIG, NOISE, STD, measurements=(constraint,))
             state = filtering.initial_state(ekf, rotation, velocity, position)
             spread = jnp.tile(jnp.eye(3)[None], (len(displacement), 1, 1))
             signals = ekf, state, gyro, accel, displacement, spread
@@ -268,8 +268,8 @@ def test_the_mounting_is_found_while_driving_with_the_covariance_that_the_errors
         assert 0.7 < nees.mean() < 1.45, (name, nees.mean())
         sizes[name] = np.sqrt(np.mean(error[:, :3] ** 2))
     assert sizes["smoothed"] < 0.7 * sizes["filtered before"]
-    off = errors(rides, run(rides, MOUNTED))[:, last, 3:6]
-    assert np.sqrt(np.mean(off**2)) > 3 * sizes["filtered"]
+    unmoved = errors(rides, run(rides, MOUNTED))[:, last, 3:6]
+    assert np.sqrt(np.mean(unmoved**2)) > 3 * sizes["filtered"]
 
 
 def test_errors_of_the_mounting_forget_within_their_time_and_those_of_the_lever_never():
@@ -280,15 +280,15 @@ def test_errors_of_the_mounting_forget_within_their_time_and_those_of_the_lever_
     decay = np.repeat([np.exp(-seconds / 2.0), 1.0], 3)
     np.testing.assert_allclose(ekf.decay(np.float64), decay)
     start = filtering.initial_state(ekf, np.eye(3), np.array([9.0, 0.0, 0.0]), np.zeros(3))
-    known = checked_state(start, ekf)
-    known = known._replace(
-        correlated=jnp.ones(6), core_covariance=known.core_covariance.at[21:, 21:].set(0.0)
+    begin = checked_state(start, ekf)
+    begin = begin._replace(
+        correlated=jnp.ones(6), core_covariance=begin.core_covariance.at[21:, 21:].set(0.0)
     )
     held = jnp.tile(jnp.asarray([[0.0, 0.0, 9.81]]), (N, 1))
     none = jnp.full((1, 3), jnp.nan), jnp.eye(3)[None]
     huge = constraint._replace(lateral_std=1e9, vertical_std=1e9)
     ekf = dataclasses.replace(ekf, measurements=(huge,))
-    after, _ = filtering.run_filter(ekf, known, jnp.zeros((N, 3)), held, *none)
+    after, _ = filtering.run_filter(ekf, begin, jnp.zeros((N, 3)), held, *none)
     np.testing.assert_allclose(after.correlated, decay, atol=1e-9)
     spread = np.diag(1 - decay**2)
     np.testing.assert_allclose(after.core_covariance[21:, 21:], spread, atol=1e-9)

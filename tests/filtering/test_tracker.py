@@ -20,7 +20,7 @@ from gnio_jax.data.resampling import resample
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.filtering import Tracker, measurements
 from gnio_jax.filtering import tracker as online
-from gnio_jax.filtering.state import Mean, with_correlated_error
+from gnio_jax.filtering.state import Mean, with_correlated_errors
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy, tiny_run
 from tests.support.checks import checked_at_first
@@ -68,6 +68,11 @@ def filter_of(config=CONFIG, **parts):
     return filtering.Filter(config, NOISE, measurements=kinds, **parts)
 
 
+def with_all_errors(state, config=CONFIG):
+    """The state with the correlated errors of `filter_of`."""
+    return with_correlated_errors(state, len(filter_of(config).correlation_times))
+
+
 def predict(windows):
     ramp = jnp.linspace(0.5, 1.5, windows.shape[1], dtype=jnp.float32)[None, :, None]
     pooled = jnp.mean(ramp * windows, axis=1) @ jnp.asarray(WEIGHTS, jnp.float32)
@@ -92,7 +97,7 @@ def start(config=CONFIG):
         [[0.5, 0.0, 0.0], [3.0, -2.0, 1.0], [0.02, -0.01, 0.03]]
     )
     arguments = rotation, velocity, position, gyro_bias, 0.1
-    return with_correlated_error(filtering.initial_state(filtering.Filter(config), *arguments))
+    return with_all_errors(filtering.initial_state(filtering.Filter(config), *arguments), config)
 
 
 @functools.cache
@@ -376,7 +381,7 @@ def test_from_rest(built, lost):
         signals[1][:first] = 0.0
     assert feed(tracker, *signals, time[:40]) == [] and tracker.pose() is None
     resting_samples = slice(first, first + 45)
-    state = with_correlated_error(
+    state = with_all_errors(
         filtering.level_state(
             filtering.Filter(CONFIG), gyro[resting_samples], accel[resting_samples]
         )
@@ -409,7 +414,7 @@ def test_a_rest_with_holes_is_a_rest(built, share):
         np.stack([np.interp(number, number[came], axis[:45][came]) for axis in signal.T], axis=1)
         for signal in (gyro, accel)
     ]
-    state = with_correlated_error(filtering.level_state(filtering.Filter(CONFIG), *resting_signals))
+    state = with_all_errors(filtering.level_state(filtering.Filter(CONFIG), *resting_signals))
     _, history = scan(state, gyro, accel, ~lost)
     steps = [round((pose.time - 7.0) / (N * DT)) - 1 for pose in poses]
     assert 10 <= steps[0] <= 12 and len(steps) > 50 and tracker.hindrance == ""
@@ -468,7 +473,7 @@ def walk(rate):
     walked = sequence._replace(
         gyro=sequence.gyro + 2.0 * shake, accel=sequence.accel + 15.0 * shake[:, ::-1]
     )
-    return with_correlated_error(state), walked
+    return with_all_errors(state), walked
 
 
 @pytest.mark.parametrize("rate", [100, 104])
