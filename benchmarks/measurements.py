@@ -42,6 +42,7 @@ def make_measurements(intervals: int) -> dict[str, tuple[tuple, tuple]]:
     return {
         "zero_velocity": ((zero_velocity.ZeroVelocity(),), ()),
         "nonholonomic": ((car,), ()),
+        "… with states": ((nonholonomic.NonHolonomic(mounting_std=0.01, lever_std=0.5),), ()),
         "magnetometer": (
             (),
             (filtering.magnetometer_on_intervals(stamps, field, rotation, CONFIG),),
