@@ -343,6 +343,8 @@ def main() -> None:
     for name in arguments.without:
         if UNITS.pop(f"measurements.nonholonomic.{name}", None) is None:
             parser.error(f"--without: {name} is no number of the constraint that is fitted")
+    if "mounting_std" in arguments.without and "mounting_seconds" not in arguments.without:
+        parser.error("--without mounting_std: mounting_seconds has no effect then; name it, too")
     drives, fold_of = load_drives(arguments.data_root, arguments.folds)
     every = sorted({fold_of[drive.group] for drive in drives})
     numbers = every if arguments.only is None else arguments.only

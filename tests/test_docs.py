@@ -129,7 +129,8 @@ def test_a_measurement_of_ones_own(capsys):
 
 def test_a_car_and_the_other_sensors_of_a_phone(capsys):
     run("docs/vehicles.md", code_of("docs/vehicles.md"))
-    mounting, *errors = capsys.readouterr().out.splitlines()
+    state, mounting, *errors = capsys.readouterr().out.splitlines()
+    assert state == "yaw 0.027 rad"
     assert mounting.startswith("yaw 0.50 rad, ±0.0")
     without, magnetometer = (abs(float(line.split()[-1].strip("°"))) for line in errors)
     assert without > 40 and magnetometer < 10

@@ -27,6 +27,7 @@ from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.filter import Filter
 from gnio_jax.filtering.fix import THRESHOLDS, Fix, improper_covariances
 from gnio_jax.filtering.magnetometer import Magnetometer
+from gnio_jax.filtering.nonholonomic import NonHolonomic
 from gnio_jax.filtering.settings import DisplacementFrame, FilterConfig
 from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_errors
 from gnio_jax.filtering.wheel_speed import WheelSpeed
@@ -177,7 +178,13 @@ def check_numbers(name: str, settings: Any, bounded_only: bool = False) -> None:
     """Refuse a tuple of settings (`NoiseModel`, `InitialStd`, `ConsideredStd`) with a number
     outside the bounds of its field. With `bounded_only`, as for a measurement of anybody's, fields
     without bounds may hold anything."""
-    for field, hint, value in iterate_settings(settings, f"{name}."):
+    try:
+        fields = list(iterate_settings(settings, f"{name}."))
+    except NameError:  # The types of a class that is local to a function may have no value here.
+        if not bounded_only:
+            raise
+        return
+    for field, hint, value in fields:
         limits = tuple(bounds(hint))
         if limits or not bounded_only:
             for number in value if isinstance(value, tuple | list) else (value,):
@@ -236,6 +243,10 @@ def checked_inputs(
         return value.astype(dtype) if jnp.issubdtype(value.dtype, jnp.floating) else value
 
     check_measurements("measurements", measurements, ekf.measurements)
+    for number, measurement in enumerate(measurements):
+        if _has_states(measurement):
+            problem = "the mounting is estimated, so the constraint is a part of the Filter"
+            raise ValueError(f"measurements[{number}]: {problem}; put it in ekf.measurements")
     measurements = tree_map_with_path(checked_rows, tuple(measurements))
     for number, measurement in enumerate(measurements):
         if isinstance(measurement, Fix):
@@ -331,6 +342,18 @@ def check_filter(ekf: Any) -> None:
             raise ValueError(f"ekf.measurements[{number}]: {problem}")
         if hasattr(measurement, "_fields"):
             check_numbers(f"ekf.measurements[{number}]", measurement, bounded_only=True)
+        for field, other in getattr(measurement, "needs", {}).items():
+            if getattr(measurement, other) is None and getattr(measurement, field) is not None:
+                problem = f"{field}: has no effect alone; give {other}, too"
+                raise ValueError(f"ekf.measurements[{number}].{problem}")
+    if sum(map(_has_states, ekf.measurements)) > 1:
+        problem = "a filter estimates the mounting of one constraint, and here are several"
+        remedy = "leave mounting_std and lever_std out of the others"
+        raise ValueError(f"ekf.measurements: {problem}; {remedy}")
+
+
+def _has_states(measurement: Any) -> bool:
+    return isinstance(measurement, NonHolonomic) and measurement.estimates_mounting
 
 
 def converted_filter(ekf: Filter, dtype: Any) -> Filter:

@@ -56,11 +56,11 @@ class MountingErrors(NamedTuple):
 
     turn: Float[Array, "3"]
     """ε, in the axes of the car, rad."""
-    step: Float[Array, "3"]
+    lever: Float[Array, "3"]
     """λ, in the body, m."""
     turn_std: Float[Array, ""]
     """Standard deviation of each component of ε before all measurements, rad."""
-    step_std: Float[Array, ""]
+    lever_std: Float[Array, ""]
     """That of λ, m."""
 
 
@@ -114,21 +114,26 @@ class NonHolonomic(NamedTuple):
         return (*3 * (of_mounting,), *3 * (constant,)) if self.estimates_mounting else ()
 
     def mounting_errors(self, state: FilterState) -> MountingErrors:
-        """The filter's estimate of ε and λ, which are states."""
+        """The filter's estimate of ε and λ. Raises `ValueError` for a state without them, as the
+        start of a run is."""
+        if len(state.correlated) < len(self.correlation_times):
+            problem = "the state has no errors of the mounting yet"
+            raise ValueError(f"state.correlated: {problem}; take the final state of a run")
         dtype = state.offset.dtype
         stds = (0.0 if std is None else std for std in (self.mounting_std, self.lever_std))
-        turn_std, step_std = (jnp.asarray(std, dtype) for std in stds)
-        turn, step = state.correlated[OF_MOUNTING], state.correlated[OF_LEVER]
-        return MountingErrors(turn_std * turn, step_std * step, turn_std, step_std)
+        turn_std, lever_std = (jnp.asarray(std, dtype) for std in stds)
+        turn, lever = state.correlated[OF_MOUNTING], state.correlated[OF_LEVER]
+        return MountingErrors(turn_std * turn, lever_std * lever, turn_std, lever_std)
 
     def mounting_at(self, state: FilterState) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
-        """C, car ← body, and the lever l, m, with the filter's estimate of their errors."""
+        """C, car ← body, and the lever l, m, with the filter's estimate of their errors, as the
+        final state of a run has it."""
         dtype = state.offset.dtype
         axes = car_axes(self.yaw, self.pitch, self.roll).astype(dtype)
         lever = jnp.stack([jnp.asarray(x, dtype) for x in self.lever])
         if self.estimates_mounting:
             errors = self.mounting_errors(state)
-            axes, lever = matmul(exp(errors.turn), axes), lever + errors.step
+            axes, lever = matmul(exp(errors.turn), axes), lever + errors.lever
         return axes, lever
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
@@ -168,7 +173,7 @@ class NonHolonomic(NamedTuple):
             by_turn = matmul(by_velocity, hat(velocity)) + matmul(by_force, hat(force))
             left_jacobian = right_jacobian(errors.turn).T
             jacobian["mounting"] = -errors.turn_std * matmul(by_turn, left_jacobian)
-            jacobian["lever"] = errors.step_std * matmul(by_body_velocity, hat(rate))
+            jacobian["lever"] = errors.lever_std * matmul(by_body_velocity, hat(rate))
         residual = jnp.where(present, -predicted, jnp.nan)
         linear = linearise(state, residual, jnp.diag(std**2), **jacobian)
         return measure(state, linear, step, THRESHOLD)

@@ -113,9 +113,10 @@ def smooth(
     positions can be worse than those of the filter. With 200 Hz, or with a larger `accel_density`
     (0.03 there), they are better.
 
-    Memory: about K · (18 m + 500) numbers, m = 21 + 6 (W + 1): 25 kB for each interval at W = 20,
-    in float64. Smoothed variances are differences. In float32 a variance that becomes smaller by
-    many orders of magnitude, as at the start, keeps few digits and can become negative.
+    Memory: about K · (18 m + 500) numbers, m = 21 + e + 6 (W + 1) with e correlated errors: 25 kB
+    for each interval at W = 20, in float64. Smoothed variances are differences. In float32 a
+    variance that becomes smaller by many orders of magnitude, as at the start, keeps few digits and
+    can become negative.
 
     Args:
         ekf: The filter (`Filter`, `make_filter`).

@@ -125,8 +125,9 @@ class FilterState(NamedTuple):
     move: Float[Array, "3"]
     """From the anchor before it, m."""
     correlated: Float[Array, "e"]
-    """Temporally correlated errors of measurements, in units of their standard deviations: no
-    entries or 3 of the displacements, then no entries or 6 of a car's mounting and lever."""
+    """Temporally correlated errors of measurements, in units of the standard deviations of the
+    filter that ran: no entries or 3 of the displacements, then no entries or 6 of a car's mounting
+    and lever. A filter with other standard deviations would continue with other errors."""
     clone_rotation: Float[Array, "c 3 3"]
     """Cloned rotations."""
     clone_offset: Float[Array, "c 3"]

@@ -84,7 +84,8 @@ def speeds_on_intervals(
         speed: (f,) m/s. Those that are not finite are none.
         intervals: Number K of clone intervals.
         config: The settings of the filter, for the length of an interval.
-        mounting: The constraint of the same car, for its angles and its lever.
+        mounting: The constraint of the same car, for its angles and its lever. What the filter
+            finds of their errors is not used here.
         start: Stamp of the first IMU sample, s.
         std: Standard deviation, m/s, with the slip and the radius of the wheels, whose errors last.
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +10,14 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering, models, types
-from gnio_jax.filtering.checks import checked_inputs
+from gnio_jax.filtering.checks import check_filter, checked_inputs
 from gnio_jax.filtering.history import describe_failure
 from gnio_jax.filtering.state import CLONE, with_correlated_errors
 from tests.support.checks import unchecked
 from tests.support.random_walk import random_walk
+
+if TYPE_CHECKING:
+    from gnio_jax.config.schema import Number
 
 N, CLONES, DT, INTERVALS = 5, 4, 0.02, 60
 CONFIG = filtering.FilterConfig(DT, N, CLONES, history="core")
@@ -141,6 +145,14 @@ def wrong():
     correlated = filtering.Filter(CONFIG, correlated)
     yield "state.correlated", {"state": lost, "ekf": correlated}
     car = filtering.Filter(CONFIG, measurements=(filtering.NonHolonomic(lever_std=0.5),))
+    second = type("Second", (filtering.NonHolonomic,), {"name": "second"})
+    for measurements, problem in (
+        ((filtering.NonHolonomic(mounting_seconds=5.0),), r"\[0\].mounting_seconds: has no effect"),
+        ((*car.measurements, second(mounting_std=0.1)), ": a filter estimates the mounting of one"),
+    ):
+        ekf = filtering.Filter(CONFIG, measurements=measurements)
+        yield f"ekf.measurements{problem}", {"ekf": ekf}
+    yield r"measurements\[0\]: the mounting is estimated", {"measurements": car.measurements}
     problem = "state.correlated: the state has 3 correlated errors, and the filter 6"
     yield problem, {"state": with_correlated_errors(state, 3), "ekf": car}
     for field in (
@@ -328,3 +340,13 @@ def test_a_network_that_is_no_function_of_windows_is_refused():
         filtering.considered_covariance(np.zeros((4, 15, 6)), 0.1)
     with unchecked(), pytest.raises(ValueError, match=r"^state: must be a FilterState"):
         filtering.Tracker(lambda _: prediction, ekf, "level")
+
+
+def test_a_measurement_whose_types_are_known_to_a_type_checker_alone_is_taken():
+    class Height(NamedTuple):
+        std: "Number"
+        name = "height"
+
+        def update(self, state, step): ...
+
+    check_filter(filtering.Filter(CONFIG, measurements=(Height(1.0),)))

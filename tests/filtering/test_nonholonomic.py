@@ -216,6 +216,8 @@ def test_an_update_of_the_mounting_is_the_textbooks_with_derivatives_by_finite_d
     assert bool(outcome.accepted)
     np.testing.assert_allclose(after.core_covariance, before - gain @ jacobian @ before, atol=1e-8)
     np.testing.assert_allclose(after.correlated, errors + (gain @ residual)[21:], atol=1e-8)
+    with pytest.raises(ValueError, match="no errors of the mounting yet; take the final state"):
+        ESTIMATED.mounting_at(state._replace(correlated=jnp.zeros(3)))
     axes, lever = ESTIMATED.mounting_at(state)
     car = with_errors(*np.split(errors * np.repeat([0.1, 0.7], 3), 2))
     np.testing.assert_allclose(axes, car_axes(car.yaw, car.pitch, car.roll), atol=1e-12)
