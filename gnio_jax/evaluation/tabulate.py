@@ -16,6 +16,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
+from gnio_jax.data.readers import DATASETS
 from gnio_jax.evaluation import statistics
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Cell, Difference, MetricSummary
@@ -64,6 +65,8 @@ COLUMNS = {
 }
 SCREEN = ("ate", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio", "nees_coverage")
 """Metrics of the table on the screen, which fits into 80 columns. The files have all metrics."""
+VEHICLE_SCREEN = ("ate", "rte_60s", "rpe_1s", "yaw_rmse", "t_rel", "nees_coverage")
+"""The same for a dataset of vehicles."""
 WAYPOINT_SCREEN = (
     "path_length",
     "legs",
@@ -335,7 +338,9 @@ def render(report: Report) -> Group:
     """The table of an evaluation and the lines under it, for `rich.console.Console.print`: a row
     per sequence, then those of the set, then the reference rows."""
     summary = report.summary()
-    screen = SCREEN
+    kind = DATASETS.get(report.settings["dataset"])
+    of_vehicle = kind is not None and not kind.pedestrian and "t_rel" in summary
+    screen = VEHICLE_SCREEN if of_vehicle else SCREEN
     if "waypoint_rms" in summary:
         screen = MIXED_SCREEN if "ate" in summary else WAYPOINT_SCREEN
     shown = [name for name in screen if name in summary]

@@ -36,6 +36,24 @@ def test_the_table_has_figures_choices_and_notes(made_report):
     assert table["95 % from"][-1] == tabulate.number(low, 0)
 
 
+def test_vehicles_have_kittis_error_in_the_place_of_the_path_ratio(made_report):
+    far = {
+        name: measures._replace(values=measures.values | {"t_rel": 1.23})
+        for name, measures in made_report.scores.items()
+    }
+    for dataset, scores, heading in (
+        ("kitti", far, "t_rel"),
+        ("kitti", made_report.scores, "ratio"),  # no piece of 100 m
+        ("tyrex", far, "ratio"),
+        ("a file", far, "ratio"),
+    ):
+        settings = made_report.settings | {"dataset": dataset}
+        table = text(made_report._replace(settings=settings, scores=scores))
+        assert [words in table for words in ("t_rel", "1.23", "ratio")] == (
+            [True, True, False] if heading == "t_rel" else [False, False, True]
+        )
+
+
 @pytest.mark.parametrize("tapped", [False, True])
 def test_the_table_fits_into_80_columns_and_breaks_names_between_their_words(made_report, tapped):
     name = "2023-11-25T12-30_person-17_pocket_left_down"
