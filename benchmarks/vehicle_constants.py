@@ -17,7 +17,8 @@ chosen by the other drives, and the held-out drives are measured once:
 Nothing is drawn, so there are no seeds. The filter starts at the reference's pose and velocity, and
 gets no displacement and no rest. `--low-pass 0` is the same protocol with the low-pass left in.
 `--without` names numbers of the constraint that are not fitted: gradients are zero then, and the
-mounting and the lever are no states without `mounting_std mounting_seconds lever_std`. `--only`
+mounting and the lever are no states without `mounting_std mounting_seconds lever_std`. The lines of
+the defaults are of the start of the fit, which has these states unless they are left out. `--only`
 runs some folds. The brackets are 95 % intervals of a bootstrap over drives (10,000 draws).
 """
 
@@ -84,7 +85,7 @@ PADDING = 200
 shapes, few compilations."""
 
 Point = np.ndarray
-"""(c,) a place of the fit, in units; zeros are the defaults."""
+"""(c,) a place of the fit, in units; zeros are its start."""
 
 
 class Choice(NamedTuple):
@@ -100,13 +101,14 @@ class FoldResult(NamedTuple):
 
     choice: Choice
     default_errors: dict[str, np.ndarray]
-    """Drive -> errors of its pieces, %, with the defaults and the chosen time constant."""
+    """Drive -> errors of its pieces, %, at the start of the fit with the chosen time constant."""
     errors: dict[str, np.ndarray]
     """The same with the chosen constants."""
 
 
 def default_settings(low_pass_seconds: float) -> FilterSettings:
-    """The package's defaults with the non-holonomic constraint, whose numbers are all named."""
+    """The start of the fit: the package's defaults with the non-holonomic constraint, whose numbers
+    are all named, and with `STATES` if they are fitted."""
     numbers = {name: value for name, value in NonHolonomic()._asdict().items() if value is not None}
     for name, value in STATES.items():
         if f"measurements.nonholonomic.{name}" in UNITS:

@@ -177,11 +177,11 @@ def choose_task(config: TrainConfig) -> type[Task]:
         raise InputError("data.stride_seconds", problem, remedy)
     if not models.predicts_displacement(model):
         _refuse_errors_of_displacement(config)
+        if not config.through_filter.learn:
+            problem = f"is empty, and '{config.model.name}' is trained in the filter's loop alone"
+            raise InputError("through_filter.learn", problem, "name the parts, e.g. [all]")
     if config.through_filter.learn:
         return FilterTask
-    if not models.predicts_displacement(model):
-        problem = f"is empty, and '{config.model.name}' is trained in the filter's loop alone"
-        raise InputError("through_filter.learn", problem, "name the parts, e.g. [all]")
     if not config.segments.seconds:
         return WindowTask
     grid = grid_of(config)

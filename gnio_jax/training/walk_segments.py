@@ -157,7 +157,7 @@ def cut_walks(
     before = jnp.floor(row_offset).astype(jnp.int32)
     # A segment may end at the last row of all, which has none after it.
     index = jnp.clip(rows[:, None] + before, 0, len(source.imu) - 2)
-    share = jnp.clip(row_offset - (index - rows[:, None]), 0.0, 1.0)[:, :, None]
+    share = (row_offset - (index - rows[:, None]))[:, :, None]
 
     def interpolate(signal: Array) -> jax.Array:
         signal = jnp.asarray(signal)

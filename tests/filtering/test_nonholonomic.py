@@ -283,6 +283,7 @@ def test_errors_of_the_mounting_forget_within_their_time_and_those_of_the_lever_
     np.testing.assert_allclose(ekf.decay(np.float64), decay)
     start = filtering.initial_state(ekf, np.eye(3), np.array([9.0, 0.0, 0.0]), np.zeros(3))
     begin = checked_state(start, ekf)
+    np.testing.assert_array_equal(begin.core_covariance[21:, 21:], np.eye(6))
     begin = begin._replace(
         correlated=jnp.ones(6), core_covariance=begin.core_covariance.at[21:, 21:].set(0.0)
     )
