@@ -17,12 +17,11 @@ from gnio_jax.config.schema import Count, Probability
 from gnio_jax.models.bidirectional import Bidirectional
 from gnio_jax.models.convolution import convolve, convolve_forward
 from gnio_jax.models.layers import EPSILON, FLOAT32, MOMENTUM, linear
+from gnio_jax.numerics import midpoints
 from gnio_jax.types import Prediction, Velocity
 
 STRIDE = 9
 """Samples from one output to the next: two convolutions of stride 3."""
-FIRST_LABEL = 14
-"""Sample of the window whose velocity is the target of the first output."""
 LOG_VARIANCE_SHIFT = 5.0
 """A variance is exp(x − 5) of the decoder's output x."""
 
@@ -35,10 +34,11 @@ class AirIO(nn.Module):
     projection, two layers of GRU in both directions, and two decoders: 354,278 parameters.
 
     Published: the velocity in m/s at each sample 14 + 9k, from windows of 5 s, with the attitude
-    in the world. Ours: velocities in metres per window, which are m/s for windows of 1 s; the
-    attitude in the frame in which the window's start has zero yaw, so that a turned world turns the
-    displacement; a displacement with the variance that the outputs have if their errors are the
-    same in the whole window. Outputs whose sample comes after the window are not used.
+    in the world. Ours: velocities at every ninth sample up to the last one, because the filter
+    measures the velocity at the window's end; velocities in metres per window, which are m/s for
+    windows of 1 s; the attitude in the frame in which the window's start has zero yaw, so that a
+    turned world turns the displacement; a displacement with the variance that the outputs have if
+    their errors are the same in the whole window.
 
     `width` scales all layers. Training needs the random stream `dropout`.
     """
@@ -68,10 +68,9 @@ class AirIO(nn.Module):
         velocity = Decoder(2 * self.width, name="displacement")(x)
         log_std = 0.5 * (Decoder(2 * self.width, name="log_std")(x) - LOG_VARIANCE_SHIFT)
         rows = label_rows(windows.shape[1])
-        velocity, log_std = velocity[:, : len(rows)], log_std[:, : len(rows)]
-        to_window = rotation[:, rows]
-        displacement = jnp.einsum("bnij,bnj->bi", to_window, velocity) / len(rows)
-        variance = jnp.einsum("bnij,bnj->bi", to_window**2, jnp.exp(2 * log_std)) / len(rows)
+        to_window, shares = rotation[:, rows], label_shares(windows.shape[1])
+        displacement = jnp.einsum("n,bnij,bnj->bi", shares, to_window, velocity)
+        variance = jnp.einsum("n,bnij,bnj->bi", shares, to_window**2, jnp.exp(2 * log_std))
         diagnostics = {"body_velocity": velocity, "body_velocity_log_std": log_std}
         last = Velocity(velocity[:, -1], log_std[:, -1])
         return Prediction(displacement, 0.5 * jnp.log(variance), diagnostics, velocity=last)
@@ -129,11 +128,18 @@ def norm(name: str, train: bool) -> nn.BatchNorm:
 
 
 def label_rows(samples: int) -> Int[np.ndarray, "m"]:
-    """The samples of a window whose velocities are predicted."""
-    rows = np.arange(FIRST_LABEL, samples, STRIDE)
-    if not len(rows):
-        raise ValueError(f"windows must have more than {FIRST_LABEL} samples, found {samples}")
-    return rows
+    """The samples of a window whose velocities are predicted: as many as the encoder has outputs,
+    and the last one is the window's last."""
+    return np.arange((samples - 1) % STRIDE, samples, STRIDE)
+
+
+def label_shares(samples: int) -> Float[np.ndarray, "m"]:
+    """Shares of the window in which the velocity of each of `label_rows` is the nearest one in
+    time. They add up to 1."""
+    rows = label_rows(samples)
+    # A velocity is that of the step to the next sample.
+    edges = np.concatenate([[0.0], midpoints(rows + 0.5), [samples]])
+    return (np.diff(edges) / samples).astype(np.float32)
 
 
 def body_axes(windows: Float[Array, "b n 12"]) -> Float[Array, "b n 3 3"]:
