@@ -16,6 +16,7 @@ that a small network learns from them in a minute. All ranges are ours.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -129,6 +130,8 @@ CARRYING = {
 }
 """Ways of carrying a phone, by name."""
 
+RATE = 200.0
+"""Rate at which a walk is drawn, Hz. The heel strikes are too quick for much lower ones."""
 STANDING_START = 3.0
 """Time of standing at the beginning of every walk, s."""
 _STEP, _CADENCE = 0.55, 1.5
@@ -244,30 +247,31 @@ def draw_motion(
     rng: np.random.Generator,
     placement: str,
     time: Float[np.ndarray, " n"],
-    dt: float,
     person: int,
 ) -> PhoneMotion:
-    """The motion of a phone on a walk that is drawn from `PEOPLE`; `time` (s) is uniform with the
-    step `dt`. `placement` is a way of `PEOPLE.carrying`.
+    """The motion of a phone at the stamps `time` (s, from 0) on a walk that is drawn from `PEOPLE`.
+    `placement` is a way of `PEOPLE.carrying`.
 
-    The gait of walker number `person` is the same in every walk. Position and velocity are value
-    and derivative of one spline.
+    The gait of walker number `person` is the same in every walk. The walk is drawn at `RATE` and
+    does not depend on the stamps. Position and velocity are value and derivative of one spline.
     """
     gait_rng = np.random.default_rng([7, person])
     carrying = PEOPLE.carrying[placement]
-    plan = _plan(rng, PEOPLE.activities, time, dt)
+    dt = 1.0 / RATE
+    clock = np.arange(math.ceil(time[-1] * RATE - 1e-6) + 1) / RATE
+    plan = _plan(rng, PEOPLE.activities, clock, dt)
     walking_cadence = step_frequency(plan.speed, gait_rng.uniform(*PEOPLE.cadence))
     running_cadence = gait_rng.uniform(2.3, 2.8) + 0.1 * plan.speed
     cadence = walking_cadence + plan.running * (running_cadence - walking_cadence)
-    cadence = cadence * (1.0 + 0.03 * wander(rng, time, 1, 1.0, 0.05, 0.5)[:, 0])
-    phase = 2.0 * np.pi * integral(time, cadence) + rng.uniform(0.0, 2.0 * np.pi)
-    steps = Steps(time, plan, plan.speed / cadence, cadence, phase)
+    cadence = cadence * (1.0 + 0.03 * wander(rng, clock, 1, 1.0, 0.05, 0.5)[:, 0])
+    phase = 2.0 * np.pi * integral(clock, cadence) + rng.uniform(0.0, 2.0 * np.pi)
+    steps = Steps(clock, plan, plan.speed / cadence, cadence, phase)
     offset = _trunk(rng, gait_rng, carrying, steps)
     offset = offset + _strides(rng, gait_rng, carrying, steps)
     offset = offset + _strikes(gait_rng, carrying, steps, dt)
     lever = np.array([rng.uniform(*bounds) for bounds in carrying.lever])
     lever[1] *= rng.choice([-1.0, 1.0])
-    offset = offset + lever + wander(rng, time, 3, rng.uniform(*PEOPLE.idle), 0.1, 0.8)
+    offset = offset + lever + wander(rng, clock, 3, rng.uniform(*PEOPLE.idle), 0.1, 0.8)
     swing = _swing(rng, gait_rng, carrying, steps)
 
     # The yaw of the mounting is arbitrary, so that the phone's heading does not show the direction
@@ -280,10 +284,11 @@ def draw_motion(
 
     speed, heading, rise, _ = plan
     course = np.stack([speed * np.cos(heading), speed * np.sin(heading), speed * rise], axis=1)
-    turn = about_z(heading)
-    path = make_interp_spline(time, integral(time, course) + turn.apply(offset), k=5)
+    travelled = integral(clock, course) + about_z(heading).apply(offset)
+    path = make_interp_spline(clock, travelled, k=5)
     position, velocity = path(time), path.derivative()(time)
-    attitude = turn * Rotation.from_rotvec(swing) * mounting
+    heading, swing = (make_interp_spline(clock, angle, k=5)(time) for angle in (heading, swing))
+    attitude = about_z(heading) * Rotation.from_rotvec(swing) * mounting
     return PhoneMotion(time, position - position[0], velocity, attitude)
 
 

@@ -63,14 +63,14 @@ def pedestrian(
     imu_errors: bool = True,
 ) -> Sequence:
     """A walk of person number `person`, for `seconds` at `rate` Hz. Everything except the gait is
-    drawn from `seed`.
+    drawn from `seed`; the motion is the same at every rate.
 
     It starts with 3 s of standing. Without `imu_errors` the IMU has neither bias nor noise. The
     attributes include the true biases at the start.
     """
     rng = np.random.default_rng([seed])
     time, dt = np.arange(round(seconds * rate) + 1) / rate, 1.0 / rate
-    motion = draw_motion(rng, placement, time, dt, person)
+    motion = draw_motion(rng, placement, time, person)
     attributes = {"dataset": "synthetic", "placement": placement, "seed": seed}
     attributes |= {"subject": f"person {person}", "licence": SYNTHETIC.licence}
     return walk_sequence(
