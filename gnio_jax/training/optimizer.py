@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ PLATEAU_EPOCHS, PLATEAU_FACTOR = 10, 0.1
 smaller squared error on the validation split (RoNIN, DeepILS)."""
 NETWORK_PARTS = {"uncertainty": ("uncertainty", "log_std"), "head": ("head", "displacement")}
 """Names of the modules of a network that belong to each of its parts; all others are its encoder
-(docs/networks.md)."""
+(docs/networks.md). Those of one expert of several have its name before theirs: expert1_log_std."""
 FILTER_PARTS = {
     "noise": (
         "noise.gyro_density",
@@ -102,7 +103,8 @@ def select_trained(variables: Any, learn: Iterable[str]) -> Trainable:
 
 
 def _network_part(module: str) -> str:
-    return next((part for part, modules in NETWORK_PARTS.items() if module in modules), "encoder")
+    name = re.sub("^expert[0-9]+_", "", module)
+    return next((part for part, modules in NETWORK_PARTS.items() if name in modules), "encoder")
 
 
 # By which steps
@@ -148,8 +150,9 @@ def adam(
         held = optax.conditionally_mask(
             moments, lambda step, log_std_learns: log_std_learns, forward_extra_args=True
         )
-        names = NETWORK_PARTS["uncertainty"]
-        labels = _by_path(lambda path: "held" if path[1].key in names else "learns")
+        labels = _by_path(
+            lambda path: "held" if _network_part(path[1].key) == "uncertainty" else "learns"
+        )
         parts = [optax.partition({"learns": moments, "held": held}, labels)]
     if config.weight_decay:
         parts.insert(0, optax.add_decayed_weights(config.weight_decay))

@@ -272,6 +272,19 @@ def test_adam_against_numpy(clip, decay, loss):
             np.testing.assert_allclose(params["params"][part]["w"], w, rtol=1e-6, atol=1e-6)
 
 
+def test_the_uncertainties_of_experts_do_not_count_the_steps_in_which_they_are_held():
+    config, loss = OptimConfig(epochs=10), LossConfig(log_std_from_epoch=2.0)
+    adam = optimizer.adam(config, loss, 5)
+    params = {"params": {name: jnp.ones(2) for name in ("expert1", "expert1_log_std")}}
+    state, update = adam.init(params), jax.jit(adam.update)
+    for step in range(11):
+        learns = step == 10
+        gradient = {"expert1": jnp.ones(2), "expert1_log_std": 0.3 * learns * jnp.ones(2)}
+        tree = {"params": gradient}
+        change, state = update(tree, state, params, log_std_learns=jnp.bool_(learns))
+    np.testing.assert_allclose(change["params"]["expert1_log_std"], 1.0, rtol=1e-5)
+
+
 @functools.partial(jax.jit, static_argnames="config")
 def value_and_slopes(log_std, error, config):
     def likelihood(log_std, error):

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from gnio_jax import config as configuration
-from gnio_jax import parallel
+from gnio_jax import models, parallel
 from gnio_jax.commands.options import Call, read
 from gnio_jax.commands.train import experiment, train
 from gnio_jax.config import (
@@ -418,6 +418,10 @@ def test_parts_are_modules_and_options_by_name():
         assert selection.get("params", {}).keys() == params
         assert set(some) <= selection.get("filter", {}).keys() and all(selection.values())
     assert optimizer.select_trained(variables, ("all", "head")) == variables
+    experts = models.variable_shapes(models.create("experts", width=2), 32)
+    for learn, part in (("head", "displacement"), ("uncertainty", "log_std")):
+        selection = optimizer.select_trained({**experts}, (learn,))["params"]
+        assert selection.keys() == {f"expert1_{part}", f"expert2_{part}"}
     without = variables | {"params": {"encoder": 0, "head": 0}}
     assert optimizer.select_trained(without, ("all",)) == without
     with pytest.raises(InputError, match=r"'uncertainty', but no module .* called uncertainty or"):
