@@ -379,7 +379,7 @@ class LossConfig:
     the paper's text can also mean."""
     log_std_from_epoch: NonNegative = 0.0
     """Epochs before the likelihood trains the uncertainty; until then it trains the displacement
-    alone (TLIO: 10)."""
+    alone (TLIO: 9)."""
     log_std_floor: Finite | None = None
     """Smallest log standard deviation in the likelihood (TLIO: log 1e-3); none by default."""
     angle_weight: Annotated[NonNegative, FILE_ONLY] = 1.0

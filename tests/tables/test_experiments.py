@@ -35,7 +35,7 @@ def test_rows_differ_in_the_network_alone():
 
 
 @pytest.mark.parametrize(
-    "epochs, batch, held", [(200, 128, 10), (24, 1024, 10), (24, 128, 1.25), (8, 1024, 4)]
+    "epochs, batch, held", [(200, 128, 9), (24, 1024, 9), (24, 128, 1.125), (8, 1024, 4)]
 )
 def test_tlio_is_held_for_the_published_steps_or_half_of_the_run(epochs, batch, held):
     optim = dataclasses.replace(BASE.optim, epochs=epochs, batch_size=batch)
