@@ -22,6 +22,8 @@ from gnio_jax.types import Prediction, Velocity
 
 STRIDE = 9
 """Samples from one output to the next: two convolutions of stride 3."""
+FIRST_LABEL = 14
+"""Sample of the window whose velocity is the target of the first output."""
 LOG_VARIANCE_SHIFT = 5.0
 """A variance is exp(x − 5) of the decoder's output x."""
 
@@ -33,12 +35,11 @@ class AirIO(nn.Module):
     Two encoders, of [accel, gyro] in the body and of the attitude as a rotation vector, a
     projection, two layers of GRU in both directions, and two decoders: 354,278 parameters.
 
-    Published: the velocity in m/s at each sample 14 + 9k, from windows of 5 s, with the attitude
-    in the world. Ours: velocities at every ninth sample up to the last one, because the filter
-    measures the velocity at the window's end; velocities in metres per window, which are m/s for
-    windows of 1 s; the attitude in the frame in which the window's start has zero yaw, so that a
-    turned world turns the displacement; a displacement with the variance that the outputs have if
-    their errors are the same in the whole window.
+    Published: the velocity in m/s at each sample 14 + 9k, and at the window's end for the outputs
+    after it, from windows of 5 s, with the attitude in the world. Ours: velocities in metres per
+    window, which are m/s for windows of 1 s; the attitude in the frame in which the window's start
+    has zero yaw, so that a turned world turns the displacement; a displacement with the variance
+    that the outputs have if their errors are the same in the whole window.
 
     `width` scales all layers. Training needs the random stream `dropout`.
     """
@@ -128,9 +129,10 @@ def norm(name: str, train: bool) -> nn.BatchNorm:
 
 
 def label_rows(samples: int) -> Int[np.ndarray, "m"]:
-    """The samples of a window whose velocities are predicted: as many as the encoder has outputs,
-    and the last one is the window's last."""
-    return np.arange((samples - 1) % STRIDE, samples, STRIDE)
+    """The sample of a window whose velocity each output of the encoder predicts: the last one for
+    those that would be after it."""
+    outputs = -(-samples // STRIDE)
+    return np.minimum(FIRST_LABEL + STRIDE * np.arange(outputs), samples - 1)
 
 
 def label_shares(samples: int) -> Float[np.ndarray, "m"]:
