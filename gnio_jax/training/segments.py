@@ -86,8 +86,10 @@ def segment_source(sequences: Iterable[Sequence], samples: int) -> SegmentSource
 
     A segment needs a trusted reference at each of its samples and at the one after them. A stretch
     of such samples has as many segments as fit in it side by side. They may overlap: segment j of m
-    begins anywhere in the j-th of m equal shares of the rows at which a segment can begin, so every
-    epoch covers the whole stretch, cut at other rows. Raises `InputError` if no segment fits.
+    begins anywhere in the j-th of m equal shares of the rows at which a segment can begin. So an
+    epoch leaves out a tenth to a sixth of a long stretch, and all epochs together visit it alike,
+    but for a segment's length at its ends, which they visit less. Raises `InputError` if no segment
+    fits.
     """
     parts = [_source_of(sequence, samples) for sequence in sequences]
     parts = [part for part in parts if part.earliest.size]
