@@ -39,6 +39,12 @@ class IONet(nn.Module):
     angle: Literal["direction", "turn"] = "direction"
     output_dim = 2
 
+    @property
+    def takes_context(self) -> bool:
+        """Whether a context may come before the window: a turn is that of all samples the network
+        sees."""
+        return self.angle == "direction"
+
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 6"], train: bool = False) -> Prediction:
         x, last = checked_windows(windows), None

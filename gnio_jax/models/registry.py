@@ -154,7 +154,7 @@ def check_experiment(model: nn.Module, config: TrainConfig, source: str = "confi
     location, name = Location(source), config.model.name
     network = innermost(model)
     if config.data.context and not getattr(network, "takes_context", True):
-        remedy = "it predicts every sample it sees: set it to 0"
+        remedy = "its targets are of every sample it sees: set it to 0"
         location.child("data.context_seconds").refuse(f"is not for {name}", remedy)
     rotation = location.child("data.window_rotation")
     in_filter = location.child("filter.window_rotation")

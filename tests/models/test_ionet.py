@@ -1,12 +1,15 @@
 """IONet against plain NumPy, its recurrent layers against PyTorch, and its integrator."""
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gnio_jax import models
-from gnio_jax.config import LossConfig
+from gnio_jax.config import DataConfig, LossConfig, ModelConfig, TrainConfig
+from gnio_jax.errors import InputError
 from gnio_jax.models.bidirectional import Bidirectional
 from gnio_jax.models.ionet import chain
 from gnio_jax.training.losses import loss_stage, losses
@@ -106,3 +109,15 @@ def test_at_rest_the_gradient_is_finite():
 
     gradient = quick(jax.grad(loss))(variables["params"])
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_a_turn_has_no_context_before_it():
+    """The loss compares the first with the last steps of what the network sees."""
+    for angle, accepted in (("direction", True), ("turn", False)):
+        model = ModelConfig("ionet", options={"angle": angle, "width": 4})
+        config = TrainConfig(model=model, data=DataConfig(context_seconds=1.0))
+        refused = contextlib.nullcontext()
+        if not accepted:
+            refused = pytest.raises(InputError, match=r"context_seconds.*is not for ionet")
+        with refused:
+            models.from_experiment(config)
