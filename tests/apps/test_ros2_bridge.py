@@ -48,6 +48,25 @@ def message(sec, nanosec, gyro=(0.1, 0.2, 0.3), accel=(0.0, 1.0, 9.8)):
     return SimpleNamespace(header=header, angular_velocity=turned, linear_acceleration=pulled)
 
 
+def in_body(error):
+    """The velocity in the body for an error of the attitude (left, rad) and of the velocity."""
+    return (Rotation.from_rotvec(error[:3]) * TURN).inv().apply([1.0, 2.0, 3.0] + error[3:])
+
+
+def test_an_unknown_yaw_is_no_error_of_the_velocity_ahead(bridge):
+    """A filter that has lost its yaw knows the velocity in the body as well as before."""
+    recorder, relay = Recorder(), bridge.Bridge(Recorder())
+    relay.take(message(5, 0))
+    _, pose = (recorder.push(time, np.zeros(3), np.zeros(3)) for time in (0.0, 1.0))
+    known, turned = 0.1**2 * np.eye(15), np.zeros((15, 1))
+    turned[2], turned[3:6, 0] = 1.0, np.cross([0.0, 0.0, 1.0], pose.velocity)
+    sure, lost = (
+        relay._odometry(pose._replace(covariance=covariance), np.zeros(3)).twist_covariance
+        for covariance in (known, known + turned @ turned.T)
+    )
+    np.testing.assert_allclose(lost, sure, atol=1e-12)
+
+
 def test_messages_become_odometry(bridge):
     tracker = Recorder()
     relay = bridge.Bridge(tracker)
@@ -66,8 +85,9 @@ def test_messages_become_odometry(bridge):
     np.testing.assert_array_equal(pose[3:, 3:], COVARIANCE[:3, :3])
     np.testing.assert_array_equal(pose[:3, 3:], COVARIANCE[6:9, :3])
     twist = np.reshape(odometry.twist_covariance, (6, 6))
-    world = TURN.as_matrix() @ twist[:3, :3] @ TURN.as_matrix().T
-    np.testing.assert_allclose(world, COVARIANCE[3:6, 3:6])
+    slope = np.stack([(in_body(step) - in_body(-step)) / 2e-6 for step in 1e-6 * np.eye(6)], axis=1)
+    expected = slope @ COVARIANCE[:6, :6] @ slope.T
+    np.testing.assert_allclose(twist[:3, :3], expected, rtol=1e-6, atol=1e-6)
     assert twist[3, 3] == -1
     np.testing.assert_allclose(odometry.rate, [0.09, 0.22, 0.27])
 
