@@ -13,6 +13,7 @@ from gnio_jax.filtering import Pose
 BRIDGE = Path(__file__).parents[2] / "examples" / "ros2" / "gnio_odometry" / "bridge.py"
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
 BIAS = np.array([0.01, -0.02, 0.03])
+VELOCITY = np.array([1.0, 2.0, 3.0])
 SQUARE = np.random.default_rng(0).normal(size=(15, 15))
 COVARIANCE = SQUARE @ SQUARE.T
 
@@ -37,7 +38,7 @@ class Recorder:
         self.samples.append((time, gyro, accel))
         if len(self.samples) % 2:
             return None
-        moved = np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
+        moved = VELOCITY, np.array([4.0, 5.0, 6.0])
         remaining_fields = BIAS, np.zeros(3), COVARIANCE, 1.0, 1.0, True
         return Pose(time, TURN.as_matrix(), *moved, *remaining_fields)
 
@@ -50,7 +51,7 @@ def message(sec, nanosec, gyro=(0.1, 0.2, 0.3), accel=(0.0, 1.0, 9.8)):
 
 def in_body(error):
     """The velocity in the body for an error of the attitude (left, rad) and of the velocity."""
-    return (Rotation.from_rotvec(error[:3]) * TURN).inv().apply([1.0, 2.0, 3.0] + error[3:])
+    return (Rotation.from_rotvec(error[:3]) * TURN).inv().apply(VELOCITY + error[3:])
 
 
 def test_an_unknown_yaw_is_no_error_of_the_velocity_ahead(bridge):
@@ -59,7 +60,7 @@ def test_an_unknown_yaw_is_no_error_of_the_velocity_ahead(bridge):
     relay.take(message(5, 0))
     _, pose = (recorder.push(time, np.zeros(3), np.zeros(3)) for time in (0.0, 1.0))
     known, turned = 0.1**2 * np.eye(15), np.zeros((15, 1))
-    turned[2], turned[3:6, 0] = 1.0, np.cross([0.0, 0.0, 1.0], pose.velocity)
+    turned[2], turned[3:6, 0] = 1.0, np.cross([0.0, 0.0, 1.0], VELOCITY)
     sure, lost = (
         relay._odometry(pose._replace(covariance=covariance), np.zeros(3)).twist_covariance
         for covariance in (known, known + turned @ turned.T)

@@ -133,15 +133,17 @@ def recording(name: str, stated: Stated) -> Source:
 
 
 def play(sequence: Sequence, speed: float) -> Iterator[Arrival]:
-    """The samples of a recording, `speed` times as fast as they were recorded; 0: as fast as
-    possible. Samples that are interpolated across a gap are missing."""
+    """The samples of a recording with the stamps of its own clock, `speed` times as fast as they
+    were recorded; 0: as fast as possible. Samples that are interpolated across a gap are
+    missing."""
     begin, first, measured = time.monotonic(), float(sequence.time[0]), sequence.imu_valid
+    start_time = float(sequence.attributes.get("start_time", 0.0))
     missing = np.zeros((len(sequence.time), 1), bool) if measured is None else ~measured[:, None]
     signals = (np.where(missing, np.nan, signal) for signal in (sequence.gyro, sequence.accel))
     for stamp, gyro, accel in zip(sequence.time, *signals, strict=True):
         if speed > 0:
             time.sleep(max(0.0, begin + (stamp - first) / speed - time.monotonic()))
-        sample = Sample(float(stamp), tuple(gyro.tolist()), tuple(accel.tolist()))
+        sample = Sample(start_time + float(stamp), tuple(gyro.tolist()), tuple(accel.tolist()))
         yield Arrival(time.monotonic(), sample)
 
 

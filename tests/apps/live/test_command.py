@@ -204,8 +204,8 @@ def test_a_recording_played_gives_the_track_of_it(
     gyro = np.concatenate([noise[0], gyro[50:]]) + np.array([0.03, -0.02, 0.01])
     accel = np.concatenate([accel[0] + noise[1], accel[50:]])
     walk = tmp_path / "walk.csv"
-    rows = np.column_stack([np.arange(len(gyro)) / RATE, gyro, accel])
-    rows = np.delete(rows, np.s_[150:175], axis=0)
+    stamps = 1.7e9 + np.arange(len(gyro)) / RATE  # both have those of the recording's own clock
+    rows = np.delete(np.column_stack([stamps, gyro, accel]), np.s_[150:175], axis=0)
     header = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
     np.savetxt(walk, rows, delimiter=",", header=header, comments="", fmt="%.12f")
     units = ("--gyro-unit", "rad/s")
@@ -217,6 +217,7 @@ def test_a_recording_played_gives_the_track_of_it(
     assert "lacks samples 1 times" in output and "in the quietest second" in output
     assert "warning: gaps: 1, the longest of 0.52 s" in output
     rows = np.searchsorted(tracked.time, followed.time - 1e-4)
+    assert followed.time[0] == pytest.approx(1.7e9 + 1.0, abs=1e-5)
     assert rows[0] == round(1.0 / 0.1) and (np.diff(rows[:-1]) == 1).all()
     overlap = rows < len(tracked.time)  # a track ends with the stamp of its last sample
     assert (~overlap).sum() <= 1 and overlap.sum() > 35
