@@ -75,7 +75,7 @@ class Bridge:
         order = [6, 7, 8, 0, 1, 2]
         of_pose[:] = covariance[np.ix_(order, order)]
         rotation, velocity = np.asarray(pose.rotation), np.asarray(pose.velocity)
-        # The error of Rᵀ v: an error of the yaw that turns both attitude and velocity is none of it.
+        # The error of Rᵀ v: one of the yaw, which turns attitude and velocity, is none of it.
         by_error = rotation.T @ np.hstack([np.cross(np.eye(3), velocity), np.eye(3)])
         of_twist[:3, :3] = by_error @ covariance[:6, :6] @ by_error.T
         of_twist[3:, 3:] = -np.eye(3)
