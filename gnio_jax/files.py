@@ -166,7 +166,13 @@ def with_ending(path: Path, ending: str) -> Path:
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file whole or not at all."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+        write_part(temporary, text)
+
+
+def write_part(path: Path, text: str) -> None:
+    """Write a text file of a folder that is not whole yet. A name in the text may have bytes that
+    are no text; they are written by their escapes, which JSON reads back."""
+    path.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_csv(path: str | os.PathLike[str], rows: Iterable[Iterable[object]]) -> None:
