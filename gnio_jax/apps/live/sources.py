@@ -14,9 +14,9 @@ import numpy as np
 from gnio_jax.apps.importing import read_imported
 from gnio_jax.apps.importing.loggers import REMEDIES
 from gnio_jax.apps.live.checks import Nature
-from gnio_jax.apps.live.inbox import Inbox, read_stream, receive_datagrams
+from gnio_jax.apps.live.inbox import Datagrams, Inbox, read_stream, receive_datagrams
 from gnio_jax.apps.live.phyphox import Phyphox, PhyphoxRows
-from gnio_jax.apps.live.samples import Arrival, Sample, Units, parse_lines
+from gnio_jax.apps.live.samples import Arrival, Sample, Units
 from gnio_jax.apps.live.sensor_logger import SensorLogger
 from gnio_jax.apps.live.server import PageServer, listen
 from gnio_jax.config import ImportOptions
@@ -71,7 +71,7 @@ def standard_input(_: str, stated: Stated) -> Source:
 
 
 def datagrams(name: str, stated: Stated) -> Source:
-    """The lines of the datagrams at udp:PORT, which only this machine reaches, or at
+    """The lines of the datagrams of one machine at udp:PORT, which only this machine reaches, or at
     udp:ADDRESS:PORT."""
     host, _, port = name.partition(":")[2].rpartition(":")
     if not (port.isascii() and port.isdecimal() and 0 < int(port[:6]) < 2**16):
@@ -85,7 +85,7 @@ def datagrams(name: str, stated: Stated) -> Source:
         raise InputError(name, problem, "choose another port or address") from None
     inbox = Inbox(name, "datagrams")
     receive_datagrams(receiver, inbox)
-    arrivals = inbox.arrivals(lambda message: parse_lines(message, stated.units), stated.silence)
+    arrivals = inbox.arrivals(Datagrams(stated.units).decode, stated.silence)
     return Source(arrivals, Nature(name, stated.imu_rate, stated.accel_sign), close=receiver.close)
 
 
