@@ -75,8 +75,9 @@ def live(request: LiveOptions, _call: options.Call) -> None:
     The rate is measured. When the command prints ready, keep the device still for a second: tilt,
     velocity and the gyro's bias are taken from it. Until there is a pose, it says each second what
     it waits for; then it prints the pose each second. The page shows path, 3σ ellipse and speed in
-    a browser. Ctrl-C or SIGTERM ends it (status 130, 143), and the trajectory is still written. If
-    the units or columns of a recording must be named, import it first (gnio data import).
+    a browser. Ctrl-C, SIGTERM or a terminal that is closed ends it (status 130, 143, 129), and the
+    trajectory is still written. If the units or columns of a recording must be named, import it
+    first (gnio data import).
 
     examples:
       {prog} http:0.0.0.0:8000                       Sensor Logger on a phone, and the page
@@ -125,17 +126,18 @@ def live(request: LiveOptions, _call: options.Call) -> None:
                 say(session.line(result))
                 last_shown = result.pose.time
 
-        try:  # Ctrl-C and SIGTERM end the stream alone
+        try:  # Ctrl-C, SIGTERM and SIGHUP end the stream alone
             session.follow(tracker, arrivals, nature, result, on_pose, say)
         except (KeyboardInterrupt, SystemExit) as signal_exit:
             interruption = signal_exit
+    if request.out and result.path:  # first, because the terminal may be gone
+        export(request.out, result.trajectory, "tum")
     for warning in result.warnings():
         say(f"warning: {warning}")
     if result.pose is not None:
         say(session.line(result))
-        if request.out and result.path:
-            export(request.out, result.trajectory, "tum")
-            say(f"trajectory: {request.out}")
+    if request.out and result.path:
+        say(f"trajectory: {request.out}")
     if interruption is not None:
         raise interruption
     if not result.path:

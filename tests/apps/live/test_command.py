@@ -1,6 +1,7 @@
 """`gnio live`: the trajectory of a stream is that of the tracker, and nonsense is refused."""
 
 import dataclasses
+import errno
 import importlib.util
 import io
 import signal
@@ -259,6 +260,34 @@ def test_a_signal_ends_the_stream_and_nothing_is_lost(
     # 31 whole intervals of 0.1 s; the first pose is that of the end of the rest.
     time = read_tum(out).time
     np.testing.assert_allclose(time, np.arange(10, 32) / 10, atol=1e-6)
+
+
+def test_a_terminal_that_is_closed_loses_nothing(run, recorded, monkeypatch, tmp_path):
+    """Nothing can be shown any more, and the trajectory is written nevertheless."""
+    content, out = "\n".join(as_lines(recorded)).encode(), tmp_path / "live.txt"
+    push, say, pushed = Tracker.push, console.say, []
+
+    def push_and_hang_up(*row):
+        pushed.append(row)
+        if len(pushed) == 156:
+            signal.raise_signal(signal.SIGHUP)
+        return push(*row)
+
+    def say_or_fail(text):
+        if len(pushed) >= 156:
+            raise OSError(errno.EIO, "Input/output error")
+        say(text)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    monkeypatch.setattr(Tracker, "push", push_and_hang_up)
+    monkeypatch.setattr(console, "say", say_or_fail)
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
+    try:
+        with pytest.raises(SystemExit):
+            console.run(lambda: app.main(["live", "--network", str(run), "--out", str(out)]))
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    np.testing.assert_allclose(read_tum(out).time, np.arange(10, 32) / 10, atol=1e-6)
 
 
 class Diverging:
