@@ -128,6 +128,7 @@ PROBE = b"""<script>
 setInterval(() => {
   document.body.dataset.beyond = document.documentElement.scrollWidth - innerWidth;
   const box = document.querySelector("canvas").getBoundingClientRect();
+  document.body.dataset.points = path.length;
   document.body.dataset.map = `${Math.round(box.width)} ${Math.round(box.height)}`;
 }, 50);
 </script>"""
@@ -165,17 +166,45 @@ def shown(server, width, *, height=800, picture=None):
     return text, dict(re.findall(r'data-(\w+)="([^"]*)"', body[1]))
 
 
+def probed(port):
+    """A server whose page says more of itself."""
+    server = listen(str(port), "http")
+    end = server.page.rpartition(b"</body>")
+    server.page = end[0] + PROBE + b"".join(end[1:])
+    digest = servers._hash(PROBE[len("<script>") : -len("</script>")])
+    server.policy = server.policy.replace("script-src", f"script-src {digest}")
+    return server
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not BROWSER, reason="no Chromium here (apt-get install chromium)")
+def test_a_page_that_stays_open_shows_the_next_stream_alone(port):
+    """The next one has more points than the first when the page asks again."""
+    server, walks, asked = probed(port), (walking(200), walking(400)), []
+
+    def state(first):
+        asked.append(first)
+        if len(asked) == 4:
+            server.session = "another"
+        return describe(walks[len(asked) >= 4], Nature("udp:5"), "net", True, first)
+
+    server.state = state
+    server.run()
+    try:
+        text, data = shown(server, 1500)
+    finally:
+        server.close()
+    assert asked[3] == len(walks[0].points) < len(walks[1].points) and "time 39.9 s" in text
+    assert int(data["points"]) == int(data["polled"]) == len(walks[1].points)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason="no Chromium here (apt-get install chromium)")
 @pytest.mark.parametrize(("width", "columns"), [(1500, 2), (500, 1)])
 @pytest.mark.parametrize("kind", ["waiting", "walking", "still"])
 def test_a_browser_shows_the_walk(port, width, columns, kind):
     """Under the page's own policy, which forbids scripts of others; names are text, never tags."""
-    server = listen(str(port), "http")
-    end = server.page.rpartition(b"</body>")
-    server.page = end[0] + PROBE + b"".join(end[1:])
-    digest = servers._hash(PROBE[len("<script>") : -len("</script>")])
-    server.policy = server.policy.replace("script-src", f"script-src {digest}")
+    server = probed(port)
     result = Followed() if kind == "waiting" else walking(300)
     result.waiting = "a rest (samples are missing for 0.3 s)" if kind == "waiting" else ""
     result.notices.append(f"hello {EVIL}")
