@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdlib>
 #include <fstream>
 #include <iostream>
 #include <limits>
@@ -80,15 +81,23 @@ std::vector<Sample> read(const std::string& path) {
   std::string line, cell;
   if (!std::getline(file, line)) throw std::runtime_error(path + ": cannot be read");
   std::vector<Sample> samples;
-  while (std::getline(file, line)) {
+  for (size_t row = 1; std::getline(file, line); ++row) {
+    if (line.find_first_not_of(" \t\r") == std::string::npos) continue;
     std::istringstream cells(line);
     Sample sample;
     for (double& value : sample) {
+      char* end = nullptr;
+      cell.clear();
       std::getline(cells, cell, ',');
-      value = std::stod(cell);
+      value = std::strtod(cell.c_str(), &end);
+      const bool increases = &value != &sample[0] || samples.empty() || value > samples.back()[0];
+      if (end == cell.c_str() || !std::isfinite(value) || !increases)
+        throw std::runtime_error(path + " row " + std::to_string(row) + ": seven finite numbers are "
+                                 "expected, with a time that increases, and found '" + line + "'");
     }
     samples.push_back(sample);
   }
+  if (samples.size() < 2) throw std::runtime_error(path + ": has fewer than two samples");
   return samples;
 }
 

@@ -371,7 +371,14 @@ CALL = r"""
 #define main unused
 #include "track.cpp"
 #undef main
-int main(int count, char**) {
+int main(int count, char** arguments) {
+  if (count > 2) try {
+    std::cout << read(arguments[2]).size();
+    return 0;
+  } catch (const std::exception& error) {
+    std::cout << error.what();
+    return 2;
+  }
   Tensors answer;
   answer.emplace("displacement", Ort::Value{{}, {1.0f, 2.0f, 3.0f}});
   answer.emplace("log_std", Ort::Value{{}, {-1.0f, -9.0f, -2.0f}});
@@ -382,20 +389,44 @@ int main(int count, char**) {
 """
 
 
-def test_the_example_in_c_turns_the_variances_of_a_frame(tmp_path):
-    """As `export.json` says: a network with a frame of its own has them along its axes."""
+@pytest.fixture(scope="module")
+def call(tmp_path_factory):
+    """A program that calls functions of the example in C++."""
     if not shutil.which("c++"):
         pytest.skip("needs a compiler")
-    (tmp_path / "onnxruntime_cxx_api.h").write_text(STUB)
-    (tmp_path / "call.cpp").write_text(CALL)
-    command = ["c++", "-std=c++17", "-w", f"-I{tmp_path}", f"-I{EXAMPLE}", tmp_path / "call.cpp"]
-    subprocess.run([*command, "-o", tmp_path / "call"], check=True)
+    folder = tmp_path_factory.mktemp("call")
+    (folder / "onnxruntime_cxx_api.h").write_text(STUB)
+    (folder / "call.cpp").write_text(CALL)
+    command = ["c++", "-std=c++17", "-w", f"-I{folder}", f"-I{EXAMPLE}", folder / "call.cpp"]
+    subprocess.run([*command, "-o", folder / "call"], check=True)
+    return lambda *words: subprocess.run([folder / "call", *words], capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("rows", "printed"),
+    [
+        ("0,0,0,0,0,0,9.8\r\n0.02,0,0,0,0,0,9.8\r\n\r\n", "2"),
+        ("", "{}: has fewer than two samples"),
+        ("0,0,0,0,0,0,9.8\n0.02,0,0,,0,0,9.8\n", "{} row 2: seven finite numbers are expected"),
+        ("0,0,0,0,0,0,9.8\n0.02,0,0,0,0,0\n", "{} row 2: seven finite numbers are expected"),
+        ("0,0,0,0,0,0,9.8\n0,0,0,0,0,0,9.8\n", "{} row 2: seven finite numbers are expected"),
+    ],
+    ids=["an empty line", "no sample", "no value", "a short row", "a stamp twice"],
+)
+def test_the_example_in_c_names_what_it_cannot_read(call, tmp_path, rows, printed):
+    path = tmp_path / "walk.csv"
+    path.write_bytes(f"time,gx,gy,gz,ax,ay,az\n{rows}".encode())
+    done = call("read", path)
+    assert done.stdout.startswith(printed.format(path))
+    assert done.returncode == (0 if printed == "2" else 2)
+
+
+def test_the_example_in_c_turns_the_variances_of_a_frame(call):
+    """As `export.json` says: a network with a frame of its own has them along its axes."""
     variances = np.diag(np.exp([-2.0, -6.0, -4.0]))  # that of y is raised to the least
     turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
     for words, expected in (([], variances), (["axes"], turn @ variances @ turn.T)):
-        call = [tmp_path / "call", *words]
-        printed = subprocess.run(call, check=True, capture_output=True, text=True).stdout
-        values = np.reshape([float(word) for word in printed.split()], (3, 3))
+        values = np.reshape([float(word) for word in call(*words).stdout.split()], (3, 3))
         np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-6)
 
 
