@@ -239,8 +239,10 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     remove_leftovers(parent)
 
     def create() -> tuple[str, int]:
-        name = tempfile.mkdtemp(prefix=f".{path.name}{PART}", dir=parent)
-        return name, os.open(name, os.O_RDONLY)
+        while True:
+            name = tempfile.mkdtemp(prefix=f".{path.name}{PART}", dir=parent)
+            with contextlib.suppress(FileNotFoundError):  # another process took it for a leftover
+                return name, os.open(name, os.O_RDONLY)
 
     temporary, handle = _create_locked(create)
     try:
@@ -250,14 +252,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         if is_fixed:
             _replace_contents(path, new, temporary)
             return
-        if path.exists():
-            path.rename(old)
-        try:
-            new.rename(path)
-        except OSError:
-            if old.exists():
-                old.rename(path)
-            raise
+        _take_place(path, new, old)
     except OSError as error:
         # The user does not know the temporary folder.
         if error.errno is not None:
@@ -266,6 +261,25 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         os.close(handle)
+
+
+def _take_place(path: Path, new: Path, old: Path) -> None:
+    """Rename `new` to `path`; an earlier folder there becomes `old`. On failure it is moved back. If
+    another process writes the same folder, the last one stays."""
+    while True:
+        if path.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            with contextlib.suppress(FileNotFoundError):  # another process has just moved it away
+                path.rename(old)
+        try:
+            new.rename(path)
+            return
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                continue  # that of another process, which has come meanwhile
+            if old.exists():
+                old.rename(path)
+            raise
 
 
 def _is_fixed(path: Path) -> bool:
