@@ -264,7 +264,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 
 def _take_place(path: Path, new: Path, old: Path) -> None:
-    """Rename `new` to `path`; an earlier folder there becomes `old`. On failure it is moved back. If
+    """Rename `new` to `path`, whose earlier folder becomes `old`. On failure that returns. If
     another process writes the same folder, the last one stays."""
     while True:
         if path.exists():
