@@ -13,7 +13,7 @@ import numpy as np
 
 from gnio_jax.apps.importing import read_imported
 from gnio_jax.apps.importing.loggers import REMEDIES
-from gnio_jax.apps.live.checks import Nature
+from gnio_jax.apps.live.checks import Nature, stated_rate
 from gnio_jax.apps.live.inbox import Datagrams, Inbox, read_stream, receive_datagrams
 from gnio_jax.apps.live.phyphox import Phyphox, PhyphoxRows
 from gnio_jax.apps.live.samples import Arrival, Sample, Units
@@ -66,7 +66,7 @@ def standard_input(_: str, stated: Stated) -> Source:
     if sys.stdin is None:
         remedy = "pipe samples into it, or name a source, such as udp:5555"
         raise InputError(STANDARD_INPUT, "is closed", remedy)
-    nature = Nature(STANDARD_INPUT, stated.imu_rate, stated.accel_sign)
+    nature = Nature(STANDARD_INPUT, stated.imu_rate, stated.accel_sign, gyro_unit=stated.units.gyro)
     return Source(read_stream(sys.stdin.buffer, nature.name, stated.units), nature, is_live=False)
 
 
@@ -86,7 +86,8 @@ def datagrams(name: str, stated: Stated) -> Source:
     inbox = Inbox(name, "datagrams")
     receive_datagrams(receiver, inbox)
     arrivals = inbox.arrivals(Datagrams(stated.units).decode, stated.silence)
-    return Source(arrivals, Nature(name, stated.imu_rate, stated.accel_sign), close=receiver.close)
+    nature = Nature(name, stated.imu_rate, stated.accel_sign, gyro_unit=stated.units.gyro)
+    return Source(arrivals, nature, close=receiver.close)
 
 
 def sensor_logger(name: str, stated: Stated) -> Source:
@@ -98,7 +99,11 @@ def sensor_logger(name: str, stated: Stated) -> Source:
     phone = SensorLogger(name, stated.units, stated.accel_sign)
     # What comes without a stated sign is Android's: see SensorLogger.
     nature = Nature(
-        name, stated.imu_rate, stated.accel_sign or "android", REMEDIES["Sensor Logger"]
+        name,
+        stated.imu_rate,
+        stated.accel_sign or "android",
+        REMEDIES["Sensor Logger"],
+        stated.units.gyro,
     )
     remarks = (
         f"in Sensor Logger: Settings, Data Streaming, HTTP Push, push to {server.address}data",
@@ -112,7 +117,13 @@ def sensor_logger(name: str, stated: Stated) -> Source:
 def phyphox(name: str, stated: Stated) -> Source:
     """The rows of an experiment of phyphox at phyphox:ADDRESS, by its remote access."""
     phone, inbox = Phyphox(name.partition(":")[2], name), Inbox(name)
-    nature = Nature(name, stated.imu_rate, stated.accel_sign or "android", REMEDIES["phyphox"])
+    nature = Nature(
+        name,
+        stated.imu_rate,
+        stated.accel_sign or "android",
+        REMEDIES["phyphox"],
+        stated.units.gyro,
+    )
 
     def arrivals() -> Iterator[Arrival]:
         phone.run(inbox)
@@ -127,9 +138,10 @@ def recording(name: str, stated: Stated) -> Source:
         gyro_unit=stated.gyro_unit, accel_unit=stated.accel_unit, accel_sign=stated.accel_sign
     )
     sequence, notes, warnings = read_imported(Path(name), options)
-    rate = stated.imu_rate or 1 / float(np.median(np.diff(sequence.time)))
+    nature = Nature(sequence.name, stated.imu_rate)
+    rate = stated_rate(1 / float(np.median(np.diff(sequence.time))), nature)
     arrivals = play(sequence, stated.speed)
-    return Source(arrivals, Nature(sequence.name), False, rate, (*warnings, *notes))
+    return Source(arrivals, nature, False, rate, (*warnings, *notes))
 
 
 def play(sequence: Sequence, speed: float) -> Iterator[Arrival]:

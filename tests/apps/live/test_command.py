@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -157,6 +158,7 @@ def test_a_stream_slower_than_the_network_is_followed(follow, tmp_path):
     assert len(rows) > 35 and np.abs(error).max() < 0.3
 
 
+EXAMPLE = Path(__file__).parents[3] / "examples" / "walk.csv"
 SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 9]
 """Of every 0.8 s are missing 0.2 s, and the filter bridges 0.1 s."""
 
@@ -170,6 +172,10 @@ SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 9]
         ([], ["http:0.0.0.0"], "http:0.0.0.0: names no port; write 8000"),
         ([], ["phyphox:"], "phyphox:: is not an address"),
         ([], ["--page", "x"], "--page x: names no port"),
+        (
+            *([], [EXAMPLE, "--imu-rate", "10"]),
+            "walk: its samples come at 100 Hz by their stamps; leave out --imu-rate 10",
+        ),
         ([], ["nowhere.csv", "--speed", "-1"], "--speed: must be finite and not negative"),
         ([], ["--rerun", "live.txt"], "--rerun"),
         ([], ["--out", "file/x/y.txt"], "file"),
