@@ -35,9 +35,9 @@ def test_what_an_import_has_bridged_is_missing_in_a_replay():
     measured = ~((walk.time > 3.0) & (walk.time < 3.5))
     imported = walk._replace(imu_valid=measured, attributes={"start_time": 1.7e9})
     samples = of_sequence(imported)
-    for signal, own in zip(samples[1:], (walk.gyro, walk.accel), strict=True):
+    for signal, original in zip(samples[1:], (walk.gyro, walk.accel), strict=True):
         np.testing.assert_array_equal(np.isnan(signal), np.tile(~measured[:, None], (1, 3)))
-        np.testing.assert_array_equal(signal[measured], own[measured])
+        np.testing.assert_array_equal(signal[measured], original[measured])
     np.testing.assert_allclose(samples.time - 1.7e9, walk.time, atol=1e-6)
     assert np.isfinite(of_sequence(walk).gyro).all()
 

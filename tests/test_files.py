@@ -48,18 +48,18 @@ def test_a_folder_returns_if_the_new_one_cannot_take_its_place(tmp_path, monkeyp
 
 def test_of_two_processes_that_write_one_folder_the_last_one_stays(tmp_path, monkeypatch):
     """One comes between the renames of the other, and takes its temporary folder for a leftover."""
-    rename, open_file, path, met = Path.rename, os.open, tmp_path / "track", []
+    rename, open_file, path, events = Path.rename, os.open, tmp_path / "track", []
 
     def rename_late(self, target):
-        if self.name == "new" and "rename" not in met:
-            met.append("rename")
+        if self.name == "new" and "rename" not in events:
+            events.append("rename")
             path.mkdir()
             (path / "theirs").touch()
         return rename(self, target)
 
     def open_late(name, *arguments, **options):
-        if "track.gnio-" in str(name) and "open" not in met:
-            met.append("open")
+        if "track.gnio-" in str(name) and "open" not in events:
+            events.append("open")
             os.rmdir(name)
         return open_file(name, *arguments, **options)
 
@@ -69,7 +69,7 @@ def test_of_two_processes_that_write_one_folder_the_last_one_stays(tmp_path, mon
     monkeypatch.setattr(os, "open", open_late)
     with replacing_folder(path) as folder:
         (folder / "ours").touch()
-    assert met == ["open", "rename"]
+    assert events == ["open", "rename"]
     assert [file.name for file in path.iterdir()] == ["ours"] and list(tmp_path.iterdir()) == [path]
 
 

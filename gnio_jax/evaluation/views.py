@@ -72,8 +72,8 @@ def make_view(estimate: SequenceEstimate, alignment: Alignment | None = "origin"
     none, blank = np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan)
     begin = aligned.trajectory.time[0]
     filtered = aligned.filtered or Filtered(blank, none[:, 0], none[:, 0])
-    known = finite_rows(aligned.trajectory.position)[:, None, None]
-    filtered = filtered._replace(covariance=np.where(known, filtered.covariance, np.nan))
+    finite = finite_rows(aligned.trajectory.position)[:, None, None]
+    filtered = filtered._replace(covariance=np.where(finite, filtered.covariance, np.nan))
     stamps, positions = aligned.waypoints or Waypoints(np.zeros(0), np.zeros((0, 2)))
     return View(
         aligned.name,

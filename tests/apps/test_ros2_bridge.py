@@ -59,11 +59,11 @@ def test_an_unknown_yaw_is_no_error_of_the_velocity_ahead(bridge):
     recorder, relay = Recorder(), bridge.Bridge(Recorder())
     relay.take(message(5, 0))
     _, pose = (recorder.push(time, np.zeros(3), np.zeros(3)) for time in (0.0, 1.0))
-    known, turned = 0.1**2 * np.eye(15), np.zeros((15, 1))
+    certain, turned = 0.1**2 * np.eye(15), np.zeros((15, 1))
     turned[2], turned[3:6, 0] = 1.0, np.cross([0.0, 0.0, 1.0], VELOCITY)
     sure, lost = (
         relay._odometry(pose._replace(covariance=covariance), np.zeros(3)).twist_covariance
-        for covariance in (known, known + turned @ turned.T)
+        for covariance in (certain, certain + turned @ turned.T)
     )
     np.testing.assert_allclose(lost, sure, atol=1e-12)
 

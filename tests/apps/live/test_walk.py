@@ -166,7 +166,7 @@ def shown(server, width, *, height=800, picture=None):
     return text, dict(re.findall(r'data-(\w+)="([^"]*)"', body[1]))
 
 
-def probed(port):
+def server_with_probe(port):
     """A server whose page says more of itself."""
     server = listen(str(port), "http")
     end = server.page.rpartition(b"</body>")
@@ -180,13 +180,13 @@ def probed(port):
 @pytest.mark.skipif(not BROWSER, reason="no Chromium here (apt-get install chromium)")
 def test_a_page_that_stays_open_shows_the_next_stream_alone(port):
     """The next one has more points than the first when the page asks again."""
-    server, walks, asked = probed(port), (walking(200), walking(400, -1.0)), []
+    server, walks, requests = server_with_probe(port), (walking(200), walking(400, -1.0)), []
 
     def state(first):
-        asked.append(first)
-        if len(asked) == 4:
+        requests.append(first)
+        if len(requests) == 4:
             server.session = "another"
-        return describe(walks[len(asked) >= 4], Nature("udp:5"), "net", True, first)
+        return describe(walks[len(requests) >= 4], Nature("udp:5"), "net", True, first)
 
     server.state = state
     server.run()
@@ -194,7 +194,7 @@ def test_a_page_that_stays_open_shows_the_next_stream_alone(port):
         text, data = shown(server, 1500)
     finally:
         server.close()
-    assert asked[3] == len(walks[0].points) < len(walks[1].points) and "time 39.9 s" in text
+    assert requests[3] == len(walks[0].points) < len(walks[1].points) and "time 39.9 s" in text
     np.testing.assert_allclose(json.loads(data["path"]), walks[1].points, atol=0.01)
 
 
@@ -204,7 +204,7 @@ def test_a_page_that_stays_open_shows_the_next_stream_alone(port):
 @pytest.mark.parametrize("kind", ["waiting", "walking", "still"])
 def test_a_browser_shows_the_walk(port, width, columns, kind):
     """Under the page's own policy, which forbids scripts of others; names are text, never tags."""
-    server = probed(port)
+    server = server_with_probe(port)
     result = Followed() if kind == "waiting" else walking(300)
     result.waiting = "a rest (samples are missing for 0.3 s)" if kind == "waiting" else ""
     result.notices.append(f"hello {EVIL}")
