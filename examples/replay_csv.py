@@ -18,6 +18,7 @@ import numpy as np
 
 from gnio_jax.commands import console, options
 from gnio_jax.errors import InputError
+from gnio_jax.files import check_other_file
 
 
 @dataclass(frozen=True)
@@ -202,7 +203,8 @@ def follow(request: Replay, _call: options.Call) -> None:
     """
     # The filter needs float64. The network states its float32 everywhere.
     jax.config.update("jax_enable_x64", True)
-    path = Path(request.csv)
+    path, out = Path(request.csv), Path(request.out or f"{Path(request.csv).stem}_trajectory.txt")
+    check_other_file(out, path)
     recorded = read(path)
 
     from gnio_jax import networks
@@ -225,7 +227,6 @@ def follow(request: Replay, _call: options.Call) -> None:
             "record longer, or give a smaller --rest-seconds",
         )
 
-    out = Path(request.out or f"{path.stem}_trajectory.txt")
     position = write_trajectory(out, path.stem, replayed.poses)
     summarise(replayed, recorded, position, compiled)
     if tracker.delay:

@@ -123,6 +123,12 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     _check_writable_folder(path.parent, f".{path.stem}{PART}", path.suffix)
 
 
+def check_other_file(out: str | os.PathLike[str], recording: str | os.PathLike[str]) -> None:
+    """Raise `InputError` if a result would be written over the recording that it comes from."""
+    if os.path.exists(recording) and os.path.exists(out) and os.path.samefile(out, recording):
+        raise InputError("--out", f"'{out}' is the recording", "name another file")
+
+
 def check_writable_folder(path: Path) -> None:
     """Raise `OSError` now if no folder could be written at `path` later by `replacing_folder`."""
     path = Path(os.path.realpath(path))

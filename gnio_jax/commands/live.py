@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from gnio_jax.commands import console, options
 from gnio_jax.config.schema import UNNAMED, Bound, NewFile, NonNegative, Positive
 from gnio_jax.errors import InputError
-from gnio_jax.files import check_writable
+from gnio_jax.files import check_other_file, check_writable
 
 Waiting = Annotated[
     float, Bound(lambda value: 0 <= value <= threading.TIMEOUT_MAX, "must be a time to wait, s")
@@ -96,6 +96,7 @@ def live(request: LiveOptions, _call: options.Call) -> None:
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     if request.out:
+        check_other_file(request.out, request.source)
         check_writable(request.out)  # otherwise the trajectory would be lost at the end
     if request.rerun:
         rerun.check(request.rerun)

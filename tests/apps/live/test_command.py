@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import importlib.util
 import io
+import shutil
 import signal
 import socket
 import sys
@@ -173,6 +174,11 @@ SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 9]
         ([], ["phyphox:"], "phyphox:: is not an address"),
         ([], ["--page", "x"], "--page x: names no port"),
         (
+            [],
+            ["walk.csv", "--out", "./walk.csv"],
+            "--out: 'walk.csv' is the recording; name another file",
+        ),
+        (
             *([], [EXAMPLE, "--imu-rate", "10"]),
             "walk: its samples come at 100 Hz by their stamps; leave out --imu-rate 10",
         ),
@@ -190,8 +196,10 @@ SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 9]
 def test_mistakes_are_one_line(mistake, run, monkeypatch, tmp_path, lines, arguments, problem):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
+    shutil.copy(EXAMPLE, tmp_path / "walk.csv")
     message = mistake("live", *arguments, "--network", run, lines=lines)
     assert problem in message and ("standard input" in message) == (not arguments)
+    assert (tmp_path / "walk.csv").read_bytes() == EXAMPLE.read_bytes()
 
 
 def test_a_standard_input_that_is_closed_is_one_line(run, monkeypatch, capsys):
