@@ -18,6 +18,7 @@ import numpy as np
 
 from gnio_jax.commands import console, options
 from gnio_jax.errors import InputError
+from gnio_jax.files import check_other_file
 
 
 @dataclass(frozen=True)
@@ -67,14 +68,24 @@ def read(path: Path) -> ImuSamples:
     from gnio_jax.data.validation import check_increasing
 
     if path.suffix.lower() in (".h5", ".hdf5"):
-        sequence = read_hdf5(path)
-        return ImuSamples(sequence.time, sequence.gyro, sequence.accel)
+        return of_sequence(read_hdf5(path))
     table = read_text(path)
     stamps = table.take("time")  # every sample needs one
     check_increasing(stamps, path)
     # A sensor that missed a sample leaves its columns empty.
     gyro, accel = table.axes("gyro_", gaps=True), table.axes("accel_", gaps=True)
     return ImuSamples(stamps, gyro, accel)
+
+
+def of_sequence(sequence) -> ImuSamples:
+    """The samples of a recording of the package, with the stamps of its own clock. Those that an
+    import has interpolated across a gap are missing."""
+    time = sequence.time + float(sequence.attributes.get("start_time", 0.0))
+    measured = np.ones(len(time), bool) if sequence.imu_valid is None else sequence.imu_valid
+    gyro, accel = (
+        np.where(measured[:, None], signal, np.nan) for signal in (sequence.gyro, sequence.accel)
+    )
+    return ImuSamples(time, gyro, accel)
 
 
 def create_tracker(run, recorded: ImuSamples, rest_seconds: float):
@@ -192,7 +203,8 @@ def follow(request: Replay, _call: options.Call) -> None:
     """
     # The filter needs float64. The network states its float32 everywhere.
     jax.config.update("jax_enable_x64", True)
-    path = Path(request.csv)
+    path, out = Path(request.csv), Path(request.out or f"{Path(request.csv).stem}_trajectory.txt")
+    check_other_file(out, path)
     recorded = read(path)
 
     from gnio_jax import networks
@@ -215,7 +227,6 @@ def follow(request: Replay, _call: options.Call) -> None:
             "record longer, or give a smaller --rest-seconds",
         )
 
-    out = Path(request.out or f"{path.stem}_trajectory.txt")
     position = write_trajectory(out, path.stem, replayed.poses)
     summarise(replayed, recorded, position, compiled)
     if tracker.delay:

@@ -123,6 +123,12 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     _check_writable_folder(path.parent, f".{path.stem}{PART}", path.suffix)
 
 
+def check_other_file(out: str | os.PathLike[str], recording: str | os.PathLike[str]) -> None:
+    """Raise `InputError` if a result would be written over the recording that it comes from."""
+    if os.path.exists(recording) and os.path.exists(out) and os.path.samefile(out, recording):
+        raise InputError("--out", f"'{out}' is the recording", "name another file")
+
+
 def check_writable_folder(path: Path) -> None:
     """Raise `OSError` now if no folder could be written at `path` later by `replacing_folder`."""
     path = Path(os.path.realpath(path))
@@ -166,7 +172,13 @@ def with_ending(path: Path, ending: str) -> Path:
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file whole or not at all."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+        write_part(temporary, text)
+
+
+def write_part(path: Path, text: str) -> None:
+    """Write a text file of a folder that is not whole yet. A name in the text may have bytes that
+    are no text; they are written by their escapes, which JSON reads back."""
+    path.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_csv(path: str | os.PathLike[str], rows: Iterable[Iterable[object]]) -> None:
@@ -233,8 +245,10 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     remove_leftovers(parent)
 
     def create() -> tuple[str, int]:
-        name = tempfile.mkdtemp(prefix=f".{path.name}{PART}", dir=parent)
-        return name, os.open(name, os.O_RDONLY)
+        while True:
+            name = tempfile.mkdtemp(prefix=f".{path.name}{PART}", dir=parent)
+            with contextlib.suppress(FileNotFoundError):  # another process took it for a leftover
+                return name, os.open(name, os.O_RDONLY)
 
     temporary, handle = _create_locked(create)
     try:
@@ -244,14 +258,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         if is_fixed:
             _replace_contents(path, new, temporary)
             return
-        if path.exists():
-            path.rename(old)
-        try:
-            new.rename(path)
-        except OSError:
-            if old.exists():
-                old.rename(path)
-            raise
+        _take_place(path, new, old)
     except OSError as error:
         # The user does not know the temporary folder.
         if error.errno is not None:
@@ -260,6 +267,25 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         os.close(handle)
+
+
+def _take_place(path: Path, new: Path, old: Path) -> None:
+    """Rename `new` to `path`, whose earlier folder becomes `old`. On failure that returns. If
+    another process writes the same folder, the last one stays."""
+    while True:
+        if path.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            with contextlib.suppress(FileNotFoundError):  # another process has just moved it away
+                path.rename(old)
+        try:
+            new.rename(path)
+            return
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                continue  # that of another process, which has come meanwhile
+            if old.exists():
+                old.rename(path)
+            raise
 
 
 def _is_fixed(path: Path) -> bool:

@@ -46,6 +46,33 @@ def test_a_folder_returns_if_the_new_one_cannot_take_its_place(tmp_path, monkeyp
     assert list(tmp_path.iterdir()) == [folder]
 
 
+def test_of_two_processes_that_write_one_folder_the_last_one_stays(tmp_path, monkeypatch):
+    """One comes between the renames of the other, and takes its temporary folder for a leftover."""
+    rename, open_file, path, events = Path.rename, os.open, tmp_path / "track", []
+
+    def rename_late(self, target):
+        if self.name == "new" and "rename" not in events:
+            events.append("rename")
+            path.mkdir()
+            (path / "theirs").touch()
+        return rename(self, target)
+
+    def open_late(name, *arguments, **options):
+        if "track.gnio-" in str(name) and "open" not in events:
+            events.append("open")
+            os.rmdir(name)
+        return open_file(name, *arguments, **options)
+
+    path.mkdir()
+    (path / "earlier").touch()
+    monkeypatch.setattr(Path, "rename", rename_late)
+    monkeypatch.setattr(os, "open", open_late)
+    with replacing_folder(path) as folder:
+        (folder / "ours").touch()
+    assert events == ["open", "rename"]
+    assert [file.name for file in path.iterdir()] == ["ours"] and list(tmp_path.iterdir()) == [path]
+
+
 @pytest.mark.parametrize("mounted", [False, True])
 def test_of_the_working_folder_and_of_a_mounted_one_the_contents_are_replaced(
     tmp_path, monkeypatch, mounted

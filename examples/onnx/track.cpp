@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdlib>
 #include <fstream>
 #include <iostream>
 #include <limits>
@@ -80,15 +81,23 @@ std::vector<Sample> read(const std::string& path) {
   std::string line, cell;
   if (!std::getline(file, line)) throw std::runtime_error(path + ": cannot be read");
   std::vector<Sample> samples;
-  while (std::getline(file, line)) {
+  for (size_t row = 1; std::getline(file, line); ++row) {
+    if (line.find_first_not_of(" \t\r") == std::string::npos) continue;
     std::istringstream cells(line);
     Sample sample;
     for (double& value : sample) {
+      char* end = nullptr;
+      cell.clear();
       std::getline(cells, cell, ',');
-      value = std::stod(cell);
+      value = std::strtod(cell.c_str(), &end);
+      const bool increases = &value != &sample[0] || samples.empty() || value > samples.back()[0];
+      if (end == cell.c_str() || !std::isfinite(value) || !increases)
+        throw std::runtime_error(path + " row " + std::to_string(row) + ": seven finite numbers are "
+                                 "expected, with a time that increases, and found '" + line + "'");
     }
     samples.push_back(sample);
   }
+  if (samples.size() < 2) throw std::runtime_error(path + ": has fewer than two samples");
   return samples;
 }
 
@@ -123,7 +132,8 @@ Tensors stride(const std::vector<Sample>& samples, size_t first, size_t count) {
   return found;
 }
 
-// What the filter step takes of the network's answer; without one, no measurement.
+// What the filter step takes of the network's answer; without one, no measurement. A network with a
+// frame of its own has the variances along the axes that its output `axes` (cosine, sine) names.
 Tensors measured(const Tensors* answer, double log_std_min) {
   std::vector<double> displacement(3, std::numeric_limits<double>::quiet_NaN());
   std::vector<double> covariance{1, 0, 0, 0, 1, 0, 0, 0, 1};
@@ -131,6 +141,13 @@ Tensors measured(const Tensors* answer, double log_std_min) {
     displacement[i] = answer->at("displacement").GetTensorData<float>()[i];
     const double log_std = answer->at("log_std").GetTensorData<float>()[i];
     covariance[4 * i] = std::exp(2 * std::max(log_std, log_std_min));
+  }
+  if (answer != nullptr && answer->count("axes") > 0) {
+    const float* axes = answer->at("axes").GetTensorData<float>();
+    const double c = axes[0], s = axes[1], along = covariance[0], across = covariance[4];
+    covariance[0] = c * c * along + s * s * across;
+    covariance[4] = s * s * along + c * c * across;
+    covariance[1] = covariance[3] = c * s * (along - across);
   }
   Tensors found;
   found.emplace("displacement", tensor({3}, displacement));

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,13 +26,15 @@ from jaxtyping import Float
 from gnio_jax.data.geodesy import Place, geodetic
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation.trajectory import Trajectory, write_tum
-from gnio_jax.files import replacing
+from gnio_jax.files import replacing, write_part
 from gnio_jax.numerics import rotations, turns_between
 
 SUFFIXES = {".tum": "tum", ".txt": "tum", ".csv": "csv", ".mcap": "mcap"}
 FORMATS = tuple(dict.fromkeys(SUFFIXES.values()))
 MAP_FORMATS = ("geojson", "gpx")
 """Formats of `export_map`."""
+NO_XML = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+"""Characters that no XML may have."""
 LAST_STAMP = 2.0**31
 """Largest stamp of builtin_interfaces/Time, s."""
 EPOCHS = 1.0e9, 2.2e9
@@ -111,7 +114,7 @@ def export_map(path: Path, trajectory: Trajectory, origin: Place, name: str) -> 
             "geometry": {"type": "LineString", "coordinates": line},
         }
         text = json.dumps({"type": "FeatureCollection", "features": [feature]}, indent=1)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        write_part(temporary, text + "\n")
 
 
 def _write_gpx(
@@ -119,12 +122,13 @@ def _write_gpx(
 ) -> None:
     lines = ['<?xml version="1.0" encoding="UTF-8"?>']
     lines += ['<gpx version="1.1" creator="gnio-jax" xmlns="http://www.topografix.com/GPX/1/1">']
-    lines += [f"<trk><name>{escape(name)}</name><trkseg>"]
+    shown = NO_XML.sub(lambda match: match[0].encode("unicode_escape").decode(), name)
+    lines += [f"<trk><name>{escape(shown)}</name><trkseg>"]
     for (latitude, longitude, altitude), stamp in zip(places, stamps, strict=True):
         time = f"<time>{stamp}</time>" if stamp else ""
         point = f'<trkpt lat="{latitude:.7f}" lon="{longitude:.7f}"><ele>{altitude:.2f}</ele>'
         lines += [f"{point}{time}</trkpt>"]
-    path.write_text("\n".join([*lines, "</trkseg></trk></gpx>\n"]), encoding="utf-8")
+    write_part(path, "\n".join([*lines, "</trkseg></trk></gpx>\n"]))
 
 
 def check(where: object, kind: str, time: Float[np.ndarray, "n"]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from gnio_jax import networks
 from gnio_jax.config import CalibrateConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import folder as results
-from gnio_jax.evaluation import tabulate
+from gnio_jax.evaluation import reuse, tabulate
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import FEWEST_GROUPS, summarise
 from gnio_jax.files import file_stem
@@ -35,7 +36,8 @@ def publish(
 ) -> Card:
     """Publish a network at `out`: a zip if its name ends with .zip, else a folder. It replaces an
     older one. It is written whole or not at all, and its settings do not contain folders of this
-    machine.
+    machine. Its card has the figures of the evaluations of these weights; a warning names those of
+    other weights.
 
     Args:
         network: The folder of a network, a published one, or a name.
@@ -59,7 +61,9 @@ def publish(
     if out.exists() and not (out.is_dir() and not any(out.iterdir())) and not has_card(out):
         raise InputError(out, "exists already and is no published network", "name another --out")
     trained = networks.with_corrector(networks.load(network))
-    figures = _read_figures(trained.path)
+    figures, left_out = _read_figures(trained)
+    for folder, problem in left_out.items():
+        warnings.warn(f"{folder}: not on the card: {problem}; evaluate it again", stacklevel=2)
     card = Card(
         name,
         trained.config.model.name,
@@ -87,16 +91,29 @@ def describe_error(network: TrainedNetwork) -> str:
     if network.card is not None:
         return network.card.measured
     try:
-        return _describe_error(_read_figures(network.path), network.config.datasets)
+        return _describe_error(_read_figures(network)[0], network.config.datasets)
     except InputError:
         return ""  # a damaged evaluation must not prevent tracking
 
 
-def _read_figures(path: Path | None) -> dict[str, Report]:
-    """Read every evaluation of a network, by its folder's name. Raises `InputError`."""
-    files = () if path is None else evaluations_folder(path).glob("*/metrics.json")
-    folders = sorted(file.parent for file in files)
-    return {folder.name: results.read(folder) for folder in folders}
+def _read_figures(network: TrainedNetwork) -> tuple[dict[str, Report], dict[str, str]]:
+    """Read every evaluation of the weights of a network, by its folder's name, and say for the
+    folders of other evaluations why they are left out. Raises `InputError`."""
+    figures: dict[str, Report] = {}
+    left_out: dict[str, str] = {}
+    if network.path is None:
+        return figures, left_out
+    files = evaluations_folder(network.path).glob("*/metrics.json")
+    for folder in sorted(file.parent for file in files):
+        report = results.read(folder)
+        problem = reuse.find_change(report, network.path)
+        if not problem and report.settings.get("weights") != network.digest:
+            problem = "its figures are of the latest checkpoint, not of the weights"
+        if problem:
+            left_out[str(folder)] = problem
+        else:
+            figures[folder.name] = report
+    return figures, left_out
 
 
 def _describe_error(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:

@@ -29,7 +29,7 @@ from gnio_jax.evaluation import (
     report,
 )
 from gnio_jax.evaluation.trajectory import write_tum
-from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
+from gnio_jax.files import check_writable_folder, replacing_folder, shown_name, write_part
 from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.models import Network
 from gnio_jax.networks import TrainedNetwork, load_corrector
@@ -92,6 +92,9 @@ def track(
     compared = np.isfinite(result.reference.position).any() or result.waypoints is not None
     errors = metrics.score([result])[result.name].values if compared else {}
     summary = summarise(result, errors, ready, recording, source, ekf, uses, origin)
+    unplaced = [kind for kind in formats if kind in export.MAP_FORMATS and origin is None]
+    unwritten = (f"{kind}: not written: no fixes place the path on the map" for kind in unplaced)
+    summary = summary._replace(warnings=(*summary.warnings, *unwritten))
     with replacing_folder(out) as folder:
         _write_figures(folder, result, summary, formats)
         _draw(folder, result, summary, config, command)
@@ -168,7 +171,7 @@ def _write_figures(
     for name in absent:
         del plain[name]
     text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False)
-    (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+    write_part(folder / "summary.json", text + "\n")
     path, reference = (
         trajectory._replace(time=trajectory.time + summary.start_time)
         for trajectory in (result.trajectory, result.reference)

@@ -40,10 +40,13 @@ def run(main: Callable[[], object]) -> None:
     A user's mistake (`InputError`), a full disk or a folder that may not be written is one line on
     stderr and status 2, and so is a variable of JAX that cannot be followed; Ctrl-C gives status
     130. SIGTERM ends the program like an exception, so that no incomplete file remains, and gives
-    status 143. A warning is one line on stderr. Any other exception is an error of the program and
-    keeps its traceback.
+    status 143. So does SIGHUP, of a terminal that is closed, with status 129, unless nohup has
+    switched it off. A warning is one line on stderr. Any other exception is an error of the program
+    and keeps its traceback.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, _terminate)
     # Pictures are files. The backend of a notebook, which its commands inherit, may be missing.
     os.environ["MPLBACKEND"] = "agg"
     for name in ("stdout", "stderr"):

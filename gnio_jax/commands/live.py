@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from gnio_jax.commands import console, options
 from gnio_jax.config.schema import UNNAMED, Bound, NewFile, NonNegative, Positive
 from gnio_jax.errors import InputError
-from gnio_jax.files import check_writable
+from gnio_jax.files import check_other_file, check_writable
 
 Waiting = Annotated[
     float, Bound(lambda value: 0 <= value <= threading.TIMEOUT_MAX, "must be a time to wait, s")
@@ -75,8 +75,9 @@ def live(request: LiveOptions, _call: options.Call) -> None:
     The rate is measured. When the command prints ready, keep the device still for a second: tilt,
     velocity and the gyro's bias are taken from it. Until there is a pose, it says each second what
     it waits for; then it prints the pose each second. The page shows path, 3σ ellipse and speed in
-    a browser. Ctrl-C or SIGTERM ends it (status 130, 143), and the trajectory is still written. If
-    the units or columns of a recording must be named, import it first (gnio data import).
+    a browser. Ctrl-C, SIGTERM or a terminal that is closed ends it (status 130, 143, 129), and the
+    trajectory is still written. If the units or columns of a recording must be named, import it
+    first (gnio data import).
 
     examples:
       {prog} http:0.0.0.0:8000                       Sensor Logger on a phone, and the page
@@ -95,6 +96,7 @@ def live(request: LiveOptions, _call: options.Call) -> None:
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     if request.out:
+        check_other_file(request.out, request.source)
         check_writable(request.out)  # otherwise the trajectory would be lost at the end
     if request.rerun:
         rerun.check(request.rerun)
@@ -125,17 +127,18 @@ def live(request: LiveOptions, _call: options.Call) -> None:
                 say(session.line(result))
                 last_shown = result.pose.time
 
-        try:  # Ctrl-C and SIGTERM end the stream alone
+        try:  # Ctrl-C, SIGTERM and SIGHUP end the stream alone
             session.follow(tracker, arrivals, nature, result, on_pose, say)
         except (KeyboardInterrupt, SystemExit) as signal_exit:
             interruption = signal_exit
+    if request.out and result.path:  # first, because the terminal may be gone
+        export(request.out, result.trajectory, "tum")
     for warning in result.warnings():
         say(f"warning: {warning}")
     if result.pose is not None:
         say(session.line(result))
-        if request.out and result.path:
-            export(request.out, result.trajectory, "tum")
-            say(f"trajectory: {request.out}")
+    if request.out and result.path:
+        say(f"trajectory: {request.out}")
     if interruption is not None:
         raise interruption
     if not result.path:

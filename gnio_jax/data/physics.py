@@ -44,7 +44,7 @@ NEAR_CLOCKS, CLEARLY = (0.2, 0.4, 0.5, 2.0, 2.5, 5.0), 0.7
 SCALES = {"deg/s": DEGREE, "rad/s": 1 / DEGREE}
 """Units for which another one may have been taken, relative to it."""
 COUNTS_OF_DEGREE = (131.0, 65.5, 32.8, 16.4)
-"""Raw counts of usual 16-bit gyros in 1 deg/s, which may have been read as deg/s."""
+"""Raw counts of usual 16-bit gyros in 1 deg/s, which may have been read as deg/s, or as rad/s."""
 LONGEST_HOLD, MOST_HELD, HELD_SHARE, FINE_SHARE = 0.2, 10, 0.3, 0.5
 """A sensor hangs if it repeats its values for this time, s, in so many rows; it is slower than its
 rows if this share repeats; rows may only be called repeated if all axes change in the last share of
@@ -102,9 +102,10 @@ def is_clock_supported(imu: ImuSamples) -> bool:
     return is_supported(error, contrast) and min(others) > CLEARLY * error
 
 
-def contradiction(imu: ImuSamples) -> tuple[float, str, str] | None:
+def contradiction(imu: ImuSamples, read_as: str | None = None) -> tuple[float, str, str] | None:
     """The axes, sign, unit or clock by which the gyro explains the turning of gravity best, if it
-    leaves an error smaller by `DOUBT`: (factor, problem, remedy)."""
+    leaves an error smaller by `DOUBT`: (factor, problem, remedy). `read_as` is the unit as which
+    the gyro was read, rad/s or deg/s; None: any other."""
     (error, contrast), span = agreement(imu), float(np.ptp(imu.time))
     is_clear = error < CLEAR_ERROR and contrast > CLEAR_CONTRAST
     if is_clear or not np.isfinite(error) or span < SHORTEST:
@@ -115,8 +116,12 @@ def contradiction(imu: ImuSamples) -> tuple[float, str, str] | None:
         problem = f"by the turning of gravity its samples come {factor:g} times {word} than its"
         remedy = "the clock is wrong: give --time-unit (s per stamp) or --sample-rate (Hz)"
         readings.append((*agreement(imu, clock=clock), f"{problem} stamps say", remedy))
-    looks = {unit: (unit, scale) for unit, scale in SCALES.items()}
-    looks |= {f"raw counts, {n:g} in 1 deg/s,": (f"{n:g}/deg/s", 1 / n) for n in COUNTS_OF_DEGREE}
+    looks = {unit: (unit, scale) for unit, scale in SCALES.items() if unit != read_as}
+    # One count in 65.5 is almost 1 deg/s, so it matters as what they were read.
+    degree = DEGREE if read_as == "rad/s" else 1.0
+    looks |= {
+        f"raw counts, {n:g} in 1 deg/s,": (f"{n:g}/deg/s", degree / n) for n in COUNTS_OF_DEGREE
+    }
     for words, (unit, scale) in looks.items():
         problem = f"its gyro looks like {words} by the turning of gravity, and not as it was read"
         remedy = f"state the unit of the gyro, as by --gyro-unit {unit}"
@@ -135,10 +140,16 @@ def contradiction(imu: ImuSamples) -> tuple[float, str, str] | None:
     return max(factors, default=None)
 
 
-def check_turning(imu: ImuSamples, source: object, adapt: Callable[[str], str] = str) -> list[str]:
+def check_turning(
+    imu: ImuSamples,
+    source: object,
+    adapt: Callable[[str], str] = str,
+    read_as: str | None = None,
+) -> list[str]:
     """Warnings about a gyro that gravity may contradict. Raises `InputError` where it certainly
-    does. `imu` is in SI units; `adapt` gives the remedy that the format of the recording allows."""
-    factor, problem, remedy = contradiction(imu) or (0.0, "", "")
+    does. `imu` is in SI units; `adapt` gives the remedy that the format of the recording allows;
+    `read_as` as in `contradiction`."""
+    factor, problem, remedy = contradiction(imu, read_as) or (0.0, "", "")
     remedy = adapt(remedy)
     if factor > PROOF and np.ptp(imu.time) >= SHORT:
         raise InputError(source, problem, remedy)

@@ -34,7 +34,7 @@ from gnio_jax.evaluation.trajectory import (
     write_waypoints,
 )
 from gnio_jax.evaluation.views import View, make_view
-from gnio_jax.files import file_stems, replacing_folder, write_csv
+from gnio_jax.files import file_stems, replacing_folder, write_csv, write_part
 from gnio_jax.reporting import Progress, silent
 
 PAGE = "report.html"
@@ -64,7 +64,7 @@ def write(
     with_pictures = plots or (folder / PAGE).exists()
     with replacing_folder(folder) as new:
         text = json.dumps(as_json(report), indent=2, allow_nan=False, ensure_ascii=False)
-        (new / "metrics.json").write_text(text + "\n", encoding="utf-8")
+        write_part(new / "metrics.json", text + "\n")
         values = {name: measures.values for name, measures in report.scores.items()}
         columns = list(dict.fromkeys(metric for row in values.values() for metric in row))
         rows = ([name, *map(row.get, columns)] for name, row in values.items())

@@ -25,7 +25,9 @@ function move() {
     data[name] = values(name);
   }
   marks.data = data;
-  const parts = [`${data.time[0].toFixed(1)} s`, `x ${data.x[0].toFixed(1)} m, y ${data.y[0].toFixed(1)} m`];
+  const place = Number.isFinite(data.x[0])
+    ? `x ${data.x[0].toFixed(1)} m, y ${data.y[0].toFixed(1)} m` : "no position";
+  const parts = [`${data.time[0].toFixed(1)} s`, place];
   const error = values("error")[0];
   if (Number.isFinite(error)) parts.push(`error ${error.toFixed(2)} m`);
   if (Number.isFinite(data.width[0])) {
@@ -67,7 +69,7 @@ function choose() {
   };
   corners.data = frames[Number(sequence.value)][Number(whole.checked)];
   slider.max = end;
-  slider.step = end / Math.max(last, 1);
+  slider.step = (end / Math.max(last, 1)) * (1 - 1e-9);  // rounding must not make the end no step
   slider.value = end;
   times.setv({start: 0, end: end});
   rows.forEach((row) => row.classList.toggle("chosen", row.dataset.sequence === sequence.value));

@@ -65,11 +65,15 @@ class View(NamedTuple):
 
 def make_view(estimate: SequenceEstimate, alignment: Alignment | None = "origin") -> View:
     """An estimate in the frame of its reference; without an `alignment` the reference is moved to
-    the start of the estimate."""
+    the start of the estimate. Where the estimate has diverged, its covariance is not known
+    either."""
     aligned = in_one_frame(estimate, alignment)
     rows = len(aligned.trajectory.time)
     none, blank = np.full((rows, 3), np.nan), np.full((rows, 3, 3), np.nan)
     begin = aligned.trajectory.time[0]
+    filtered = aligned.filtered or Filtered(blank, none[:, 0], none[:, 0])
+    finite = finite_rows(aligned.trajectory.position)[:, None, None]
+    filtered = filtered._replace(covariance=np.where(finite, filtered.covariance, np.nan))
     stamps, positions = aligned.waypoints or Waypoints(np.zeros(0), np.zeros((0, 2)))
     return View(
         aligned.name,
@@ -77,7 +81,7 @@ def make_view(estimate: SequenceEstimate, alignment: Alignment | None = "origin"
         aligned.trajectory.position,
         aligned.reference.position,
         aligned.displacements or Displacements(none, blank),
-        aligned.filtered or Filtered(blank, none[:, 0], none[:, 0]),
+        filtered,
         Waypoints(stamps - begin, positions),
         positions_at(aligned.trajectory, stamps),
     )

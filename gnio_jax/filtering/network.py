@@ -123,7 +123,7 @@ def memory_step(predict: PredictWithMemory, ekf: Filter) -> MemoryStep:
             lambda leaf: jnp.where(whole, leaf, jnp.nan),
             (prediction.displacement, prediction.diagnostics),
         )
-        prediction = Prediction(displacement, prediction.log_std, diagnostics)
+        prediction = prediction._replace(displacement=displacement, diagnostics=diagnostics)
         return memory, Recall(prediction, memory.heading)
 
     return advance

@@ -126,10 +126,10 @@ def test_a_map_has_the_name_of_the_recording_and_longitudes_within_180_degrees(t
     longitude[longitude > 180.0] -= 360.0
     origin = Place(0.0, 179.9995, 0.0)
     for kind in ("gpx", "geojson"):
-        export_map(tmp_path / f"trajectory.{kind}", ferry, origin, "ferry & walk")
+        export_map(tmp_path / f"trajectory.{kind}", ferry, origin, "ferry & \udcff\x01walk")
     space = "{http://www.topografix.com/GPX/1/1}"
     track = ElementTree.parse(tmp_path / "trajectory.gpx").getroot()
-    assert track.findtext(f"{space}trk/{space}name") == "ferry & walk"
+    assert track.findtext(f"{space}trk/{space}name") == r"ferry & \udcff\x01walk"
     points = [float(point.get("lon")) for point in track.iter(f"{space}trkpt")]
     np.testing.assert_allclose(points, longitude, atol=1e-6)
     content = json.loads((tmp_path / "trajectory.geojson").read_text())

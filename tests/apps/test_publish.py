@@ -43,7 +43,8 @@ def run(tmp_path_factory):
         evaluation.mkdir(parents=True)
         groups = {"a": "ann", "b": "bob", "c": "ann", "d": "bob"}
         carried = {"a": "in a pocket", "b": "in a hand", "c": "in a hand", "d": "in a hand"}
-        figures = report.Report(SETTINGS, SCORES, {}, groups, {}, {}, carried)
+        settings = SETTINGS | {"weights": read_network(folder).digest}
+        figures = report.Report(settings, SCORES, {}, groups, {}, {}, carried)
         (evaluation / "metrics.json").write_text(json.dumps(report.as_json(figures)))
         yield folder
 
@@ -75,7 +76,8 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published, run,
     copy = shutil.copytree(run, tmp_path / "walk_calibrated")
     legs = [{"leg_ratio": ratio, "waypoint_rms": 2.0} for ratio in (0.75, 0.85, 0.75, 0.85)]
     scores = {name: Measures(leg, {}, False) for name, leg in zip("abcd", legs, strict=True)}
-    figures = report.Report(SETTINGS, scores, {}, {name: name for name in scores}, {}, {})
+    settings = SETTINGS | {"weights": read_network(run).digest}
+    figures = report.Report(settings, scores, {}, {name: name for name in scores}, {}, {})
     write_report(copy / "eval" / "mall_test_ekf", figures)
     for calibrated, shown in (("runs/half", "half"), ("walk", "walk"), ("other/run", "run")):
         (copy / "calibration.json").write_text(json.dumps({"run": calibrated, "split": "val"}))
@@ -133,7 +135,8 @@ def test_the_data_of_a_network_in_words(published, run, tmp_path):
 def test_a_published_network_is_published_again(published, monkeypatch, tmp_path):
     """With the figures of its own evaluations."""
     monkeypatch.chdir(tmp_path)
-    figures = report.Report(SETTINGS, SCORES, {}, dict.fromkeys("abcd", "ann"), {}, {})
+    settings = SETTINGS | {"weights": read_network(published / "walk").digest}
+    figures = report.Report(settings, SCORES, {}, dict.fromkeys("abcd", "ann"), {}, {})
     write_report(tmp_path / "evaluations" / "walk" / "tyrex_test_ekf", figures)
     card = publish(published / "walk", tmp_path / "again.zip", "again", *SAID)
     measured = "typical error 1.25 m (1 group) on walks of 60 s (tyrex_test_ekf)"
@@ -141,6 +144,32 @@ def test_a_published_network_is_published_again(published, monkeypatch, tmp_path
     assert "It is the published network `walk`, whose card has" in read_text(tmp_path / "again.zip")
     first, second = map(read_network, (published / "walk", tmp_path / "again.zip"))
     assert first.config == second.config and first.digest == second.digest
+
+
+def test_figures_of_other_weights_are_not_on_the_card(run, tmp_path):
+    """Such as those of a run that was trained on, of its latest checkpoint, and of another package
+    of the same name."""
+    copy = shutil.copytree(run, tmp_path / "walk")
+    network = read_network(copy)
+    digests = {"before": "0" * 64, "latest": None}
+    for folder, digest in digests.items():
+        settings = SETTINGS | {"weights": digest, "checkpoint": "best", "step": network.step}
+        settings |= {"checkpoint": "latest"} if digest is None else {}
+        figures = report.Report(settings, SCORES, {}, dict.fromkeys("abcd", "ann"), {}, {})
+        write_report(copy / "eval" / folder, figures)
+    (copy / "checkpoints" / "latest" / str(network.step)).mkdir(parents=True)
+    with pytest.warns(UserWarning) as warned:
+        card = publish(copy, tmp_path / "package", "walk", *SAID)
+    assert card.measured == MEASURED == describe_error(network)
+    text = read_text(tmp_path / "package")
+    assert "| synthetic_test_ekf |" in text and "before" not in text and "latest" not in text
+    texts = [str(warning.message) for warning in warned]
+    assert len(texts) == 2 and all("evaluate it again" in line for line in texts)
+    assert f"{copy / 'eval' / 'before'}: not on the card: its figures are of weights" in texts[0]
+    assert "of the latest checkpoint" in texts[1]
+    # If there are no others, it was not measured.
+    shutil.rmtree(copy / "eval" / "synthetic_test_ekf")
+    assert describe_error(read_network(copy)) == ""
 
 
 def test_the_command(run, tmp_path, gnio, mistake):

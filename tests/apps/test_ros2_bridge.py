@@ -13,6 +13,7 @@ from gnio_jax.filtering import Pose
 BRIDGE = Path(__file__).parents[2] / "examples" / "ros2" / "gnio_odometry" / "bridge.py"
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
 BIAS = np.array([0.01, -0.02, 0.03])
+VELOCITY = np.array([1.0, 2.0, 3.0])
 SQUARE = np.random.default_rng(0).normal(size=(15, 15))
 COVARIANCE = SQUARE @ SQUARE.T
 
@@ -37,7 +38,7 @@ class Recorder:
         self.samples.append((time, gyro, accel))
         if len(self.samples) % 2:
             return None
-        moved = np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
+        moved = VELOCITY, np.array([4.0, 5.0, 6.0])
         remaining_fields = BIAS, np.zeros(3), COVARIANCE, 1.0, 1.0, True
         return Pose(time, TURN.as_matrix(), *moved, *remaining_fields)
 
@@ -46,6 +47,25 @@ def message(sec, nanosec, gyro=(0.1, 0.2, 0.3), accel=(0.0, 1.0, 9.8)):
     turned, pulled = (SimpleNamespace(**dict(zip("xyz", x, strict=True))) for x in (gyro, accel))
     header = SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec))
     return SimpleNamespace(header=header, angular_velocity=turned, linear_acceleration=pulled)
+
+
+def in_body(error):
+    """The velocity in the body for an error of the attitude (left, rad) and of the velocity."""
+    return (Rotation.from_rotvec(error[:3]) * TURN).inv().apply(VELOCITY + error[3:])
+
+
+def test_an_unknown_yaw_is_no_error_of_the_velocity_ahead(bridge):
+    """A filter that has lost its yaw knows the velocity in the body as well as before."""
+    recorder, relay = Recorder(), bridge.Bridge(Recorder())
+    relay.take(message(5, 0))
+    _, pose = (recorder.push(time, np.zeros(3), np.zeros(3)) for time in (0.0, 1.0))
+    certain, turned = 0.1**2 * np.eye(15), np.zeros((15, 1))
+    turned[2], turned[3:6, 0] = 1.0, np.cross([0.0, 0.0, 1.0], VELOCITY)
+    sure, lost = (
+        relay._odometry(pose._replace(covariance=covariance), np.zeros(3)).twist_covariance
+        for covariance in (certain, certain + turned @ turned.T)
+    )
+    np.testing.assert_allclose(lost, sure, atol=1e-12)
 
 
 def test_messages_become_odometry(bridge):
@@ -66,8 +86,9 @@ def test_messages_become_odometry(bridge):
     np.testing.assert_array_equal(pose[3:, 3:], COVARIANCE[:3, :3])
     np.testing.assert_array_equal(pose[:3, 3:], COVARIANCE[6:9, :3])
     twist = np.reshape(odometry.twist_covariance, (6, 6))
-    world = TURN.as_matrix() @ twist[:3, :3] @ TURN.as_matrix().T
-    np.testing.assert_allclose(world, COVARIANCE[3:6, 3:6])
+    slope = np.stack([(in_body(step) - in_body(-step)) / 2e-6 for step in 1e-6 * np.eye(6)], axis=1)
+    expected = slope @ COVARIANCE[:6, :6] @ slope.T
+    np.testing.assert_allclose(twist[:3, :3], expected, rtol=1e-6, atol=1e-6)
     assert twist[3, 3] == -1
     np.testing.assert_allclose(odometry.rate, [0.09, 0.22, 0.27])
 

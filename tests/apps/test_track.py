@@ -171,6 +171,17 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, undrawn, runs, tmp_
     assert f"warning: {rate}" in gnio("track", tmp_path / "fast.h5", "--out", tmp_path / "fast")
 
 
+def test_the_name_of_a_file_may_have_bytes_that_are_no_text(gnio, undrawn, runs, tmp_path):
+    """As an archive of another system unpacks them: it is tracked, and imported."""
+    walk = csv(tmp_path / "walk\udcff.csv", np.delete(np.arange(600), np.s_[200:270]) / 100)
+    weights = ("--network", runs / "walker")
+    gnio("track", walk, *weights, "--out", tmp_path / "track")
+    assert summary_of(tmp_path / "track")["recording"] == "walk\udcff"
+    gnio("data", "import", walk, "--out", tmp_path / "walk.h5")
+    again = gnio("track", tmp_path / "walk.h5", *weights, "--out", tmp_path / "again")
+    assert r"walk\udcff.csv: accel taken as m/s2" in again
+
+
 def test_what_is_refused(mistake, runs, tmp_path, monkeypatch):
     """Also what cannot be written, stamps that ROS cannot hold among it: before the work."""
     monkeypatch.setattr("gnio_jax.apps.track.prepare", lambda *_, **__: pytest.fail("too late"))

@@ -115,6 +115,19 @@ def test_field_pressure_and_fixes_mend_heading_height_and_place(runs, tmp_path):
     assert points[-1].find(f"{space}time").text.startswith("2023-11-14T22:1")
 
 
+def test_a_map_that_is_not_written_is_said(runs, tmp_path):
+    """The receiver shows fixes, but three of them place no path."""
+    walk = phone_walk.walk(seconds=60.0)
+    gnss = walk.readings["gnss"]
+    few = gnss._replace(**{name: part[:3] for name, part in gnss._asdict().items()})
+    result = tracked(runs, tmp_path, walk._replace(readings={"gnss": few}), formats=("gpx", "csv"))
+    assert sorted(path.suffix for path in (tmp_path / "track").glob("trajectory.*")) == [
+        *(".csv", ".txt")
+    ]
+    assert "gpx: not written: no fixes place the path on the map" in result.summary.warnings
+    assert not any(line.startswith("csv: ") for line in result.summary.warnings)
+
+
 def test_a_barometer_is_heard_beside_a_network_that_is_sure_of_level_ground(runs, tmp_path):
     """Up a hill of 6 m and down again, by displacements that are level to a centimetre."""
     walk = phone_walk.walk()

@@ -22,13 +22,14 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(autouse=True)
 def handlers(monkeypatch):
-    """The signal's handler as it was, and the caches' places."""
-    before = signal.getsignal(signal.SIGTERM)
+    """The signals' handlers as they were, and the caches' places."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
         monkeypatch.setenv(name, os.environ.get(name, "0"))
     monkeypatch.setenv("MPLBACKEND", "agg")
     yield
-    signal.signal(signal.SIGTERM, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def interrupted():
@@ -46,6 +47,7 @@ def mistaken():
         (interrupted, 130, "interrupted\n"),
         (lambda: open("/dev/null/x", "w"), 2, "/dev/null/x: Not a directory\n"),
         (lambda: os.kill(os.getpid(), signal.SIGTERM), 143, ""),
+        (lambda: os.kill(os.getpid(), signal.SIGHUP), 129, ""),
         (lambda: warnings.warn("two\nlines", stacklevel=1), None, "warning: two lines\n"),
     ],
 )
@@ -59,6 +61,11 @@ def test_run_ends_in_one_line_and_a_status(main, status, line, capsys):
             console.run(main)
         assert end.value.code == status
     assert capsys.readouterr() == ("", line)
+
+
+def test_nohup_keeps_a_command_alive():
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    console.run(lambda: os.kill(os.getpid(), signal.SIGHUP))
 
 
 def test_variables_of_jax_and_matplotlib_do_not_end_in_a_traceback(monkeypatch, capsys):

@@ -58,6 +58,26 @@ def test_a_report_is_read_back_as_it_was_written(tmp_path, estimates, made_repor
     assert references == trajectories[1:]
 
 
+def test_a_name_may_have_bytes_that_are_no_text(tmp_path, estimates, made_report):
+    """As a file whose name another system has written."""
+    names = {estimate.name: f"{estimate.name}\udcff" for estimate in estimates}
+    odd = [estimate._replace(name=names[estimate.name]) for estimate in estimates]
+    fields = ("scores", "groups", "notes", "placements")
+    named = {
+        field: {names[name]: value for name, value in getattr(made_report, field).items()}
+        for field in fields
+    }
+    rows = {
+        row: {names[name]: measures for name, measures in scores.items()}
+        for row, scores in made_report.reference_rows.items()
+    }
+    recordings = {names[name]: 60.0 for name in made_report.scores}
+    settings = made_report.settings | {"recordings": recordings}
+    report = made_report._replace(**named, reference_rows=rows, settings=settings)
+    write(tmp_path / "odd", report, odd)
+    assert evaluation.load(tmp_path / "odd") == report
+
+
 def test_the_states_hold_all_results_of_the_estimator(tmp_path, estimates):
     walk, summed = estimates[0], estimates[1]._replace(filtered=None, states=None)
     write(tmp_path, reported([walk, summed]), [walk, summed])

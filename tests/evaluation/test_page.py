@@ -204,3 +204,18 @@ def test_a_browser_shows_the_page(written, walks, tmp_path, width):
     assert readings["first"].startswith(expected)
     assert f"3σ {shapes.major[120]:.2f} × {shapes.minor[120]:.2f} m" in readings["first"]
     assert readings["second"].startswith("20.0 s") and readings["second"] != readings["first"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not BROWSER, reason="no Chromium here (apt-get install chromium)")
+def test_a_browser_shows_no_place_of_an_estimate_that_has_diverged(walks, tmp_path):
+    walk, lost = walks[0], np.arange(len(walks[0].trajectory.time)) >= 200
+    path = walk.trajectory
+    blank = (np.where(lost[:, None], np.nan, part) for part in (path.position, path.orientation))
+    run = run_of([walk._replace(trajectory=Trajectory(path.time, *blank))])
+    page.write(tmp_path / "report.html", "lost", [run])
+    options = "--headless --no-sandbox --disable-gpu --virtual-time-budget=30000 --dump-dom".split()
+    command = [BROWSER, *options, (tmp_path / "report.html").as_uri()]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
+    readout = re.search(r'<span id="readout">(.*?)</span>', shown)[1]
+    assert readout == f"{path.time[-1] - path.time[0]:.1f} s  ·  no position"

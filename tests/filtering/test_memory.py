@@ -101,6 +101,32 @@ def test_it_measures_in_the_yaw_frame_of_the_oldest_clone():
     assert np.isnan(history.displacement[:W]).all()
 
 
+def test_the_variances_of_a_network_of_ones_own_may_be_along_other_axes():
+    """As those of a network on windows: all axes turn about z, so the covariance does, too. Nothing
+    is corrected."""
+    turn = Rotation.from_euler("z", 0.7).as_matrix()
+
+    class AlongAxes:
+        begin = network().predict().begin
+
+        @staticmethod
+        def step(*arguments):
+            memory, prediction = network().predict().step(*arguments)
+            return memory, prediction._replace(axes=jnp.asarray(turn[:2, 0], jnp.float32))
+
+    config = dataclasses.replace(CONFIG, gate_threshold=1e-9, convergence_seconds=0.0)
+    ekf = filtering.Filter(dataclasses.replace(config, success_seconds=1e3))
+    _, plain = program(ekf)(start(), *recording())
+    _, along = quick(functools.partial(filtering.run_odometry, AlongAxes(), ekf))(
+        start(), *recording()
+    )
+    rows = plain.measurement_covariance[W + 1 :]
+    assert np.abs(rows[:, 0, 0] / rows[:, 1, 1] - 1).max() > 0.01
+    np.testing.assert_allclose(
+        along.measurement_covariance[W + 1 :], turn @ np.array(rows) @ turn.T, rtol=1e-5, atol=1e-9
+    )
+
+
 @pytest.mark.parametrize("equivariance", ["none", "device_heading"])
 def test_a_turned_world_turns_all_that_comes_of_it(equivariance):
     _, history = run(equivariance)

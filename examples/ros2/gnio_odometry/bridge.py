@@ -74,14 +74,16 @@ class Bridge:
         # The filter's error is (θ, v, p, ...), θ in the world frame.
         order = [6, 7, 8, 0, 1, 2]
         of_pose[:] = covariance[np.ix_(order, order)]
-        rotation = np.asarray(pose.rotation)
-        of_twist[:3, :3] = rotation.T @ covariance[3:6, 3:6] @ rotation
+        rotation, velocity = np.asarray(pose.rotation), np.asarray(pose.velocity)
+        # The error of Rᵀ v: one of the yaw, which turns attitude and velocity, is none of it.
+        by_error = rotation.T @ np.hstack([np.cross(np.eye(3), velocity), np.eye(3)])
+        of_twist[:3, :3] = by_error @ covariance[:6, :6] @ by_error.T
         of_twist[3:, 3:] = -np.eye(3)
         return Odometry(
             (sec, nanosec),
             tuple(np.asarray(pose.position).tolist()),
             tuple(Rotation.from_matrix(rotation).as_quat().tolist()),
-            tuple((rotation.T @ np.asarray(pose.velocity)).tolist()),
+            tuple((rotation.T @ velocity).tolist()),
             tuple((gyro - np.asarray(pose.gyro_bias)).tolist()),
             of_pose.ravel().tolist(),
             of_twist.ravel().tolist(),

@@ -139,10 +139,12 @@ def _euroc(path: Path) -> RawRecording:
 
 
 def write_imported(path: str | os.PathLike[str], recording: Imported) -> None:
-    """Write the sequence as `write_hdf5` does, with its notes and warnings."""
+    """Write the sequence as `write_hdf5` does, with its notes and warnings, in which a file's name
+    may have bytes that are no text."""
     sequence = recording.sequence
     lines = {_NOTES: recording.notes, _WARNINGS: recording.warnings}
     texts = {n: "\n".join(" ".join(line.split()) for line in ls) for n, ls in lines.items() if ls}
+    texts = {n: text.encode("utf-8", "backslashreplace").decode() for n, text in texts.items()}
     write_hdf5(path, sequence._replace(attributes=sequence.attributes | texts))
 
 

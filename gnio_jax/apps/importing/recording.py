@@ -170,11 +170,9 @@ def _in_si(
     unit = options.gyro_unit or raw.gyro.unit
     scale, slowness = units.gyro_scale(imu, unit, gyro.file, notes)
     imu = imu._replace(gyro=imu.gyro * scale)
-    warnings += (
-        doubts
-        + slowness
-        + physics.check_turning(imu, gyro.file, str if raw.by_columns else _without_columns)
-    )
+    adapt = str if raw.by_columns else _without_columns
+    read_as = next((name for name in physics.SCALES if units.UNITS["gyro"][name] == scale), None)
+    warnings += doubts + slowness + physics.check_turning(imu, gyro.file, adapt, read_as)
     if (gyro.is_doubtful or accel.is_doubtful) and not physics.is_clock_supported(imu):
         problem = f"field 'time' makes it run at {rounded_rate(imu.time):g} Hz, which may be wrong"
         remedy = "if that is right, state its unit by --time-unit, or give --sample-rate (Hz)"

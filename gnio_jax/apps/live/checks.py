@@ -55,6 +55,8 @@ class Nature(NamedTuple):
     assumed."""
     needs: str = "send the gyro (gyro) and the accelerometer (accel)"
     """What to do if one sensor does not come."""
+    gyro_unit: str = "rad/s"
+    """Unit as which the gyro was read."""
 
 
 def with_measured_rate(
@@ -92,7 +94,7 @@ def with_measured_rate(
         sign = _sign_of(np.array([sample.accel for sample in whole]), nature, notices)
     for notice in notices:
         yield Arrival(held[-1].clock, notice=notice)
-    watches = _Turning(nature.name), _Steps()
+    watches = _Turning(nature), _Steps()
     for arrival in itertools.chain(held, arrivals):
         if (sample := arrival.sample) is not None:
             x, y, z = (sign * axis for axis in sample.accel)
@@ -123,8 +125,13 @@ def _rate_of(stamps: Float[np.ndarray, " n"], nature: Nature) -> float:
         problem = f"its samples come at {rate:.4g} Hz by their stamps"
         remedy = f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz: stamps must be in seconds"
         raise InputError(nature.name, problem, remedy)
+    return stated_rate(rate, nature)
+
+
+def stated_rate(rate: float, nature: Nature) -> float:
+    """The stated rate, or else the `rate` of the stamps, Hz. Raises `InputError` if both differ."""
     stated = nature.imu_rate
-    if stated and not RATE_SHARE < stated * interval < 1 / RATE_SHARE:
+    if stated and not RATE_SHARE < stated / rate < 1 / RATE_SHARE:
         problem = f"its samples come at {rate:.4g} Hz by their stamps"
         raise InputError(nature.name, problem, f"leave out --imu-rate {stated:g}: it is measured")
     return stated or rate
@@ -159,8 +166,9 @@ def _for_streams(remedy: str) -> str:
 class _Turning:
     """Compares the rotation of gravity with the gyro, until it is certain or a minute is over."""
 
-    def __init__(self, name: str):
-        self._name, self._rows, self._due = name, list[tuple[float, ...]](), list(TURNING_SECONDS)
+    def __init__(self, nature: Nature):
+        self._nature, self._due = nature, list(TURNING_SECONDS)
+        self._rows = list[tuple[float, ...]]()
 
     def notices(self, arrival: Arrival) -> Iterator[Arrival]:
         """Warnings, after each of `TURNING_SECONDS`. Raises `InputError` for a contradiction."""
@@ -173,7 +181,8 @@ class _Turning:
         self._due.pop(0)
         rows = np.array(self._rows)
         imu = physics.ImuSamples(rows[:, 0] - rows[0, 0], rows[:, 1:4], rows[:, 4:7])
-        warnings = physics.check_turning(imu, self._name, _for_streams)
+        name, unit = self._nature.name, self._nature.gyro_unit
+        warnings = physics.check_turning(imu, name, _for_streams, unit)
         yield from (Arrival(arrival.clock, notice=f"warning: {text}") for text in warnings)
         if warnings or physics.is_supported(*physics.agreement(imu)):
             self._due.clear()

@@ -114,7 +114,10 @@ class Clock:
         gap = min(jump if is_hole else lost, LONGEST_GAP)
         self._offset += gap - jump
         if is_hole:
-            return f"samples are missing for {jump:.1f} s before {stamps[0]:.2f} s"
+            problem = f"samples are missing for {jump:.1f} s before {stamps[0]:.2f} s"
+            behind = f"times from there on are {jump - gap:.1f} s behind the stamps"
+            remark = f": it goes on with a gap of {gap:g} s, and {behind}"
+            return problem + (remark if gap < jump else "")
         words = f"was set {'forward' if jump > 0 else 'back'} by {abs(jump - gap):.3g} s"
         return f"the clock of the samples {words}: it goes on with a gap of {gap:.2g} s"
 

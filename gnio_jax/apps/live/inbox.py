@@ -87,17 +87,38 @@ class Inbox:
 
 
 def receive_datagrams(receiver: socket.socket, inbox: Inbox) -> None:
-    """Put the datagrams of a UDP socket into the inbox, in a thread."""
+    """Put the datagrams of a UDP socket into the inbox, in a thread: (content, address of the
+    machine that sent it)."""
 
     def receive() -> None:
         while True:
             try:
-                message = receiver.recv(CHUNK)
+                content, (machine, _) = receiver.recvfrom(CHUNK)
             except OSError:
                 return  # the socket is closed
-            inbox.put(message, len(message))
+            inbox.put((content, machine), len(content))
 
     threading.Thread(target=receive, daemon=True).start()
+
+
+class Datagrams:
+    """Reads the datagrams of one machine, that of the first sample. Two IMUs at one port would make
+    one path of both."""
+
+    def __init__(self, stated: Units):
+        self._stated = stated
+        self._machine: str | None = None
+
+    def decode(self, datagram: tuple[bytes, str]) -> Iterator[Sample | str]:
+        """The samples of a datagram, or why a line, or a sample of another machine, is refused."""
+        content, machine = datagram
+        for sample in parse_lines(content, self._stated):
+            if isinstance(sample, Sample):
+                self._machine = self._machine or machine
+            if self._machine in (None, machine):
+                yield sample
+            else:
+                yield f"comes from {machine}, and the first sample from {self._machine}"
 
 
 def read_stream(stream: Any, name: str, stated: Units) -> Iterator[Arrival]:

@@ -12,6 +12,7 @@ import hashlib
 import ipaddress
 import json
 import re
+import secrets
 import socket
 import threading
 from collections import Counter
@@ -45,6 +46,9 @@ class PageServer(ThreadingHTTPServer):
     def __init__(self, host: str, port: int, inbox: Inbox | None = None):
         self.inbox: Inbox | None = inbox
         self.state: State = no_state
+        self.session = secrets.token_hex(8)
+        """A page that stays open over the end of a stream sees by it that the path is another
+        one."""
         self._connections, self._count = Counter[str](), threading.Lock()
         self.page = (files(__package__) / "page.html").read_bytes()
         script = re.findall(rb"<script>(.*?)</script>", self.page, re.DOTALL)
@@ -137,7 +141,8 @@ class _Handler(BaseHTTPRequestHandler):
         if path == "/" and not query:
             self._answer(HTTPStatus.OK, "text/html; charset=utf-8", self.server.page)
         elif path == "/state" and (match := re.fullmatch(r"from=(\d{1,9})", query, re.ASCII)):
-            content = json.dumps(self.server.state(int(match[1])), allow_nan=False).encode()
+            state = {**self.server.state(int(match[1])), "session": self.server.session}
+            content = json.dumps(state, allow_nan=False).encode()
             self._answer(HTTPStatus.OK, "application/json", content)
         else:
             self._refuse(HTTPStatus.NOT_FOUND)

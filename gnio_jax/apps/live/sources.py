@@ -13,10 +13,10 @@ import numpy as np
 
 from gnio_jax.apps.importing import read_imported
 from gnio_jax.apps.importing.loggers import REMEDIES
-from gnio_jax.apps.live.checks import Nature
-from gnio_jax.apps.live.inbox import Inbox, read_stream, receive_datagrams
+from gnio_jax.apps.live.checks import Nature, stated_rate
+from gnio_jax.apps.live.inbox import Datagrams, Inbox, read_stream, receive_datagrams
 from gnio_jax.apps.live.phyphox import Phyphox, PhyphoxRows
-from gnio_jax.apps.live.samples import Arrival, Sample, Units, parse_lines
+from gnio_jax.apps.live.samples import Arrival, Sample, Units
 from gnio_jax.apps.live.sensor_logger import SensorLogger
 from gnio_jax.apps.live.server import PageServer, listen
 from gnio_jax.config import ImportOptions
@@ -66,12 +66,12 @@ def standard_input(_: str, stated: Stated) -> Source:
     if sys.stdin is None:
         remedy = "pipe samples into it, or name a source, such as udp:5555"
         raise InputError(STANDARD_INPUT, "is closed", remedy)
-    nature = Nature(STANDARD_INPUT, stated.imu_rate, stated.accel_sign)
+    nature = Nature(STANDARD_INPUT, stated.imu_rate, stated.accel_sign, gyro_unit=stated.units.gyro)
     return Source(read_stream(sys.stdin.buffer, nature.name, stated.units), nature, is_live=False)
 
 
 def datagrams(name: str, stated: Stated) -> Source:
-    """The lines of the datagrams at udp:PORT, which only this machine reaches, or at
+    """The lines of the datagrams of one machine at udp:PORT, which only this machine reaches, or at
     udp:ADDRESS:PORT."""
     host, _, port = name.partition(":")[2].rpartition(":")
     if not (port.isascii() and port.isdecimal() and 0 < int(port[:6]) < 2**16):
@@ -85,8 +85,9 @@ def datagrams(name: str, stated: Stated) -> Source:
         raise InputError(name, problem, "choose another port or address") from None
     inbox = Inbox(name, "datagrams")
     receive_datagrams(receiver, inbox)
-    arrivals = inbox.arrivals(lambda message: parse_lines(message, stated.units), stated.silence)
-    return Source(arrivals, Nature(name, stated.imu_rate, stated.accel_sign), close=receiver.close)
+    arrivals = inbox.arrivals(Datagrams(stated.units).decode, stated.silence)
+    nature = Nature(name, stated.imu_rate, stated.accel_sign, gyro_unit=stated.units.gyro)
+    return Source(arrivals, nature, close=receiver.close)
 
 
 def sensor_logger(name: str, stated: Stated) -> Source:
@@ -98,7 +99,11 @@ def sensor_logger(name: str, stated: Stated) -> Source:
     phone = SensorLogger(name, stated.units, stated.accel_sign)
     # What comes without a stated sign is Android's: see SensorLogger.
     nature = Nature(
-        name, stated.imu_rate, stated.accel_sign or "android", REMEDIES["Sensor Logger"]
+        name,
+        stated.imu_rate,
+        stated.accel_sign or "android",
+        REMEDIES["Sensor Logger"],
+        stated.units.gyro,
     )
     remarks = (
         f"in Sensor Logger: Settings, Data Streaming, HTTP Push, push to {server.address}data",
@@ -112,7 +117,13 @@ def sensor_logger(name: str, stated: Stated) -> Source:
 def phyphox(name: str, stated: Stated) -> Source:
     """The rows of an experiment of phyphox at phyphox:ADDRESS, by its remote access."""
     phone, inbox = Phyphox(name.partition(":")[2], name), Inbox(name)
-    nature = Nature(name, stated.imu_rate, stated.accel_sign or "android", REMEDIES["phyphox"])
+    nature = Nature(
+        name,
+        stated.imu_rate,
+        stated.accel_sign or "android",
+        REMEDIES["phyphox"],
+        stated.units.gyro,
+    )
 
     def arrivals() -> Iterator[Arrival]:
         phone.run(inbox)
@@ -127,21 +138,24 @@ def recording(name: str, stated: Stated) -> Source:
         gyro_unit=stated.gyro_unit, accel_unit=stated.accel_unit, accel_sign=stated.accel_sign
     )
     sequence, notes, warnings = read_imported(Path(name), options)
-    rate = stated.imu_rate or 1 / float(np.median(np.diff(sequence.time)))
+    nature = Nature(sequence.name, stated.imu_rate)
+    rate = stated_rate(1 / float(np.median(np.diff(sequence.time))), nature)
     arrivals = play(sequence, stated.speed)
-    return Source(arrivals, Nature(sequence.name), False, rate, (*warnings, *notes))
+    return Source(arrivals, nature, False, rate, (*warnings, *notes))
 
 
 def play(sequence: Sequence, speed: float) -> Iterator[Arrival]:
-    """The samples of a recording, `speed` times as fast as they were recorded; 0: as fast as
-    possible. Samples that are interpolated across a gap are missing."""
+    """The samples of a recording with the stamps of its own clock, `speed` times as fast as they
+    were recorded; 0: as fast as possible. Samples that are interpolated across a gap are
+    missing."""
     begin, first, measured = time.monotonic(), float(sequence.time[0]), sequence.imu_valid
+    start_time = float(sequence.attributes.get("start_time", 0.0))
     missing = np.zeros((len(sequence.time), 1), bool) if measured is None else ~measured[:, None]
     signals = (np.where(missing, np.nan, signal) for signal in (sequence.gyro, sequence.accel))
     for stamp, gyro, accel in zip(sequence.time, *signals, strict=True):
         if speed > 0:
             time.sleep(max(0.0, begin + (stamp - first) / speed - time.monotonic()))
-        sample = Sample(float(stamp), tuple(gyro.tolist()), tuple(accel.tolist()))
+        sample = Sample(start_time + float(stamp), tuple(gyro.tolist()), tuple(accel.tolist()))
         yield Arrival(time.monotonic(), sample)
 
 

@@ -24,7 +24,7 @@ from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation import PreparedRecording, SequenceEstimate, estimate, prepare
 from gnio_jax.evaluation.metrics import ate
-from gnio_jax.files import fingerprint, replacing_folder
+from gnio_jax.files import fingerprint, replacing_folder, write_part
 from gnio_jax.filtering import Filter, make_filter
 from gnio_jax.models import Network
 from gnio_jax.networks import load
@@ -134,7 +134,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
             "files": files,
         }
         text = json.dumps(manifest, indent=2, ensure_ascii=False, allow_nan=False)
-        (folder / "export.json").write_text(text + "\n", encoding="utf-8")
+        write_part(folder / "export.json", text + "\n")
     return ExportResult(out, {name: file["bytes"] for name, file in files.items()}, deviation)
 
 

@@ -1,5 +1,7 @@
 """Rate, units and sign of a stream, and sensors that contradict each other."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from tests.support import known_walk
 from tests.support.checks import unchecked
 from tests.support.live_streams import STILL, arrivals, as_lines, of_lines, samples_of, texts_of
 
+EXAMPLE = Path(__file__).parents[3] / "examples" / "walk.csv"
 WALK = pedestrian(30, 330, seconds=60.0, rate=100.0)
 
 
@@ -171,6 +174,20 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_said():
     np.testing.assert_allclose(
         [s.gyro for s in converted_samples], known_walk.rate(time), atol=1e-9
     )
+
+
+@pytest.mark.parametrize(
+    ("read_as", "factor", "words"),
+    [("rad/s", 180 / np.pi, "deg/s"), ("deg/s", 65.5, "raw counts, 65.5 in 1 deg/s,")],
+)
+def test_degrees_are_not_taken_for_raw_counts(read_as, factor, words):
+    """Read as rad/s, degrees are too large by about as much as 65.5 counts read as deg/s. The walk
+    begins with a rest, so it shows little in its first 8 s."""
+    rows = np.loadtxt(EXAMPLE, delimiter=",", skiprows=1)
+    lines = as_lines((rows[:, 0], factor * rows[:, 1:4], rows[:, 4:]))
+    nature = Nature("udp:5", gyro_unit=read_as)
+    with pytest.raises(InputError, match=rf"its gyro looks like {words} by the turning"):
+        list(with_measured_rate(of_lines(lines), nature, print))
 
 
 def ride_and_walk():

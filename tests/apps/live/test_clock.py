@@ -52,6 +52,16 @@ def test_the_same_from_a_file_which_does_not_tell_the_time():
     assert np.diff(times(far)).max() == pytest.approx(60.0, abs=0.1)  # as long as a tracker takes
 
 
+def test_a_gap_that_is_shortened_is_said():
+    """The times of the path are then no longer those of the stamps."""
+    stamps = np.concatenate([STAMPS[:100], STAMPS[100:] + 200.0])
+    stage = clocked(stamps, stamps)
+    (notice,) = texts_of(stage)
+    assert notice.startswith("samples are missing for 200.0 s before 201.00 s: it goes on with a ")
+    behind = stamps[-1] - times(stage)[-1]
+    assert behind == pytest.approx(140.01) and f"{behind:.1f} s behind the stamps" in notice
+
+
 def test_a_pause_of_the_phone_is_a_gap_and_its_stamps_stay():
     stamps = np.concatenate([STAMPS[:100], STAMPS[100:] + 30.0])
     np.testing.assert_allclose(times(clocked(stamps, stamps)), stamps)

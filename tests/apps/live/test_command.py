@@ -1,12 +1,15 @@
 """`gnio live`: the trajectory of a stream is that of the tracker, and nonsense is refused."""
 
 import dataclasses
+import errno
 import importlib.util
 import io
+import shutil
 import signal
 import socket
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -156,6 +159,7 @@ def test_a_stream_slower_than_the_network_is_followed(follow, tmp_path):
     assert len(rows) > 35 and np.abs(error).max() < 0.3
 
 
+EXAMPLE = Path(__file__).parents[3] / "examples" / "walk.csv"
 SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 9]
 """Of every 0.8 s are missing 0.2 s, and the filter bridges 0.1 s."""
 
@@ -169,6 +173,15 @@ SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 9]
         ([], ["http:0.0.0.0"], "http:0.0.0.0: names no port; write 8000"),
         ([], ["phyphox:"], "phyphox:: is not an address"),
         ([], ["--page", "x"], "--page x: names no port"),
+        (
+            [],
+            ["walk.csv", "--out", "./walk.csv"],
+            "--out: 'walk.csv' is the recording; name another file",
+        ),
+        (
+            *([], [EXAMPLE, "--imu-rate", "10"]),
+            "walk: its samples come at 100 Hz by their stamps; leave out --imu-rate 10",
+        ),
         ([], ["nowhere.csv", "--speed", "-1"], "--speed: must be finite and not negative"),
         ([], ["--rerun", "live.txt"], "--rerun"),
         ([], ["--out", "file/x/y.txt"], "file"),
@@ -183,8 +196,10 @@ SPARSE = [line for k, line in enumerate(as_lines(walked())[:200]) if k % 40 > 9]
 def test_mistakes_are_one_line(mistake, run, monkeypatch, tmp_path, lines, arguments, problem):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
+    shutil.copy(EXAMPLE, tmp_path / "walk.csv")
     message = mistake("live", *arguments, "--network", run, lines=lines)
     assert problem in message and ("standard input" in message) == (not arguments)
+    assert (tmp_path / "walk.csv").read_bytes() == EXAMPLE.read_bytes()
 
 
 def test_a_standard_input_that_is_closed_is_one_line(run, monkeypatch, capsys):
@@ -204,8 +219,8 @@ def test_a_recording_played_gives_the_track_of_it(
     gyro = np.concatenate([noise[0], gyro[50:]]) + np.array([0.03, -0.02, 0.01])
     accel = np.concatenate([accel[0] + noise[1], accel[50:]])
     walk = tmp_path / "walk.csv"
-    rows = np.column_stack([np.arange(len(gyro)) / RATE, gyro, accel])
-    rows = np.delete(rows, np.s_[150:175], axis=0)
+    stamps = 1.7e9 + np.arange(len(gyro)) / RATE  # both have those of the recording's own clock
+    rows = np.delete(np.column_stack([stamps, gyro, accel]), np.s_[150:175], axis=0)
     header = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
     np.savetxt(walk, rows, delimiter=",", header=header, comments="", fmt="%.12f")
     units = ("--gyro-unit", "rad/s")
@@ -217,6 +232,7 @@ def test_a_recording_played_gives_the_track_of_it(
     assert "lacks samples 1 times" in output and "in the quietest second" in output
     assert "warning: gaps: 1, the longest of 0.52 s" in output
     rows = np.searchsorted(tracked.time, followed.time - 1e-4)
+    assert followed.time[0] == pytest.approx(1.7e9 + 1.0, abs=1e-5)
     assert rows[0] == round(1.0 / 0.1) and (np.diff(rows[:-1]) == 1).all()
     overlap = rows < len(tracked.time)  # a track ends with the stamp of its last sample
     assert (~overlap).sum() <= 1 and overlap.sum() > 35
@@ -258,6 +274,34 @@ def test_a_signal_ends_the_stream_and_nothing_is_lost(
     # 31 whole intervals of 0.1 s; the first pose is that of the end of the rest.
     time = read_tum(out).time
     np.testing.assert_allclose(time, np.arange(10, 32) / 10, atol=1e-6)
+
+
+def test_a_terminal_that_is_closed_loses_nothing(run, recorded, monkeypatch, tmp_path):
+    """Nothing can be shown any more, and the trajectory is written nevertheless."""
+    content, out = "\n".join(as_lines(recorded)).encode(), tmp_path / "live.txt"
+    push, say, pushed = Tracker.push, console.say, []
+
+    def push_and_hang_up(*row):
+        pushed.append(row)
+        if len(pushed) == 156:
+            signal.raise_signal(signal.SIGHUP)
+        return push(*row)
+
+    def say_or_fail(text):
+        if len(pushed) >= 156:
+            raise OSError(errno.EIO, "Input/output error")
+        say(text)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    monkeypatch.setattr(Tracker, "push", push_and_hang_up)
+    monkeypatch.setattr(console, "say", say_or_fail)
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
+    try:
+        with pytest.raises(SystemExit):
+            console.run(lambda: app.main(["live", "--network", str(run), "--out", str(out)]))
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    np.testing.assert_allclose(read_tum(out).time, np.arange(10, 32) / 10, atol=1e-6)
 
 
 class Diverging:

@@ -1,5 +1,6 @@
 """What waits for the filter, and the lines of streams and datagrams."""
 
+import contextlib
 import io
 import os
 import socket
@@ -71,6 +72,27 @@ def test_datagrams_are_received_before_they_are_read(port):
     source.close()
     assert [sample.time for sample in samples_of(arrivals)] == list(range(50))
     assert all(arrival.clock < read for arrival in arrivals if arrival.sample)
+
+
+def test_the_datagrams_of_a_second_machine_are_refused(port):
+    """Two IMUs at one port, in turn; the first one may send from several ports, and what is no
+    sample makes nobody the first."""
+    source = open_source(f"udp:{port}", Stated(silence=0.3))
+    with contextlib.ExitStack() as sockets:
+        senders = []
+        for machine in ("127.0.0.2", "127.0.0.1", "127.0.0.2", "127.0.0.1"):
+            sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            senders.append(sockets.enter_context(sender))
+            sender.bind((machine, 0))
+        senders[0].sendto(b"time,gyro,accel\n", ("127.0.0.1", port))
+        for k in range(1, 21):
+            senders[k % 4].sendto(f"{k},{STILL}\n".encode(), ("127.0.0.1", port))
+        arrivals = list(source.arrivals)
+    source.close()
+    assert [sample.time for sample in samples_of(arrivals)] == list(range(1, 21, 2))
+    refusals = texts_of(arrivals, "refusal")
+    assert len(refusals) == 11 and refusals[0].startswith("is not a sample")
+    assert set(refusals[1:]) == {"comes from 127.0.0.2, and the first sample from 127.0.0.1"}
 
 
 def lines_of(content):

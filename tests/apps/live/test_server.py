@@ -69,7 +69,9 @@ def test_the_page_and_its_state_are_all_there_is_to_see(serving):
     assert headers["X-Content-Type-Options"] == "nosniff" and headers["Server"] == "gnio"
     assert headers["Cache-Control"] == "no-store"
     status, headers, content = response(address, path="/state?from=12")
-    assert status == 200 and json.loads(content) == {"first": 12}
+    assert status == 200
+    assert json.loads(content) == {"first": 12, "session": server.session}
+    assert serving()[0].session != server.session
     assert headers["Content-Type"] == "application/json"
 
 

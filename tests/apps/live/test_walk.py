@@ -128,18 +128,19 @@ PROBE = b"""<script>
 setInterval(() => {
   document.body.dataset.beyond = document.documentElement.scrollWidth - innerWidth;
   const box = document.querySelector("canvas").getBoundingClientRect();
+  document.body.dataset.path = JSON.stringify(path);
   document.body.dataset.map = `${Math.round(box.width)} ${Math.round(box.height)}`;
 }, 50);
 </script>"""
 EVIL = "<img src=x onerror=alert(1)>&amp;"
 
 
-def walking(steps):
-    """A walk on a circle of 8 m, at rest in the end."""
+def walking(steps, side=1.0):
+    """A walk on a circle of 8 m to the left (side 1) or right, at rest in the end."""
     result, zero = Followed(rest_seconds=0.5), np.zeros(3)
     for k in range(steps):
         angle = min(k, steps - 10) / 50
-        position = np.array([8 * np.sin(angle), 8 * (1 - np.cos(angle)), 0.1])
+        position = np.array([8 * np.sin(angle), side * 8 * (1 - np.cos(angle)), 0.1])
         covariance = np.eye(15)
         covariance[6:8, 6:8] = [[0.5, 0.3], [0.3, 0.4]]
         speed = np.array([1.2, 0.5, 0.0])
@@ -165,17 +166,45 @@ def shown(server, width, *, height=800, picture=None):
     return text, dict(re.findall(r'data-(\w+)="([^"]*)"', body[1]))
 
 
+def server_with_probe(port):
+    """A server whose page says more of itself."""
+    server = listen(str(port), "http")
+    end = server.page.rpartition(b"</body>")
+    server.page = end[0] + PROBE + b"".join(end[1:])
+    digest = servers._hash(PROBE[len("<script>") : -len("</script>")])
+    server.policy = server.policy.replace("script-src", f"script-src {digest}")
+    return server
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not BROWSER, reason="no Chromium here (apt-get install chromium)")
+def test_a_page_that_stays_open_shows_the_next_stream_alone(port):
+    """The next one has more points than the first when the page asks again."""
+    server, walks, requests = server_with_probe(port), (walking(200), walking(400, -1.0)), []
+
+    def state(first):
+        requests.append(first)
+        if len(requests) == 4:
+            server.session = "another"
+        return describe(walks[len(requests) >= 4], Nature("udp:5"), "net", True, first)
+
+    server.state = state
+    server.run()
+    try:
+        text, data = shown(server, 1500)
+    finally:
+        server.close()
+    assert requests[3] == len(walks[0].points) < len(walks[1].points) and "time 39.9 s" in text
+    np.testing.assert_allclose(json.loads(data["path"]), walks[1].points, atol=0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason="no Chromium here (apt-get install chromium)")
 @pytest.mark.parametrize(("width", "columns"), [(1500, 2), (500, 1)])
 @pytest.mark.parametrize("kind", ["waiting", "walking", "still"])
 def test_a_browser_shows_the_walk(port, width, columns, kind):
     """Under the page's own policy, which forbids scripts of others; names are text, never tags."""
-    server = listen(str(port), "http")
-    end = server.page.rpartition(b"</body>")
-    server.page = end[0] + PROBE + b"".join(end[1:])
-    digest = servers._hash(PROBE[len("<script>") : -len("</script>")])
-    server.policy = server.policy.replace("script-src", f"script-src {digest}")
+    server = server_with_probe(port)
     result = Followed() if kind == "waiting" else walking(300)
     result.waiting = "a rest (samples are missing for 0.3 s)" if kind == "waiting" else ""
     result.notices.append(f"hello {EVIL}")

@@ -315,6 +315,121 @@ def library(folder):
     return headers[0], folder / "libonnxruntime.so"
 
 
+STUB = r"""
+#pragma once
+#include <cstdint>
+#include <memory>
+#include <string>
+#include <vector>
+enum { ORT_LOGGING_LEVEL_ERROR };
+namespace Ort {
+struct AllocatorWithDefaultOptions { int GetInfo() const { return 0; } };
+struct Value {
+  std::vector<double> doubles;
+  std::vector<float> floats;
+  template <class T>
+  static Value CreateTensor(AllocatorWithDefaultOptions&, const int64_t*, size_t) {
+    return Value{std::vector<double>(9), {}};
+  }
+  template <class T> T* GetTensorMutableData() { return doubles.data(); }
+  template <class T> const T* GetTensorData() const {
+    if constexpr (sizeof(T) == 4) return floats.data();
+    else return doubles.data();
+  }
+};
+using Text = std::unique_ptr<char[]>;
+struct Shape { std::vector<int64_t> GetShape() { return {0}; } };
+struct Type { Shape GetTensorTypeAndShapeInfo() { return {}; } };
+struct Metadata {
+  Text LookupCustomMetadataMapAllocated(const char*, AllocatorWithDefaultOptions&) { return {}; }
+};
+struct Env { Env(int, const char*) {} };
+struct SessionOptions { void SetIntraOpNumThreads(int) {} };
+struct RunOptions {};
+struct IoBinding;
+struct Session {
+  Session(Env&, const char*, const SessionOptions&) {}
+  size_t GetInputCount() { return 0; }
+  size_t GetOutputCount() { return 0; }
+  Text GetInputNameAllocated(size_t, AllocatorWithDefaultOptions&) { return {}; }
+  Text GetOutputNameAllocated(size_t, AllocatorWithDefaultOptions&) { return {}; }
+  Type GetInputTypeInfo(size_t) { return {}; }
+  Metadata GetModelMetadata() { return {}; }
+  void Run(const RunOptions&, IoBinding&) {}
+};
+struct IoBinding {
+  IoBinding(Session&) {}
+  void BindInput(const char*, const Value&) {}
+  void BindOutput(const char*, int) {}
+  std::vector<std::string> GetOutputNames() { return {}; }
+  std::vector<Value> GetOutputValues() { return {}; }
+};
+}  // namespace Ort
+"""
+"""The parts of ONNX Runtime that the example uses, which do nothing."""
+CALL = r"""
+#define main unused
+#include "track.cpp"
+#undef main
+int main(int count, char** arguments) {
+  if (count > 2) try {
+    std::cout << read(arguments[2]).size();
+    return 0;
+  } catch (const std::exception& error) {
+    std::cout << error.what();
+    return 2;
+  }
+  Tensors answer;
+  answer.emplace("displacement", Ort::Value{{}, {1.0f, 2.0f, 3.0f}});
+  answer.emplace("log_std", Ort::Value{{}, {-1.0f, -9.0f, -2.0f}});
+  if (count > 1) answer.emplace("axes", Ort::Value{{}, {0.6f, 0.8f}});
+  const Tensors given = measured(&answer, -3.0);
+  for (int i = 0; i < 9; ++i) std::cout << given.at("covariance").doubles[i] << " ";
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def call(tmp_path_factory):
+    """A program that calls functions of the example in C++."""
+    if not shutil.which("c++"):
+        pytest.skip("needs a compiler")
+    folder = tmp_path_factory.mktemp("call")
+    (folder / "onnxruntime_cxx_api.h").write_text(STUB)
+    (folder / "call.cpp").write_text(CALL)
+    command = ["c++", "-std=c++17", "-w", f"-I{folder}", f"-I{EXAMPLE}", folder / "call.cpp"]
+    subprocess.run([*command, "-o", folder / "call"], check=True)
+    return lambda *words: subprocess.run([folder / "call", *words], capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("rows", "printed"),
+    [
+        ("0,0,0,0,0,0,9.8\r\n0.02,0,0,0,0,0,9.8\r\n\r\n", "2"),
+        ("", "{}: has fewer than two samples"),
+        ("0,0,0,0,0,0,9.8\n0.02,0,0,,0,0,9.8\n", "{} row 2: seven finite numbers are expected"),
+        ("0,0,0,0,0,0,9.8\n0.02,0,0,0,0,0\n", "{} row 2: seven finite numbers are expected"),
+        ("0,0,0,0,0,0,9.8\n0,0,0,0,0,0,9.8\n", "{} row 2: seven finite numbers are expected"),
+    ],
+    ids=["an empty line", "no sample", "no value", "a short row", "a stamp twice"],
+)
+def test_the_example_in_c_names_what_it_cannot_read(call, tmp_path, rows, printed):
+    path = tmp_path / "walk.csv"
+    path.write_bytes(f"time,gx,gy,gz,ax,ay,az\n{rows}".encode())
+    done = call("read", path)
+    assert done.stdout.startswith(printed.format(path))
+    assert done.returncode == (0 if printed == "2" else 2)
+
+
+def test_the_example_in_c_turns_the_variances_of_a_frame(call):
+    """As `export.json` says: a network with a frame of its own has them along its axes."""
+    variances = np.diag(np.exp([-2.0, -6.0, -4.0]))  # that of y is raised to the least
+    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    for words, expected in (([], variances), (["axes"], turn @ variances @ turn.T)):
+        values = np.reshape([float(word) for word in call(*words).stdout.split()], (3, 3))
+        np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_the_example_in_c(models, walked, odometry, tmp_path):
     headers, shared = library(tmp_path)
