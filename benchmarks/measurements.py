@@ -1,18 +1,24 @@
 """What each measurement costs a filter that takes displacements.
 
     python -m benchmarks.measurements [--seconds 60] [--repeats 20] [--only magnetometer ...]
+    python -m benchmarks.measurements --network pedestrian
 
 Every row is the filter with displacements and one other measurement in every clone interval, over
-the filter with displacements alone. The programs are compiled first, and the compile time is in a
-column of its own. Then they run in turn, and every timing waits for its result. A ratio is the
-median over the rounds of a program's processor time over that of displacements alone in the same
-round, so that other programs on the machine disturb it less. The best of the rounds is beside it.
+the filter with displacements alone. With a trained network, by its name or folder, it is the whole
+odometry: the network in the loop of its own filter.
+
+The programs are compiled first, and the compile time is in a column of its own. Then they run in
+turn, and every timing waits for its result. A ratio is the median over the rounds of a program's
+processor time over that of displacements alone in the same round, so that other programs on the
+machine disturb it less. The best of the rounds is beside it.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -20,16 +26,18 @@ import numpy as np
 
 from benchmarks import baseline
 from benchmarks.filter_throughput import DT, walk
-from gnio_jax import filtering
+from gnio_jax import filtering, models, networks
 from gnio_jax.filtering import nonholonomic, wheel_speed, zero_velocity
 
 CONFIG = filtering.FilterConfig(DT, 10, 20)
 """20 Hz clones, a window of 1 s."""
 
 
-def make_measurements(intervals: int) -> dict[str, tuple[tuple, tuple]]:
+def make_measurements(
+    intervals: int, config: filtering.FilterConfig
+) -> dict[str, tuple[tuple, tuple]]:
     """Name -> the measurements of the filter and those with rows, for `walk` of the throughput."""
-    stamps = CONFIG.clone_seconds * np.arange(intervals + 2)
+    stamps = config.clone_seconds * np.arange(intervals + 2)
     yaw = 0.24 * stamps
     zero, one = np.zeros_like(stamps), np.ones_like(stamps)
     field = np.stack([20 * np.cos(yaw), -20 * np.sin(yaw), -40 * one], axis=1)
@@ -45,31 +53,47 @@ def make_measurements(intervals: int) -> dict[str, tuple[tuple, tuple]]:
         "… with states": ((nonholonomic.NonHolonomic(mounting_std=0.01, lever_std=0.5),), ()),
         "magnetometer": (
             (),
-            (filtering.magnetometer_on_intervals(stamps, field, rotation, CONFIG),),
+            (filtering.magnetometer_on_intervals(stamps, field, rotation, config),),
         ),
         "barometer": (
             (),
-            (filtering.barometer_on_intervals(stamps, 101325.0 * one, intervals, CONFIG),),
+            (filtering.barometer_on_intervals(stamps, 101325.0 * one, intervals, config),),
         ),
         "fix": (
             (),
-            (filtering.fixes_on_intervals(stamps[1:-1], places, covariance, intervals, CONFIG),),
+            (filtering.fixes_on_intervals(stamps[1:-1], places, covariance, intervals, config),),
         ),
         "wheel_speed": (
             (),
-            (wheel_speed.speeds_on_intervals(stamps, 1.2 * one, intervals, CONFIG, car),),
+            (wheel_speed.speeds_on_intervals(stamps, 1.2 * one, intervals, config, car),),
         ),
     }
 
 
-def compile_filter(rows: tuple, of_filter: tuple, with_rows: tuple) -> tuple[Any, tuple, float]:
+def make_filter(name: str | None) -> tuple[Callable, filtering.Filter]:
+    """The run of a filter over the rows of `walk`, and the filter without other measurements: that
+    of the trained network `name`, or one with given displacements."""
+    if name is None:
+        noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, DT)
+        return filtering.run_filter, filtering.Filter(CONFIG, noise)
+    loaded = networks.load(name)
+    predict = models.Network.of(loaded.model, loaded.variables).predict()
+
+    def run(ekf, state, gyro, accel, displacement, covariance, measurements):
+        return filtering.run_odometry(predict, ekf, state, gyro, accel, measurements=measurements)
+
+    ekf = filtering.make_filter(loaded.config.data, loaded.config.filter)
+    return run, replace(ekf, measurements=())
+
+
+def compile_filter(
+    run_rows: Callable, ekf: filtering.Filter, rows: tuple, with_rows: tuple
+) -> tuple[Any, tuple, float]:
     """The compiled program, its arguments, and the seconds of its compilation."""
-    noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, DT)
-    ekf = filtering.Filter(CONFIG, noise, measurements=of_filter)
     state = filtering.initial_state(ekf, np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3))
 
     def run(ekf, state, rows, with_rows):
-        return filtering.run_filter(ekf, state, *rows, measurements=with_rows)
+        return run_rows(ekf, state, *rows, measurements=with_rows)
 
     arguments = jax.device_put((ekf, state, rows, with_rows))
     begin = time.perf_counter()
@@ -84,14 +108,19 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="length of the simulated walk")
     parser.add_argument("--repeats", type=int, default=20, help="rounds")
     parser.add_argument("--only", nargs="+", help="names of measurements; default: all")
+    parser.add_argument("--network", help="a trained network in the loop, by its name or folder")
     arguments = parser.parse_args()
-    rows = walk(arguments.seconds, CONFIG)
-    kinds = make_measurements(len(rows[2]))
+    run, ekf = make_filter(arguments.network)
+    rows = walk(arguments.seconds, ekf.config)
+    kinds = make_measurements(len(rows[2]), ekf.config)
     if unknown := set(arguments.only or ()) - kinds.keys():
         parser.error(f"--only: {', '.join(sorted(unknown))}; known: {', '.join(kinds)}")
     chosen = arguments.only or list(kinds)
-    programs = {"displacement alone": compile_filter(rows, (), ())}
-    programs |= {name: compile_filter(rows, *kinds[name]) for name in chosen}
+    programs = {"displacement alone": compile_filter(run, ekf, rows, ())}
+    for name in chosen:
+        of_filter, with_rows = kinds[name]
+        with_measurement = replace(ekf, measurements=of_filter)
+        programs[name] = compile_filter(run, with_measurement, rows, with_rows)
     for name, (program, inputs, _) in programs.items():
         _, history = jax.block_until_ready(program(*inputs))
         assert bool(np.isfinite(history.position).all()), "the filter diverged: no timing counts"
@@ -104,8 +133,10 @@ def main() -> None:
             jax.block_until_ready(program(*inputs))
             spent[name].append(time.process_time() - begin)
     base = np.array(spent["displacement alone"])
-    device = jax.devices()[0].device_kind
-    print(f"\n{device}, jax {jax.__version__}, 20 Hz clones, 1 s window, one sequence, float64")
+    device, config = jax.devices()[0].device_kind, ekf.config
+    clones = f"{1 / config.clone_seconds:g} Hz clones, {config.window * config.dt:g} s window"
+    network = f"network {arguments.network} in the loop" if arguments.network else "no network"
+    print(f"\n{device}, jax {jax.__version__}, {clones}, {network}, one sequence, float64")
     print(f"{'':20} {'µs a step':>10} {'ratio':>7} {'of best':>8} {'compile s':>10}")
     figures = {}
     for name, times in spent.items():
@@ -114,7 +145,8 @@ def main() -> None:
         print(f"{name:20} {step:10.1f} {ratio:7.2f} {best:8.2f} {programs[name][2]:10.1f}")
         figures[f"{name} / displacement alone"] = ratio
     del figures["displacement alone / displacement alone"]
-    baseline.compare("measurements", figures)
+    if arguments.network is None:
+        baseline.compare("measurements", figures)
 
 
 if __name__ == "__main__":

@@ -76,7 +76,7 @@ class Displacement:
         config = step.config
         linear, defined = linearise_displacement(self, state, step)
         linear = linear._replace(residual=jnp.where(self.present, linear.residual, jnp.nan))
-        outcome, correction = project(state, linear, step)
+        outcome, innovation = project(state, linear, step)
         tested = outcome.present & defined
         # The gate is open at the start and after a series of rejections.
         longest = config.speed_limit * config.window * config.dt
@@ -91,12 +91,12 @@ class Displacement:
             factor = 1 / jnp.clip(jnp.where(possible, weight, 1.0), LEAST_WEIGHT)
         if factor is not None:  # applied with a larger covariance
             weaker = linear._replace(covariance=linear.covariance + (factor - 1) * self.covariance)
-            _, correction = project(state, weaker, step)
+            _, innovation = project(state, weaker, step)
             accepted = possible
         # A matrix that is no covariance must spoil the state, and `healthy` then reports it.
         accepted = accepted | (outcome.present & plausible & jnp.isnan(outcome.nis))
         outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
-        return correct(state._replace(gate=gate), outcome, correction, step)
+        return correct(state._replace(gate=gate), outcome, innovation, step)
 
 
 def scaled_displacement(
