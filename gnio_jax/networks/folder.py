@@ -259,6 +259,10 @@ def _read_start(path: Path, name: str, count: int) -> bytes:
             with (path / name).open("rb") as file:
                 return file.read(count)
         with zipfile.ZipFile(path) as archive:
+            entries = archive.namelist()
+            folders = {entry.partition("/")[0] for entry in entries} - {"__MACOSX"}
+            if name not in entries and len(folders) == 1:  # as a file manager packs a folder
+                name = f"{folders.pop()}/{name}"
             method = archive.getinfo(name).compress_type
             if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise zipfile.BadZipFile(f"compression method {method}")  # none of `gnio publish`

@@ -181,6 +181,21 @@ def test_damaged_files_are_refused(package, tmp_path, monkeypatch):
     refused(tmp_path / "broken.zip", "cannot be read")
 
 
+def test_a_zip_of_the_folder_is_its_network(published, tmp_path):
+    """As a file manager packs it, with what macOS adds; two folders are no network."""
+    path, expected = tmp_path / "packed.zip", read_network(published / "walk")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("__MACOSX/walk/._config.yaml", b"")
+        for file in (published / "walk").iterdir():
+            archive.write(file, f"walk/{file.name}")
+    network = read_network(path)
+    assert network.digest == expected.digest
+    assert network.card == expected.card
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(f"other/{CONFIG}", b"")
+    refused(path, f"'{CARD}' is missing")
+
+
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
 def test_a_zip_of_another_compression_is_refused(published, tmp_path, method):
     """Also one that is damaged, and every other network is still listed."""
