@@ -124,7 +124,8 @@ def waypoint_poses(
         ends = Mean(*(getattr(estimates, name) for name in Mean._fields))
         poses = jax.device_get(_between_clones(ends, walk.gyro, walk.accel, walk.count, config))
         poses = [part[: len(sequence.time)] for part in poses]
-        if not all(np.isfinite(part).all() for part in poses):
+        healthy = (np.asarray(estimates.healthy)[: walk.count] > 0).all()
+        if not healthy or not all(np.isfinite(part).all() for part in poses):
             raise InputError(sequence.name, "the filter fails on it", "leave out the walk")
         return poses
 

@@ -208,6 +208,10 @@ def test_an_imu_that_cannot_be_is_refused_in_one_line():
             sequence._replace(accel=changed(sequence.accel, 400, 1e200)),
             "the filter fails on it; leave",
         ),
+        (  # 200 m/s for a moment: finite, but no filter that is healthy
+            sequence._replace(accel=changed(sequence.accel, 400, 1e4)),
+            "the filter fails on it; leave",
+        ),
     ):
         with pytest.raises(InputError, match=f"^walk: {text}") as caught:
             filtering.waypoint_poses(spoilt, predict, EKF)
