@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import os
 
 import numpy as np
 import pytest
@@ -15,6 +16,9 @@ from tests.support import small_tables
 from tests.support.networks import SMALL
 
 METHODS = make.networks(TablesConfig("comparison", methods="all"))
+SIBLINGS = {"eqnio_ronin", "imot", "trunk_fourier", "trunk_rep", "trunk_wavelet"}
+"""Networks of which another row has all but a part that has its own tests. They run with
+GNIO_EVERY_NETWORK=1."""
 METHOD = experiments.method
 IN_CONFIG = {field.name for field in dataclasses.fields(ModelConfig)}
 
@@ -45,6 +49,8 @@ def base(tmp_path_factory):
 def test_a_method_is_trained_calibrated_and_measured_on_the_windows_of_the_base(
     network, base, tmp_path, monkeypatch
 ):
+    if network in SIBLINGS and not os.environ.get("GNIO_EVERY_NETWORK"):
+        pytest.skip("takes half a minute; set GNIO_EVERY_NETWORK=1")
     if network == "ridi":
         pytest.importorskip("sklearn", reason="needs gnio-jax[ridi]")
     small_tables.patch(monkeypatch)
