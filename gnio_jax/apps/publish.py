@@ -63,7 +63,7 @@ def publish(
     trained = networks.with_corrector(networks.load(network))
     figures, left_out = _read_figures(trained)
     for folder, problem in left_out.items():
-        warnings.warn(f"{folder}: not on the card: {problem}; evaluate it again", stacklevel=2)
+        warnings.warn(f"{folder}: not on the card: {problem}", stacklevel=2)
     card = Card(
         name,
         trained.config.model.name,
@@ -106,11 +106,11 @@ def _read_figures(network: TrainedNetwork) -> tuple[dict[str, Report], dict[str,
     files = evaluations_folder(network.path).glob("*/metrics.json")
     for folder in sorted(file.parent for file in files):
         report = results.read(folder)
-        problem = reuse.find_change(report, network.path)
-        if not problem and report.settings.get("weights") != network.digest:
+        if problem := reuse.find_change(report, network.path):
+            left_out[str(folder)] = f"{problem}; evaluate the network again"
+        elif report.settings.get("weights") != network.digest:
             problem = "its figures are of the latest checkpoint, not of the weights"
-        if problem:
-            left_out[str(folder)] = problem
+            left_out[str(folder)] = f"{problem}; evaluate without --checkpoint latest"
         else:
             figures[folder.name] = report
     return figures, left_out

@@ -267,6 +267,9 @@ def _leave(line: str, status: int) -> typing.NoReturn:
 
 
 def _terminate(number: int, _frame: object) -> typing.NoReturn:
+    # A shell and its terminal may both send it, and the second must not end what the first begins.
+    for signal_number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(signal_number, signal.SIG_IGN)
     raise SystemExit(128 + number)
 
 

@@ -313,6 +313,8 @@ def correction_by(innovation: Innovation, accepted: Bool[Array, ""]) -> Correcti
     whitened, spread, core, clones, by_part = innovation
     rows = (core, clones, jnp.concatenate(list(by_part.values()), axis=1))
     masked = tuple(jnp.where(accepted, part, 0.0) for part in rows)
+    # Without a root of S the rows of a refused measurement would be no zeros.
+    spread = jnp.where(accepted, spread, jnp.eye(len(spread), dtype=spread.dtype))
     (core, clones, jacobian), _ = whiten(spread, masked)
     blocks = jnp.split(jacobian, len(by_part), axis=1)
     by_part = dict(zip(by_part, blocks, strict=True))

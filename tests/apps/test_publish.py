@@ -164,7 +164,8 @@ def test_figures_of_other_weights_are_not_on_the_card(run, tmp_path):
     text = read_text(tmp_path / "package")
     assert "| synthetic_test_ekf |" in text and "before" not in text and "latest" not in text
     texts = [str(warning.message) for warning in warned]
-    assert len(texts) == 2 and all("evaluate it again" in line for line in texts)
+    assert len(texts) == 2 and texts[0].endswith("evaluate the network again")
+    assert texts[1].endswith("evaluate without --checkpoint latest")
     assert f"{copy / 'eval' / 'before'}: not on the card: its figures are of weights" in texts[0]
     assert "of the latest checkpoint" in texts[1]
     # If there are no others, it was not measured.

@@ -56,21 +56,27 @@ def in_body(error):
 
 def test_an_unknown_yaw_is_no_error_of_the_velocity_ahead(bridge):
     """A filter that has lost its yaw knows the velocity in the body as well as before."""
-    recorder, relay = Recorder(), bridge.Bridge(Recorder())
-    relay.take(message(5, 0))
+    recorder = Recorder()
     _, pose = (recorder.push(time, np.zeros(3), np.zeros(3)) for time in (0.0, 1.0))
     certain, turned = 0.1**2 * np.eye(15), np.zeros((15, 1))
     turned[2], turned[3:6, 0] = 1.0, np.cross([0.0, 0.0, 1.0], VELOCITY)
-    sure, lost = (
-        relay._odometry(pose._replace(covariance=covariance), np.zeros(3)).twist_covariance
-        for covariance in (certain, certain + turned @ turned.T)
-    )
-    np.testing.assert_allclose(lost, sure, atol=1e-12)
+    level = np.append(VELOCITY[:2], 0.0)  # the lever of the yaw's arc, of second order
+    first_order, arc = certain + turned @ turned.T, np.zeros((15, 15))
+    arc[3:6, 3:6] = 0.75 * np.outer(level, level)
+
+    def of_twist(covariance, invariant):
+        relay = bridge.Bridge(Recorder(), invariant)
+        relay.take(message(5, 0))
+        return relay._odometry(pose._replace(covariance=covariance), np.zeros(3)).twist_covariance
+
+    sure = of_twist(certain, False)
+    np.testing.assert_allclose(of_twist(first_order, False), sure, atol=1e-12)
+    np.testing.assert_allclose(of_twist(first_order + arc, True), sure, atol=1e-12)
 
 
 def test_messages_become_odometry(bridge):
     tracker = Recorder()
-    relay = bridge.Bridge(tracker)
+    relay = bridge.Bridge(tracker, invariant=False)
     # Unix time in float64 would keep 0.24 µs.
     assert relay.take(message(1_700_000_000, 999_999_999)) is None
     odometry = relay.take(message(1_700_000_001, 4_999_999))

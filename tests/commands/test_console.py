@@ -36,6 +36,16 @@ def interrupted():
     raise KeyboardInterrupt
 
 
+def hung_up_twice():
+    """A shell and its terminal may both send it."""
+    try:
+        os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        for number in (signal.SIGHUP, signal.SIGTERM):
+            os.kill(os.getpid(), number)
+        print("written", file=sys.stderr)
+
+
 def mistaken():
     raise InputError("file.csv", "has no column x", "add\nit")
 
@@ -48,6 +58,7 @@ def mistaken():
         (lambda: open("/dev/null/x", "w"), 2, "/dev/null/x: Not a directory\n"),
         (lambda: os.kill(os.getpid(), signal.SIGTERM), 143, ""),
         (lambda: os.kill(os.getpid(), signal.SIGHUP), 129, ""),
+        (hung_up_twice, 129, "written\n"),
         (lambda: warnings.warn("two\nlines", stacklevel=1), None, "warning: two lines\n"),
     ],
 )

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.filtering.state import arc_covariance
+
 NANOSECONDS = 1_000_000_000
 
 
@@ -30,11 +32,12 @@ class Odometry(NamedTuple):
 
 
 class Bridge:
-    """Feeds a `gnio_jax.filtering.Tracker` with messages. Stamps are counted from the first one, in
-    whole nanoseconds, so that no digit is lost in float64."""
+    """Feeds a `gnio_jax.filtering.Tracker`, whose filter has the `invariant` error or not, with
+    messages. Stamps are counted from the first one, in whole nanoseconds, so that no digit is lost
+    in float64."""
 
-    def __init__(self, tracker: Any):
-        self._tracker = tracker
+    def __init__(self, tracker: Any, invariant: bool = True):
+        self._tracker, self._invariant = tracker, invariant
         self._first: int | None = None
         self.refused = 0
         """Messages that the tracker could not take, and clone steps of a filter that diverged."""
@@ -75,9 +78,11 @@ class Bridge:
         order = [6, 7, 8, 0, 1, 2]
         of_pose[:] = covariance[np.ix_(order, order)]
         rotation, velocity = np.asarray(pose.rotation), np.asarray(pose.velocity)
-        # The error of Rᵀ v: one of the yaw, which turns attitude and velocity, is none of it.
+        # The error of Rᵀ v: one of the yaw, which turns attitude and velocity, is none of it. So
+        # neither is the second order of such an error, which is in the covariance of v.
         by_error = rotation.T @ np.hstack([np.cross(np.eye(3), velocity), np.eye(3)])
-        of_twist[:3, :3] = by_error @ covariance[:6, :6] @ by_error.T
+        arc = np.asarray(arc_covariance(covariance)) if self._invariant else 0.0
+        of_twist[:3, :3] = by_error @ (covariance - arc)[:6, :6] @ by_error.T
         of_twist[3:, 3:] = -np.eye(3)
         return Odometry(
             (sec, nanosec),

@@ -11,7 +11,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 from tf2_ros import TransformBroadcaster
 
-from gnio_jax import networks
+from gnio_jax import filtering, networks
 from gnio_jax.apps.live.tracking import create_tracker
 from gnio_odometry.bridge import Bridge
 
@@ -34,7 +34,9 @@ class GnioOdometry(Node):
         self._imu = self.declare_parameter("imu_frame", "imu_link").value
         publish_tf = self.declare_parameter("publish_tf", True).value
         run = networks.load(network)
-        self._bridge = Bridge(create_tracker(run, rate or None, rest_seconds))
+        tracker = create_tracker(run, rate or None, rest_seconds)
+        ekf = filtering.make_filter(run.config.data, run.config.filter)
+        self._bridge = Bridge(tracker, ekf.config.invariant)
         self._publisher = self.create_publisher(Odometry, "odometry", 10)
         self._transforms = TransformBroadcaster(self) if publish_tf else None
         self.create_subscription(Imu, "imu", self._take, SENSOR_DATA)

@@ -6,6 +6,7 @@ What waits is bounded in number and in bytes. What is lost is counted and report
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import socket
@@ -24,6 +25,8 @@ MOST_MESSAGES, MOST_BYTES = 100_000, 32_000_000
 """Messages that wait for the filter, at most, and their size, bytes."""
 CHUNK = 65536
 """Bytes that are read at once, and largest datagram."""
+TAKEN_OVER = 2.0
+"""Silence after which the datagrams of another machine are read, s."""
 
 
 class Inbox:
@@ -102,23 +105,27 @@ def receive_datagrams(receiver: socket.socket, inbox: Inbox) -> None:
 
 
 class Datagrams:
-    """Reads the datagrams of one machine, that of the first sample. Two IMUs at one port would make
-    one path of both."""
+    """Reads the datagrams of one machine, until it is silent for `TAKEN_OVER` seconds: it may have
+    got another address. Two IMUs at one port would make one path of both."""
 
     def __init__(self, stated: Units):
         self._stated = stated
         self._machine: str | None = None
+        self._heard = -math.inf
+        """Time at which its newest sample was read, s by this machine."""
 
     def decode(self, datagram: tuple[bytes, str]) -> Iterator[Sample | str]:
         """The samples of a datagram, or why a line, or a sample of another machine, is refused."""
         content, machine = datagram
         for sample in parse_lines(content, self._stated):
-            if isinstance(sample, Sample):
-                self._machine = self._machine or machine
+            now = time.monotonic()
+            is_silent = now - self._heard > TAKEN_OVER
+            if isinstance(sample, Sample) and (is_silent or machine == self._machine):
+                self._machine, self._heard = machine, now
             if self._machine in (None, machine):
                 yield sample
             else:
-                yield f"comes from {machine}, and the first sample from {self._machine}"
+                yield f"comes from {machine}, and the samples before it from {self._machine}"
 
 
 def read_stream(stream: Any, name: str, stated: Units) -> Iterator[Arrival]:

@@ -178,7 +178,7 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_said():
 
 @pytest.mark.parametrize(
     ("read_as", "factor", "words"),
-    [("rad/s", 180 / np.pi, "deg/s"), ("deg/s", 65.5, "raw counts, 65.5 in 1 deg/s,")],
+    [("rad/s", 180 / np.pi, "deg/s"), ("deg/s", 65.5, "raw counts, 131 or 65.5 in 1 deg/s,")],
 )
 def test_degrees_are_not_taken_for_raw_counts(read_as, factor, words):
     """Read as rad/s, degrees are too large by about as much as 65.5 counts read as deg/s. The walk

@@ -31,6 +31,15 @@ from tests.support.live_streams import RATE, as_lines, of_lines, samples_of, tex
 from tests.support.rerun_files import columns_of
 
 
+@pytest.fixture(autouse=True)
+def handlers():
+    """The signals' handlers as they were."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture(scope="module")
 def recorded():
     return walked()
@@ -292,15 +301,12 @@ def test_a_terminal_that_is_closed_loses_nothing(run, recorded, monkeypatch, tmp
             raise OSError(errno.EIO, "Input/output error")
         say(text)
 
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     monkeypatch.setattr(Tracker, "push", push_and_hang_up)
     monkeypatch.setattr(console, "say", say_or_fail)
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
-    try:
-        with pytest.raises(SystemExit):
-            console.run(lambda: app.main(["live", "--network", str(run), "--out", str(out)]))
-    finally:
-        signal.signal(signal.SIGHUP, before)
+    with pytest.raises(SystemExit):
+        console.run(lambda: app.main(["live", "--network", str(run), "--out", str(out)]))
     np.testing.assert_allclose(read_tum(out).time, np.arange(10, 32) / 10, atol=1e-6)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from gnio_jax.apps.live import inbox as inboxes
 from gnio_jax.apps.live.inbox import Inbox, read_stream
-from gnio_jax.apps.live.samples import NO_SAMPLE, SI, parse_lines
+from gnio_jax.apps.live.samples import NO_SAMPLE, SI, Sample, parse_lines
 from gnio_jax.apps.live.sources import Stated, open_source
 from tests.support.live_streams import STILL, samples_of, texts_of
 
@@ -92,7 +92,20 @@ def test_the_datagrams_of_a_second_machine_are_refused(port):
     assert [sample.time for sample in samples_of(arrivals)] == list(range(1, 21, 2))
     refusals = texts_of(arrivals, "refusal")
     assert len(refusals) == 11 and refusals[0].startswith("is not a sample")
-    assert set(refusals[1:]) == {"comes from 127.0.0.2, and the first sample from 127.0.0.1"}
+    problem = "comes from 127.0.0.2, and the samples before it from 127.0.0.1"
+    assert set(refusals[1:]) == {problem}
+
+
+def test_a_machine_that_was_silent_may_have_another_address(monkeypatch):
+    clock = iter([0.0, 1.0, 2.5, 4.0, 7.0, 8.0])
+    monkeypatch.setattr(inboxes.time, "monotonic", lambda: next(clock))
+    reader = inboxes.Datagrams(SI)
+    senders = ["first", "first", "second", "first", "second", "first"]
+    accepted = [
+        isinstance(next(reader.decode((f"{k},{STILL}\n".encode(), machine))), Sample)
+        for k, machine in enumerate(senders)
+    ]
+    assert accepted == [True, True, False, True, True, False]
 
 
 def lines_of(content):

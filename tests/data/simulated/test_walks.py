@@ -38,17 +38,17 @@ def test_the_error_free_imu_integrates_to_the_trajectory(placement):
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 400.0])
 def test_a_walk_is_the_same_at_every_rate(rate):
-    usual, other = (
+    usual, resampled = (
         walks.pedestrian(3, 5, "pocket", 20.0, r, imu_errors=False) for r in (200.0, rate)
     )
     shared = min(rate, 200.0)
     usual_rows, rows = (slice(None, None, round(r / shared)) for r in (200.0, rate))
     for field in ("position", "velocity", "orientation"):
         expected = getattr(usual, field)[usual_rows]
-        np.testing.assert_allclose(getattr(other, field)[rows], expected, atol=1e-9)
+        np.testing.assert_allclose(getattr(resampled, field)[rows], expected, atol=1e-9)
     # Samples of a lower rate are means over longer intervals, so they are no larger.
-    strongest, other_strongest = (abs(walk.accel).max() for walk in (usual, other))
-    assert other_strongest < 1.02 * strongest
+    strongest, strongest_resampled = (abs(walk.accel).max() for walk in (usual, resampled))
+    assert strongest_resampled < 1.02 * strongest
 
 
 def test_every_walk_is_physical(val):
