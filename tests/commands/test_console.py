@@ -24,6 +24,7 @@ ROOT = Path(__file__).parents[2]
 def handlers(monkeypatch):
     """The signals' handlers as they were, and the caches' places."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run below nohup
     for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
         monkeypatch.setenv(name, os.environ.get(name, "0"))
     monkeypatch.setenv("MPLBACKEND", "agg")
