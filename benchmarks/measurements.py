@@ -26,7 +26,8 @@ import numpy as np
 
 from benchmarks import baseline
 from benchmarks.filter_throughput import DT, walk
-from gnio_jax import filtering, models, networks
+from benchmarks.odometry_throughput import trained
+from gnio_jax import filtering
 from gnio_jax.filtering import nonholonomic, wheel_speed, zero_velocity
 
 CONFIG = filtering.FilterConfig(DT, 10, 20)
@@ -76,13 +77,14 @@ def make_filter(name: str | None) -> tuple[Callable, filtering.Filter]:
     if name is None:
         noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, DT)
         return filtering.run_filter, filtering.Filter(CONFIG, noise)
-    loaded = networks.load(name)
-    predict = models.Network.of(loaded.model, loaded.variables).predict()
+    network, ekf = trained(name)
 
     def run(ekf, state, gyro, accel, displacement, covariance, measurements):
-        return filtering.run_odometry(predict, ekf, state, gyro, accel, measurements=measurements)
+        signals = gyro, accel
+        return filtering.run_odometry(
+            network.predict(), ekf, state, *signals, measurements=measurements
+        )
 
-    ekf = filtering.make_filter(loaded.config.data, loaded.config.filter)
     return run, replace(ekf, measurements=())
 
 

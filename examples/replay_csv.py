@@ -63,29 +63,19 @@ class ReplayResult:
 
 def read(path: Path) -> ImuSamples:
     """Read a CSV or HDF5. Raises `InputError` if a stamp is missing or does not increase."""
+    from gnio_jax.apps.live.sources import recorded_samples
     from gnio_jax.data.hdf5 import read_hdf5
     from gnio_jax.data.parsing.tables import read_text
     from gnio_jax.data.validation import check_increasing
 
     if path.suffix.lower() in (".h5", ".hdf5"):
-        return of_sequence(read_hdf5(path))
+        return ImuSamples(*recorded_samples(read_hdf5(path)))
     table = read_text(path)
     stamps = table.take("time")  # every sample needs one
     check_increasing(stamps, path)
     # A sensor that missed a sample leaves its columns empty.
     gyro, accel = table.axes("gyro_", gaps=True), table.axes("accel_", gaps=True)
     return ImuSamples(stamps, gyro, accel)
-
-
-def of_sequence(sequence) -> ImuSamples:
-    """The samples of a recording of the package, with the stamps of its own clock. Those that an
-    import has interpolated across a gap are missing."""
-    time = sequence.time + float(sequence.attributes.get("start_time", 0.0))
-    measured = np.ones(len(time), bool) if sequence.imu_valid is None else sequence.imu_valid
-    gyro, accel = (
-        np.where(measured[:, None], signal, np.nan) for signal in (sequence.gyro, sequence.accel)
-    )
-    return ImuSamples(time, gyro, accel)
 
 
 def create_tracker(run, recorded: ImuSamples, rest_seconds: float):

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data, models
+from gnio_jax.data.hdf5 import write_hdf5
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -28,18 +29,20 @@ def test_the_walk_of_the_gradients_example_has_its_true_start_and_displacements(
     assert np.abs(error).max() < 5 * 0.05 and 0.03 < error.std() < 0.07
 
 
-def test_what_an_import_has_bridged_is_missing_in_a_replay():
+def test_what_an_import_has_bridged_is_missing_in_a_replay(tmp_path):
     """Half a second without samples, in a file that an import has put on a uniform clock."""
-    of_sequence = runpy.run_path(str(EXAMPLES / "replay_csv.py"))["of_sequence"]
+    read = runpy.run_path(str(EXAMPLES / "replay_csv.py"))["read"]
     walk = data.load("synthetic", split="test")[0]
     measured = ~((walk.time > 3.0) & (walk.time < 3.5))
     imported = walk._replace(imu_valid=measured, attributes={"start_time": 1.7e9})
-    samples = of_sequence(imported)
+    for name, sequence in (("imported", imported), ("walk", walk)):
+        write_hdf5(tmp_path / f"{name}.h5", sequence)
+    samples = read(tmp_path / "imported.h5")
     for signal, original in zip(samples[1:], (walk.gyro, walk.accel), strict=True):
         np.testing.assert_array_equal(np.isnan(signal), np.tile(~measured[:, None], (1, 3)))
         np.testing.assert_array_equal(signal[measured], original[measured])
     np.testing.assert_allclose(samples.time - 1.7e9, walk.time, atol=1e-6)
-    assert np.isfinite(of_sequence(walk).gyro).all()
+    assert np.isfinite(read(tmp_path / "walk.h5").gyro).all()
 
 
 def test_the_network_of_its_own_is_that_of_the_page():

@@ -116,21 +116,23 @@ def contradiction(imu: ImuSamples, read_as: str | None = None) -> tuple[float, s
         problem = f"by the turning of gravity its samples come {factor:g} times {word} than its"
         remedy = "the clock is wrong: give --time-unit (s per stamp) or --sample-rate (Hz)"
         readings.append((*agreement(imu, clock=clock), f"{problem} stamps say", remedy))
-    looks = [(unit, unit, scale) for unit, scale in SCALES.items() if unit != read_as]
+    looks = [
+        (agreement(imu, scale), unit, unit) for unit, scale in SCALES.items() if unit != read_as
+    ]
     # One count in 65.5 is almost 1 deg/s, so it matters as what they were read.
     degree = DEGREE if read_as == "rad/s" else 1.0
-    by_counts = {n: agreement(imu, degree / n)[0] for n in COUNTS_OF_DEGREE}
-    best_counts = min(by_counts, key=lambda n: by_counts[n])
-    likely = [f"{n:g}" for n, other in by_counts.items() if other <= DOUBT * by_counts[best_counts]]
+    by_counts = {n: agreement(imu, degree / n) for n in COUNTS_OF_DEGREE}
+    best_counts = min(by_counts, key=lambda n: by_counts[n][0])
+    best_error = by_counts[best_counts][0]
+    likely = [f"{n:g}" for n, (other, _) in by_counts.items() if other <= DOUBT * best_error]
     unit = f"{best_counts:g}/deg/s"
     if len(likely) > 1:  # gravity does not tell them apart
         unit += f" (or another of {' and '.join(likely)}, by the sensor's data sheet)"
-    words = f"raw counts, {' or '.join(likely)} in 1 deg/s,"
-    looks.append((words, unit, degree / best_counts))
-    for words, unit, scale in looks:
+    looks.append((by_counts[best_counts], f"raw counts, {' or '.join(likely)} in 1 deg/s,", unit))
+    for agreed, words, unit in looks:
         problem = f"its gyro looks like {words} by the turning of gravity, and not as it was read"
         remedy = f"state the unit of the gyro, as by --gyro-unit {unit}"
-        readings.append((*agreement(imu, scale), problem, remedy))
+        readings.append((*agreed, problem, remedy))
     errors = _errors(imu, _window(imu), _SIGNED)
     assert errors is not None  # as for the stated reading
     best = _SIGNED[np.argmin(errors)]

@@ -20,6 +20,7 @@ from gnio_jax.apps.live.samples import Arrival, Sample, Units
 from gnio_jax.apps.live.sensor_logger import SensorLogger
 from gnio_jax.apps.live.server import PageServer, listen
 from gnio_jax.config import ImportOptions
+from gnio_jax.data.physics import ImuSamples
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
@@ -145,18 +146,24 @@ def recording(name: str, stated: Stated) -> Source:
 
 
 def play(sequence: Sequence, speed: float) -> Iterator[Arrival]:
-    """The samples of a recording with the stamps of its own clock, `speed` times as fast as they
-    were recorded; 0: as fast as possible. Samples that are interpolated across a gap are
-    missing."""
-    begin, first, measured = time.monotonic(), float(sequence.time[0]), sequence.imu_valid
-    start_time = float(sequence.attributes.get("start_time", 0.0))
-    missing = np.zeros((len(sequence.time), 1), bool) if measured is None else ~measured[:, None]
-    signals = (np.where(missing, np.nan, signal) for signal in (sequence.gyro, sequence.accel))
-    for stamp, gyro, accel in zip(sequence.time, *signals, strict=True):
+    """The `recorded_samples` of a sequence, `speed` times as fast as they were recorded; 0: as fast
+    as possible."""
+    imu = recorded_samples(sequence)
+    begin, first = time.monotonic(), imu.time[0]
+    for stamp, gyro, accel in zip(*imu, strict=True):
         if speed > 0:
             time.sleep(max(0.0, begin + (stamp - first) / speed - time.monotonic()))
-        sample = Sample(start_time + float(stamp), tuple(gyro.tolist()), tuple(accel.tolist()))
+        sample = Sample(float(stamp), tuple(gyro.tolist()), tuple(accel.tolist()))
         yield Arrival(time.monotonic(), sample)
+
+
+def recorded_samples(sequence: Sequence) -> ImuSamples:
+    """The samples of a recording with the stamps of its own clock. Those that an import has
+    interpolated across a gap are NaN."""
+    time_of_start = float(sequence.attributes.get("start_time", 0.0))
+    measured = True if sequence.imu_valid is None else sequence.imu_valid[:, None]
+    signals = (np.where(measured, signal, np.nan) for signal in (sequence.gyro, sequence.accel))
+    return ImuSamples(sequence.time + time_of_start, *signals)
 
 
 SOURCES = {
