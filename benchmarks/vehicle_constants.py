@@ -2,6 +2,7 @@
 
     python -m benchmarks.vehicle_constants --data-root DIR [--folds 3] [--only 0 1 2]
         [--low-pass 0.03 0.06 0.09] [--without mounting_std mounting_seconds lever_std]
+        [--all-drives]
 
 The drives of a fold are held out whole; without `--folds` each drive is a fold of its own. All is
 chosen by the other drives, and the held-out drives are measured once:
@@ -19,7 +20,9 @@ gets no displacement and no rest. `--low-pass 0` is the same protocol with the l
 `--without` names numbers of the constraint that are not fitted: gradients are zero then, and the
 mounting and the lever are no states without `mounting_std mounting_seconds lever_std`. The lines of
 the defaults are of the start of the fit, which has these states unless they are left out. `--only`
-runs some folds. The brackets are 95 % intervals of a bootstrap over drives (10,000 draws).
+runs some folds. With `--all-drives` none is held out, and the settings of the fit are printed as
+in `configs/vehicles.yaml`. The brackets are 95 % intervals of a bootstrap over drives (10,000
+draws).
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
@@ -37,6 +40,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy.optimize import least_squares  # noqa: E402
 
+from gnio_jax import config as configuration  # noqa: E402
 from gnio_jax import data  # noqa: E402
 from gnio_jax.config import DataConfig, FilterSettings  # noqa: E402
 from gnio_jax.evaluation.metrics import pieces  # noqa: E402
@@ -316,6 +320,19 @@ def describe_errors(errors: Mapping[str, np.ndarray]) -> str:
     )
 
 
+def describe_settings(settings: FilterSettings) -> str:
+    """The constants of the fit as lines of a configuration."""
+    values = configuration.flatten(settings)
+    numbers: dict[str, Any] = {}
+    for name in ("low_pass_seconds", *UNITS):
+        *groups, constant = name.split(".")
+        section = numbers
+        for group in groups:
+            section = section.setdefault(group, {})
+        section[constant] = float(f"{float(values[name]):.3g}")
+    return configuration.to_yaml({"filter": numbers}).rstrip()
+
+
 def load_drives(root: str | None, folds: int | None) -> tuple[list[Drive], dict[str, int]]:
     """The drives that have a piece, by name, and the fold of each group: `folds` ones, which depend
     on the names and lengths of all drives, or one for each group."""
@@ -341,6 +358,9 @@ def main() -> None:
     parser.add_argument("--only", type=int, nargs="+", help="folds to run; default: all")
     parser.add_argument("--low-pass", type=float, nargs="+", default=[0.03, 0.06, 0.09])
     parser.add_argument("--without", nargs="+", default=[], help="numbers that are not fitted")
+    parser.add_argument(
+        "--all-drives", action="store_true", help="fit to all drives; hold none out"
+    )
     arguments = parser.parse_args()
     for name in arguments.without:
         if UNITS.pop(f"measurements.nonholonomic.{name}", None) is None:
@@ -357,6 +377,12 @@ def main() -> None:
     defaults = np.zeros(len(UNITS))
     unchanged = {drive.name: measure_drive(drive, 0.0, defaults) for drive in drives}
     print(f"defaults, low-pass left in: {describe_errors(unchanged)}", flush=True)
+    if arguments.all_drives:
+        tau, penalty, point = choose(drives, arguments.low_pass)
+        fitted = {drive.name: measure_drive(drive, tau, point) for drive in drives}
+        print(f"constants of all drives, on them: {describe_errors(fitted)}")
+        print(f"penalty {penalty:g}\n{describe_settings(settings_at(tau, point))}", flush=True)
+        return
     default_errors, errors = {}, {}
     for number in numbers:
         training = [drive for drive in drives if fold_of[drive.group] != number]

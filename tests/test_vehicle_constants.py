@@ -21,10 +21,12 @@ from benchmarks.vehicle_constants import (
     relative_errors,
     settings_at,
 )
+from gnio_jax import config as configuration
 from gnio_jax.evaluation.metrics import piece_errors
 from gnio_jax.evaluation.prepare import prepare
 from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.filtering import initial_state, make_filter, run_filter
+from gnio_jax.filtering.settings import free_parameters
 from gnio_jax.numerics import quaternion_from_matrix, quaternions
 from gnio_jax.types import Sequence
 
@@ -227,6 +229,24 @@ def test_the_program_prints_the_errors_of_all_drives_and_runs_a_part_of_the_fold
     monkeypatch.setattr(sys, "argv", [*words, "--only", "3"])
     vehicle_constants.main()
     assert "fold 3, drive 3: " in capsys.readouterr().out
+
+
+def test_the_constants_of_all_drives_are_printed_as_a_file_has_them(sequences, monkeypatch, capsys):
+    monkeypatch.setattr(vehicle_constants, "PENALTIES", (0.03,))
+    monkeypatch.setattr(vehicle_constants, "STEPS", 2)
+    monkeypatch.setattr(vehicle_constants.data, "load", lambda *_: sequences)
+    words = "vehicle_constants --low-pass 0.06 --all-drives".split()
+    monkeypatch.setattr(sys, "argv", words)
+    vehicle_constants.main()
+    head, lines = capsys.readouterr().out.split("filter:\n")
+    loaded, _ = vehicle_constants.load_drives(None, None)
+    _, _, point = choose(loaded, [0.06])
+    assert "constants of all drives, on them: all pieces " in head and np.any(point)
+    settings = configuration.parse("filter:\n" + lines, "fit").filter
+    expected = free_parameters(settings_at(0.06, point), UNITS)
+    for name, value in free_parameters(settings, UNITS).items():
+        assert float(value) == pytest.approx(float(expected[name]), abs=0.01), name
+    assert settings.low_pass_seconds == 0.06
 
 
 def test_a_fold_that_does_not_exist_is_refused(sequences, monkeypatch, capsys):
