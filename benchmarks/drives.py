@@ -70,10 +70,11 @@ ORIGIN = Place(45.0, -93.0, 250.0)
 def with_states(config: TrainConfig, states: dict[str, float], **others: float) -> TrainConfig:
     """The configuration of a car's filter with these states, and with other numbers of the
     constraint."""
-    measurements = dict(config.filter.measurements)
     names = STATES[list(STATES)[-1]]
-    numbers = {k: v for k, v in measurements["nonholonomic"].items() if k not in names}
-    measurements["nonholonomic"] = {**numbers, **states, **others}
+    constraint = config.filter.measurements["nonholonomic"] or {}
+    numbers = {name: value for name, value in constraint.items() if name not in names}
+    changed = {"nonholonomic": {**numbers, **states, **others}}
+    measurements = {**config.filter.measurements, **changed}
     settings = dataclasses.replace(config.filter, measurements=measurements)
     return dataclasses.replace(config, filter=settings)
 
