@@ -467,7 +467,16 @@ class MetricInputs(NamedTuple):
     def nees(self) -> Float[np.ndarray, "n"]:
         """eᵀ P⁻¹ e of the position: the error of the start-aligned estimate, turned back into the
         filter's world. NaN without a reference, and where P is zero, as at a start that was given
-        as exact."""
+        as exact.
+
+        Raises `Undefined` if the estimate is aligned at a later row than its first. The covariance
+        of an error since row m is P_kk + P_mm − P_km − P_mk, without the effect of the yaw at m.
+        The filter does not keep the covariance between two rows, and P_kk alone is too large.
+        """
+        late = int(np.argmax(self.raw.known & self.reference.known))
+        if late:
+            seconds = self.raw.time[late] - self.raw.time[0]
+            raise Undefined(f"the reference begins {seconds:.1f} s after the filter's start")
         yaw = relative_yaw(self.raw.orientation[:1], self.started.orientation[:1])[0]
         error = (self.started.position - self.reference.position) @ rotation_z(yaw).T
         covariance, dims = self.filter_results().covariance, self.dims
@@ -570,8 +579,9 @@ def measure(
 
     `ate*`, `rte*`, `drift` and `yaw_rmse` use the estimate with `alignment`, which is fitted in 3-D
     for the horizontal metrics too. NEES uses alignment at the start, because the filter's
-    covariance is relative to its start. An estimate with a row that is not finite has diverged:
-    every metric that a finite one would have is infinite, and the shares are 0.
+    covariance is relative to its start; it has no value if the reference begins later. An estimate
+    with a row that is not finite has diverged: every metric that a finite one would have is
+    infinite, and the shares are 0.
 
     Args:
         estimate: The estimated poses.

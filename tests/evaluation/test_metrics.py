@@ -318,6 +318,23 @@ def test_nees_does_not_depend_on_the_frame():
     assert straight["nees"] == pytest.approx(np.mean(np.sum((error / sigma) ** 2, 1)) / 3)
 
 
+def test_nees_has_no_value_where_the_reference_begins_after_the_start():
+    """The errors since a later row are smaller than those that the covariance counts."""
+    truth, results = walk(), filtered(EYES, 3.0)
+    names = ("nees", "nees_2d", "nees_coverage", "nees_coverage_2d")
+    whole = metrics.measure(perturbed(truth), truth, filtered=results)
+    assert not whole.reasons and all(whole.values[name] > 0 for name in names)
+    for row, seconds in ((1, "0.1"), (450, "45.0")):
+        late = masked(truth, slice(0, row))
+        measures = metrics.measure(perturbed(truth), late, filtered=results)
+        for name in names:
+            assert measures.values[name] is None
+            reason = f"the reference begins {seconds} s after the filter's start"
+            assert measures.reasons[name] == reason
+        assert measures.values["nis"] == pytest.approx(1.0) and measures.values["ate"] > 0
+        assert not measures.diverged
+
+
 def test_a_singular_or_indefinite_covariance_has_an_infinite_nees():
     truth, covariance = walk(), EYES.copy()
     for bad in (
