@@ -80,7 +80,7 @@ def body_velocity(prediction: Prediction, windows: Windows) -> Float[Array, ""]:
 
 def bins(prediction: Prediction, windows: Windows, axes: int) -> Float[Array, ""]:
     """VeloBins: Huber's loss of the mean plus the divergence KL(label ‖ prediction), sums over the
-    axes. There is no likelihood.
+    axes, which are those of the uncertainty (`Prediction.axes`). There is no likelihood.
 
     The label is a Gaussian about the truth, integrated over the bins and tilted exponentially to
     the exact mean. Its σ is the present error, at least a tenth of a bin, without gradient.
@@ -89,8 +89,12 @@ def bins(prediction: Prediction, windows: Windows, axes: int) -> Float[Array, ""
         refuse("bins", "a network with model.head: bins")
     logits = prediction.diagnostics["bin_logits"][:, :axes]
     centres = centres_of(prediction.diagnostics["bin_reach"][0], logits.shape[-1])
-    error = (windows.displacement - prediction.displacement)[:, :axes]
-    label = jax.lax.stop_gradient(_label(windows.displacement[:, :axes], error, centres))
+    truth, mean = (
+        prediction.along_axes(part[:, :axes])
+        for part in (windows.displacement, prediction.displacement)
+    )
+    error = truth - mean
+    label = jax.lax.stop_gradient(_label(truth, error, centres))
     logs = jax.nn.log_softmax(logits, axis=-1)
     entropy = jnp.sum(jnp.where(label > 0, label * jnp.log(jnp.maximum(label, 1e-30)), 0.0), -1)
     divergence = entropy - jnp.sum(label * logs, axis=-1)
