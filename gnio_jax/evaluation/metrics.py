@@ -473,9 +473,9 @@ class MetricInputs(NamedTuple):
         of an error since row m is P_kk + P_mm − P_km − P_mk, without the effect of the yaw at m.
         The filter does not keep the covariance between two rows, and P_kk alone is too large.
         """
-        late = int(np.argmax(self.raw.known & self.reference.known))
-        if late:
-            seconds = self.raw.time[late] - self.raw.time[0]
+        aligned_row = int(np.argmax(self.raw.known & self.reference.known))
+        if aligned_row:
+            seconds = self.raw.time[aligned_row] - self.raw.time[0]
             raise Undefined(f"the reference begins {seconds:.1f} s after the filter's start")
         yaw = relative_yaw(self.raw.orientation[:1], self.started.orientation[:1])[0]
         error = (self.started.position - self.reference.position) @ rotation_z(yaw).T

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from gnio_jax.config import LossConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models.airimu import LIKELIHOOD_WEIGHT, huber_loss
-from gnio_jax.models.airio import body_axes, label_rows
+from gnio_jax.models.airio import body_axes, label_rows, velocities, with_end
 from gnio_jax.models.bins import centres_of
 from gnio_jax.models.equivariance import turn, turn_windows
 from gnio_jax.types import Prediction, Windows
@@ -65,13 +65,14 @@ def polar(prediction: Prediction, windows: Windows, config: LossConfig) -> Float
 
 def body_velocity(prediction: Prediction, windows: Windows) -> Float[Array, ""]:
     """AirIO: 100 (Huber + 1e-4 (e²/σ² + ln σ²)), means over samples and axes. Velocities are metres
-    per window."""
+    per window. Velocity and attitude of a target are those at the same time (`label_rows`): for the
+    last one at the window's end, where the filter measures it."""
     diagnostics, samples = prediction.diagnostics, windows.steps.shape[1]
     if "body_velocity" not in diagnostics:
         refuse("body_velocity", "velocities of the body, as the network airio gives")
     rows = label_rows(samples)
-    axes = body_axes(windows.imu[:, rows])
-    truth = jnp.einsum("bnij,bni->bnj", axes, samples * windows.steps[:, rows])
+    axes = with_end(body_axes(windows.imu))[:, rows]
+    truth = jnp.einsum("bnij,bni->bnj", axes, samples * velocities(windows.steps)[:, rows])
     error, log_std = truth - diagnostics["body_velocity"], diagnostics["body_velocity_log_std"]
     likelihood = error**2 * jnp.exp(-2 * log_std) + 2 * log_std
     huber = huber_loss(error, VELOCITY_HUBER)
