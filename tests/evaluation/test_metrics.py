@@ -325,8 +325,8 @@ def test_nees_has_no_value_where_the_reference_begins_after_the_start():
     whole = metrics.measure(perturbed(truth), truth, filtered=results)
     assert not whole.reasons and all(whole.values[name] > 0 for name in names)
     for row, seconds in ((1, "0.1"), (450, "45.0")):
-        late = masked(truth, slice(0, row))
-        measures = metrics.measure(perturbed(truth), late, filtered=results)
+        reference = masked(truth, slice(0, row))
+        measures = metrics.measure(perturbed(truth), reference, filtered=results)
         for name in names:
             assert measures.values[name] is None
             reason = f"the reference begins {seconds} s after the filter's start"
