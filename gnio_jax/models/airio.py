@@ -139,7 +139,7 @@ def label_rows(samples: int) -> Int[np.ndarray, "m"]:
 def label_shares(samples: int) -> Float[np.ndarray, "m"]:
     """Shares of the window in which the velocity of each of `label_rows` is the nearest one in
     time. They add up to 1."""
-    edges = np.concatenate([[0.0], midpoints(label_rows(samples)), [samples]])
+    edges = np.concatenate([[0.0], midpoints(label_rows(samples).astype(float)), [samples]])
     return (np.diff(edges) / samples).astype(np.float32)
 
 
