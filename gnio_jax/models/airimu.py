@@ -25,6 +25,7 @@ from gnio_jax.models.airio import (
     rotation_vector,
 )
 from gnio_jax.models.bidirectional import Recurrence
+from gnio_jax.models.layers import checked_windows
 from gnio_jax.types import GRAVITY, Prediction
 
 ACCEL_UNIT, GYRO_UNIT = 0.1, np.pi / 180
@@ -131,7 +132,7 @@ class Corrected(nn.Module):
     def __call__(
         self, windows: Float[Array, "b n 12"], train: bool = False, **constants: Any
     ) -> Prediction:
-        windows = windows.astype(jnp.float32)
+        windows = checked_windows(windows, self.channels)
         rotation, shape = body_axes(windows), windows.shape
         vectors = windows[..., :6].reshape(*shape[:2], 2, 3)
         body = jnp.einsum("bnij,bnki->bnkj", rotation, vectors).reshape(*shape[:2], 6)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from gnio_jax.config.schema import Count, Probability
 from gnio_jax.models.bidirectional import Bidirectional
 from gnio_jax.models.convolution import convolve, convolve_forward
-from gnio_jax.models.layers import EPSILON, FLOAT32, MOMENTUM, linear
+from gnio_jax.models.layers import EPSILON, FLOAT32, MOMENTUM, checked_windows, linear
 from gnio_jax.numerics import midpoints
 from gnio_jax.types import Prediction, Velocity
 
@@ -52,7 +52,7 @@ class AirIO(nn.Module):
 
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 12"], train: bool = False) -> Prediction:
-        windows = windows.astype(jnp.float32)
+        windows = checked_windows(windows, self.channels)
         rotation = body_axes(windows)
         imu = windows[..., :6].reshape(*windows.shape[:2], 2, 3)
         body = jnp.einsum("bnij,bnki->bnkj", rotation, imu).reshape(*windows.shape[:2], 6)

@@ -196,7 +196,7 @@ class DeviceHeading(SeesDevice, Equivariant):
     def __call__(
         self, windows: Float[Array, "b n 12"], train: bool = False, **constants: Any
     ) -> Prediction:
-        windows = windows.astype(jnp.float32)
+        windows = checked_windows(windows, self.channels)
         x_axis, y_axis = windows[..., 6:9], windows[..., 9:12]
         up = vertical_of_normal(x_axis, y_axis)
         faces_up = (up.mean(axis=1) > jnp.float32(self.least_up))[:, None]

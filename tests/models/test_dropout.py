@@ -68,9 +68,9 @@ def test_airimu_drops_a_tenth_of_its_units():
     with watch(calls):
         model.apply(variables, windows, train=True, **options)
     assert len(calls) == 2
-    for _, units, left in calls:
+    for _, units, output in calls:
         present = np.asarray(units) != 0
-        dropped = np.asarray(left)[present] == 0
+        dropped = np.asarray(output)[present] == 0
         assert np.mean(dropped) == pytest.approx(0.1, abs=0.01)
         kept = np.asarray(units)[present][~dropped] / 0.9
-        np.testing.assert_allclose(np.asarray(left)[present][~dropped], kept, rtol=1e-5)
+        np.testing.assert_allclose(np.asarray(output)[present][~dropped], kept, rtol=1e-5)
