@@ -72,5 +72,5 @@ def test_airimu_drops_a_tenth_of_its_units():
         present = np.asarray(units) != 0
         dropped = np.asarray(output)[present] == 0
         assert np.mean(dropped) == pytest.approx(0.1, abs=0.01)
-        kept = np.asarray(units)[present][~dropped] / 0.9
-        np.testing.assert_allclose(np.asarray(output)[present][~dropped], kept, rtol=1e-5)
+        scaled = np.asarray(units)[present][~dropped] / 0.9
+        np.testing.assert_allclose(np.asarray(output)[present][~dropped], scaled, rtol=1e-5)
