@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import gammaincinv
 
+from gnio_jax.data.reference import JUMP_MARGIN
 from gnio_jax.evaluation.trajectory import (
     Alignment,
     Quaternions,
@@ -25,7 +26,7 @@ from gnio_jax.evaluation.trajectory import (
     positions_at,
     relative_yaw,
 )
-from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotation_z, spans
+from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotation_z, spans, stretches
 from gnio_jax.types import KITTI_LENGTHS, Waypoints
 
 Positions = Float[np.ndarray, "n d"]
@@ -40,6 +41,10 @@ LEAST_LEG = 1.0
 """Length of a leg below which the ratio of lengths is not meaningful, m."""
 APART = 0.25
 """Largest relative error of the time between two rows that are compared (ours)."""
+LONGEST_HOLE = 2 * JUMP_MARGIN
+"""Longest time between two trusted rows that a straight line joins where the distance along the
+reference is summed, s (ours). Around a jump of the reference a longer time is not trusted, so that
+no jump counts as a distance."""
 LEAST_SECONDS = 10.0
 """Time below which `yaw_drift` is undefined, s."""
 
@@ -80,20 +85,20 @@ def rte(estimate: Positions, reference: Positions, step: float, seconds: float =
     return _rms_of_pairs(error[lag:] - error[:-lag], finite_rows(reference), lag, seconds)
 
 
-def rte_distance(estimate: Positions, reference: Positions, metres: float) -> float:
+def rte_distance(estimate: Positions, reference: Positions, step: float, metres: float) -> float:
     """RMS of the error of displacements over `metres` walked, from every row, m (D-RTE of CTIN and
     iMoT).
 
-    A displacement ends at the first row by which the reference has walked `metres`. The distance
-    walked is summed from row to row, within an unbroken stretch of the reference.
+    A displacement ends at the first row by which the reference has walked `metres`, summed from row
+    to row (`_walked_distances`). It counts if both of its ends are trusted.
     """
+    trusted, error = finite_rows(reference), estimate - reference
     errors = [np.zeros((0, estimate.shape[1]))]
-    for start, stop in spans(finite_rows(reference)):
-        truth, error = reference[start:stop], (estimate - reference)[start:stop]
-        walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth, axis=0), axis=1))])
+    for first, walked in _walked_distances(reference, step):
         end = np.searchsorted(walked, walked + metres - 1e-9)
         begin = np.flatnonzero(end < len(walked))
-        errors.append(error[end[begin]] - error[begin])
+        i, j = first + begin, first + end[begin]
+        errors.append((error[j] - error[i])[trusted[i] & trusted[j]])
     return _rms(np.concatenate(errors), f"no unbroken reference of {metres:g} m")
 
 
@@ -192,6 +197,26 @@ def path_length(position: Positions, step: float, seconds: float = 1.0) -> float
     return float(sides[np.diff(corners) <= 2 * stretch].sum())
 
 
+def _walked_distances(
+    reference: Positions, step: float
+) -> Iterator[tuple[int, Float[np.ndarray, "m"]]]:
+    """The unbroken stretches of the reference: the first row of each, and the distance walked from
+    there to each of its rows, m.
+
+    The distance is summed from row to row. Trusted rows that are at most `LONGEST_HOLE` apart are
+    joined by a straight line, on which the distance of the rows between them is interpolated.
+    """
+    trusted = np.flatnonzero(finite_rows(reference))
+    if not len(trusted):
+        return
+    most = max(1.0, LONGEST_HOLE / step * (1 + 1e-6))
+    for part in stretches(np.diff(trusted) > most):
+        rows = trusted[part]
+        sides = np.linalg.norm(np.diff(reference[rows], axis=0), axis=1)
+        distance = np.concatenate([[0.0], np.cumsum(sides)])
+        yield int(rows[0]), np.interp(np.arange(rows[0], rows[-1] + 1), rows, distance)
+
+
 def path_length_ratio(estimate: Positions, reference: Positions, step: float) -> float:
     """Estimated over true `path_length` where the reference is trusted: 1 is correct, 0 is an
     estimate that never moved."""
@@ -226,12 +251,11 @@ def standing(reference: Positions, step: float) -> Bool[np.ndarray, "n"]:
 def stationary_drift(estimate: Positions, reference: Positions, step: float) -> float:
     """Metres that the estimate walks (`path_length`) per minute in which the reference stands still
     (`standing`). A gate on the displacement should reduce this drift (GNIO)."""
-    rests = spans(standing(reference, step))
-    stretches = [(start, stop) for start, stop in rests if stop - start > 1]
-    if not stretches:
+    rests = [(start, stop) for start, stop in spans(standing(reference, step)) if stop - start > 1]
+    if not rests:
         raise Undefined(f"the reference never stands still for {STANDING_SECONDS:g} s")
-    walked = sum(path_length(estimate[start:stop], step) for start, stop in stretches)
-    seconds = sum((stop - 1 - start) * step for start, stop in stretches)
+    walked = sum(path_length(estimate[start:stop], step) for start, stop in rests)
+    seconds = sum((stop - 1 - start) * step for start, stop in rests)
     return float(walked / (seconds / 60))
 
 
@@ -315,9 +339,9 @@ def piece_errors(
     """Errors of translation (m) and rotation (rad) over pieces, divided by their length.
 
     A piece of ℓ metres begins at row i and ends at the first row j by which the reference has moved
-    further than ℓ, summed from row to row within an unbroken stretch. Its error is the motion
-    (T_i⁻¹ T_j of the estimate)⁻¹ (T_i⁻¹ T_j of the reference). Raises `Undefined` where no unbroken
-    stretch is longer than 100 m.
+    further than ℓ, summed from row to row (`_walked_distances`). It counts if the pose of the
+    reference is trusted at i and at j. Its error is the motion (T_i⁻¹ T_j of the estimate)⁻¹
+    (T_i⁻¹ T_j of the reference). Raises `Undefined` where no unbroken stretch is longer than 100 m.
     """
     i, j, length = pieces(reference, step)
     if not len(i):
@@ -335,15 +359,14 @@ def piece_errors(
 def pieces(reference: Trajectory, step: float) -> Int[np.ndarray, "3 m"]:
     """First row, last row and nominal length (m) of the pieces of `piece_errors`."""
     every, parts = max(1, round(1.0 / step)), [np.zeros((3, 0), int)]
-    trusted = finite_rows(reference.position) & finite_rows(reference.orientation)
-    for start, stop in spans(trusted):
-        sides = np.linalg.norm(np.diff(reference.position[start:stop], axis=0), axis=1)
-        distance = np.concatenate([[0.0], np.cumsum(sides)])
-        begins = np.arange(0, stop - start, every)
+    for first, distance in _walked_distances(reference.position, step):
+        begins = np.arange(0, len(distance), every)
         for length in KITTI_LENGTHS:
             end = np.searchsorted(distance, distance[begins] + length, side="right")
-            rows = np.stack([begins + start, end + start, np.full(len(end), length)])
-            parts.append(rows[:, end < stop - start])
+            within = end < len(distance)
+            i, j = first + begins[within], first + end[within]
+            rows = np.stack([i, j, np.full(len(i), length)])
+            parts.append(rows[:, reference.known[i] & reference.known[j]])
     return np.concatenate(parts, axis=1)
 
 
@@ -444,7 +467,16 @@ class MetricInputs(NamedTuple):
     def nees(self) -> Float[np.ndarray, "n"]:
         """eᵀ P⁻¹ e of the position: the error of the start-aligned estimate, turned back into the
         filter's world. NaN without a reference, and where P is zero, as at a start that was given
-        as exact."""
+        as exact.
+
+        Raises `Undefined` if the estimate is aligned at a later row than its first. The covariance
+        of an error since row m is P_kk + P_mm − P_km − P_mk, without the effect of the yaw at m.
+        The filter does not keep the covariance between two rows, and P_kk alone is too large.
+        """
+        aligned_row = int(np.argmax(self.raw.known & self.reference.known))
+        if aligned_row:
+            seconds = self.raw.time[aligned_row] - self.raw.time[0]
+            raise Undefined(f"the reference begins {seconds:.1f} s after the filter's start")
         yaw = relative_yaw(self.raw.orientation[:1], self.started.orientation[:1])[0]
         error = (self.started.position - self.reference.position) @ rotation_z(yaw).T
         covariance, dims = self.filter_results().covariance, self.dims
@@ -465,8 +497,8 @@ SPATIAL: dict[str, Metric] = {
     "ate_max": lambda c: float(np.max(c.errors)),
     "rte_60s": lambda c: rte(*c.paths, c.step),
     "rte_60s_ronin": lambda c: rte(*c.paths, c.step) / math.sqrt(c.dims),
-    "rte_1m": lambda c: rte_distance(*c.paths, 1.0),
-    "rte_10m": lambda c: rte_distance(*c.paths, 10.0),
+    "rte_1m": lambda c: rte_distance(*c.paths, c.step, 1.0),
+    "rte_10m": lambda c: rte_distance(*c.paths, c.step, 10.0),
     "rpe_1s": lambda c: rpe(c.raw, c.reference, c.step, 1.0, c.dims),
     "rpe_10s": lambda c: rpe(c.raw, c.reference, c.step, 10.0, c.dims),
     "rpe_se3": lambda c: rpe(c.raw, c.reference, c.step, 1.0, c.dims, full=True),
@@ -547,8 +579,9 @@ def measure(
 
     `ate*`, `rte*`, `drift` and `yaw_rmse` use the estimate with `alignment`, which is fitted in 3-D
     for the horizontal metrics too. NEES uses alignment at the start, because the filter's
-    covariance is relative to its start. An estimate with a row that is not finite has diverged:
-    every metric that a finite one would have is infinite, and the shares are 0.
+    covariance is relative to its start; it has no value if the reference begins later. An estimate
+    with a row that is not finite has diverged: every metric that a finite one would have is
+    infinite, and the shares are 0.
 
     Args:
         estimate: The estimated poses.

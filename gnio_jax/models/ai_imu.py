@@ -16,7 +16,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from gnio_jax.models.airio import body_axes
-from gnio_jax.models.layers import FLOAT32, linear
+from gnio_jax.models.layers import FLOAT32, checked_windows, linear
 from gnio_jax.types import GRAVITY, NONHOLONOMIC_LOG_FACTOR, Prediction
 
 SAMPLES = 17
@@ -52,10 +52,11 @@ class AIIMU(nn.Module):
 
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 12"], train: bool = False) -> Prediction:
+        windows = checked_windows(windows, self.channels)
         if windows.shape[1] < SAMPLES:
             samples = windows.shape[1]
             raise ValueError(f"windows must have at least {SAMPLES} samples, found {samples}")
-        windows = windows[:, -SAMPLES:].astype(jnp.float32)
+        windows = windows[:, -SAMPLES:]
         imu = windows[..., :6].reshape(*windows.shape[:2], 2, 3)
         body = jnp.einsum("bnij,bnki->bnkj", body_axes(windows), imu)
         x = (body.reshape(*windows.shape[:2], 6) - MEAN[None, None]) / STD[None, None]

@@ -25,6 +25,7 @@ from gnio_jax.models.airio import (
     rotation_vector,
 )
 from gnio_jax.models.bidirectional import Recurrence
+from gnio_jax.models.layers import checked_windows
 from gnio_jax.types import GRAVITY, Prediction
 
 ACCEL_UNIT, GYRO_UNIT = 0.1, np.pi / 180
@@ -64,8 +65,13 @@ class AirIMU(nn.Module):
     strided convolutions, two layers of GRU forwards in time, four decoders (520,044 parameters).
 
     An output holds for 9 samples, and the first 9 samples are context only: nothing is added to
-    them. Published: output j holds for the samples from 9 j − 4 to 9 j + 4. Ours: from 9 j on, so
-    that all blocks of a stream are alike. Training needs the random stream `dropout`.
+    them. Output j sees the samples from 9 j − 12 to 9 j + 12 and, by the GRU, all before them.
+    Published: it holds from 9 j − 4 to 9 j + 4, in the middle of these. Ours: from 9 j to 9 j + 8,
+    4 samples later (40 ms at 100 Hz, 20 ms at 200 Hz), in training as in use. It is no delay of the
+    correction: an output sees its whole block, with 12 samples before it and 4 after it in the
+    place of 8 and 8. So all blocks of a stream are alike, and a stream waits for 12 samples in the
+    place of 16. Weights that were trained with the published hold would be 4 samples late here.
+    Training needs the random stream `dropout`.
     """
 
     width: int = 64
@@ -131,7 +137,7 @@ class Corrected(nn.Module):
     def __call__(
         self, windows: Float[Array, "b n 12"], train: bool = False, **constants: Any
     ) -> Prediction:
-        windows = windows.astype(jnp.float32)
+        windows = checked_windows(windows, self.channels)
         rotation, shape = body_axes(windows), windows.shape
         vectors = windows[..., :6].reshape(*shape[:2], 2, 3)
         body = jnp.einsum("bnij,bnki->bnkj", rotation, vectors).reshape(*shape[:2], 6)

@@ -16,14 +16,14 @@ from jaxtyping import Array, Float, Int
 from gnio_jax.config.schema import Count, Probability
 from gnio_jax.models.bidirectional import Bidirectional
 from gnio_jax.models.convolution import convolve, convolve_forward
-from gnio_jax.models.layers import EPSILON, FLOAT32, MOMENTUM, linear
+from gnio_jax.models.layers import EPSILON, FLOAT32, MOMENTUM, checked_windows, linear
 from gnio_jax.numerics import midpoints
 from gnio_jax.types import Prediction, Velocity
 
 STRIDE = 9
 """Samples from one output to the next: two convolutions of stride 3."""
 FIRST_LABEL = 14
-"""Sample of the window whose velocity is the target of the first output."""
+"""Sample of the window at whose stamp the velocity is the target of the first output."""
 LOG_VARIANCE_SHIFT = 5.0
 """A variance is exp(x − 5) of the decoder's output x."""
 
@@ -52,7 +52,7 @@ class AirIO(nn.Module):
 
     @nn.compact
     def __call__(self, windows: Float[Array, "b n 12"], train: bool = False) -> Prediction:
-        windows = windows.astype(jnp.float32)
+        windows = checked_windows(windows, self.channels)
         rotation = body_axes(windows)
         imu = windows[..., :6].reshape(*windows.shape[:2], 2, 3)
         body = jnp.einsum("bnij,bnki->bnkj", rotation, imu).reshape(*windows.shape[:2], 6)
@@ -69,7 +69,7 @@ class AirIO(nn.Module):
         velocity = Decoder(2 * self.width, name="displacement")(x)
         log_std = 0.5 * (Decoder(2 * self.width, name="log_std")(x) - LOG_VARIANCE_SHIFT)
         rows = label_rows(windows.shape[1])
-        to_window, shares = rotation[:, rows], label_shares(windows.shape[1])
+        to_window, shares = with_end(rotation)[:, rows], label_shares(windows.shape[1])
         displacement = jnp.einsum("n,bnij,bnj->bi", shares, to_window, velocity)
         variance = jnp.einsum("n,bnij,bnj->bi", shares, to_window**2, jnp.exp(2 * log_std))
         diagnostics = {"body_velocity": velocity, "body_velocity_log_std": log_std}
@@ -129,19 +129,36 @@ def norm(name: str, train: bool) -> nn.BatchNorm:
 
 
 def label_rows(samples: int) -> Int[np.ndarray, "m"]:
-    """The sample of a window whose velocity each output of the encoder predicts: the last one for
-    those that would be after it."""
+    """The time for which each output of the encoder predicts the velocity, in samples since the
+    first stamp of a window: the window's end, one sample after its last stamp, for those that would
+    be later."""
     outputs = -(-samples // STRIDE)
-    return np.minimum(FIRST_LABEL + STRIDE * np.arange(outputs), samples - 1)
+    return np.minimum(FIRST_LABEL + STRIDE * np.arange(outputs), samples)
 
 
 def label_shares(samples: int) -> Float[np.ndarray, "m"]:
     """Shares of the window in which the velocity of each of `label_rows` is the nearest one in
     time. They add up to 1."""
-    rows = label_rows(samples)
-    # A velocity is that of the step to the next sample.
-    edges = np.concatenate([[0.0], midpoints(rows + 0.5), [samples]])
+    edges = np.concatenate([[0.0], midpoints(label_rows(samples).astype(float)), [samples]])
     return (np.diff(edges) / samples).astype(np.float32)
+
+
+def with_end(rotation: Float[Array, "b n 3 3"]) -> Float[Array, "b m 3 3"]:
+    """The attitudes at the n stamps of a window and at its end, m = n + 1. The last turn is taken
+    as the one before it (ours): an error of α dt² for an angular acceleration α."""
+    before, last = rotation[:, -2], rotation[:, -1]
+    end = jnp.einsum("bij,bkj,bkl->bil", last, before, last)
+    return jnp.concatenate([rotation, end[:, None]], axis=1)
+
+
+def velocities(steps: Float[Array, "b n 3"]) -> Float[Array, "b m 3"]:
+    """Velocities at the n stamps of a window and at its end, m = n + 1, in metres per sample, of
+    the displacements from each stamp to the next: means of both neighbours, and at the two ends on
+    the straight line through the two nearest."""
+    inner = 0.5 * (steps[:, 1:] + steps[:, :-1])
+    first = 1.5 * steps[:, :1] - 0.5 * steps[:, 1:2]
+    end = 1.5 * steps[:, -1:] - 0.5 * steps[:, -2:-1]
+    return jnp.concatenate([first, inner, end], axis=1)
 
 
 def body_axes(windows: Float[Array, "b n 12"]) -> Float[Array, "b n 3 3"]:

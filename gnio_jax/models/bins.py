@@ -53,3 +53,20 @@ class BinHead(nn.Module):
 def centres_of(reach: Float[Array, ""], count: int) -> Float[Array, "n"]:
     """Centres of `count` equal bins in [−reach, reach], m."""
     return reach * (2 * jnp.arange(count, dtype=jnp.float32) + 1 - count) / count
+
+
+def mean_of_quarter_turns(logits: Float[Array, "4 *b 3 n"]) -> Float[Array, "*b 3 n"]:
+    """Logits of the mean of four distributions, whose windows were turned by 0, 90, 180 and 270°
+    and which are turned back. This is exact, because the bins are symmetric about zero."""
+    parts = []
+    for quarters, log_shares in enumerate(jax.nn.log_softmax(logits, axis=-1)):
+        x, y, z = jnp.moveaxis(log_shares, -2, 0)
+        for _ in range(quarters):
+            x, y = y, mirror(x)  # back by 90°: (x, y) → (y, −x)
+        parts.append(jnp.stack([x, y, z], axis=-2))
+    return jax.nn.logsumexp(jnp.stack(parts), axis=0) - jnp.log(jnp.float32(len(parts)))
+
+
+def mirror(logits: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
+    """The distribution of the opposite displacement."""
+    return logits[..., ::-1]

@@ -33,7 +33,7 @@ from gnio_jax.models.equivariance import (
     turn_prediction,
     turn_windows,
 )
-from gnio_jax.models.layers import EPSILON, repeat_ends
+from gnio_jax.models.layers import EPSILON, check_windows, repeat_ends
 from gnio_jax.types import Prediction
 
 SPAN = 32
@@ -78,6 +78,7 @@ class EqNIO(Equivariant):
     def __call__(
         self, windows: Float[Array, "b n 6"], train: bool = False, **constants: Any
     ) -> Prediction:
+        check_windows(windows)
         heading, sign = self.frame(windows, train)
         turned = turn_windows(windows, opposite(heading))
         reflected = jnp.asarray(np.asarray(REFLECTED)[None], windows.dtype)

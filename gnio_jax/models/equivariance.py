@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from gnio_jax.config.schema import Tilt
 from gnio_jax.geometry import direction
+from gnio_jax.models.bins import mean_of_quarter_turns, mirror
 from gnio_jax.models.heads import root_mean_square, to_axes
 from gnio_jax.models.layers import checked_windows, conv_norm, linear
 from gnio_jax.models.memory import NetworkWithMemory
@@ -51,8 +52,8 @@ class FourHeadings(Equivariant):
     turned back. This is exact for quarter turns.
 
     The variance is the mean of the four variances, also turned back. Diagnostics are those of the
-    window without a turn, except CTIN's velocities, which are averaged too. Training applies the
-    network once, because augmentation draws the heading.
+    window without a turn, except CTIN's velocities and the distributions over bins, which are
+    averaged too. Training applies the network once, because augmentation draws the heading.
     """
 
     averages_headings = True
@@ -77,6 +78,10 @@ class FourHeadings(Equivariant):
             log_stds = by_heading(turned_back.diagnostics["velocity_log_std"])
             diagnostics["velocity"] = velocities.mean(axis=-2)
             diagnostics["velocity_log_std"] = root_mean_square(log_stds)
+        if "bin_logits" in diagnostics:  # so do networks with these
+            logits = prediction.diagnostics["bin_logits"]
+            logits = logits.reshape(turns, batch, *logits.shape[1:])
+            diagnostics["bin_logits"] = mean_of_quarter_turns(logits)
         return Prediction(
             by_heading(turned_back.displacement).mean(axis=-2),
             root_mean_square(by_heading(turn_log_std(prediction.log_std, opposite(heading)))),
@@ -145,10 +150,15 @@ class FourHeadingsWithMemory(NetworkWithMemory):
         displacement = turn(prediction.displacement, opposite(heading))
         log_std = turn_log_std(prediction.log_std, opposite(heading))
         state = jax.tree.map(lambda leaf: leaf.reshape(batch, turns, *leaf.shape[1:]), rows)
+        diagnostics = {name: value[::turns] for name, value in prediction.diagnostics.items()}
+        if "bin_logits" in diagnostics:
+            logits = prediction.diagnostics["bin_logits"]
+            logits = jnp.moveaxis(logits.reshape(batch, turns, *logits.shape[1:]), 1, 0)
+            diagnostics["bin_logits"] = mean_of_quarter_turns(logits)
         return state, Prediction(
             by_heading(displacement).mean(axis=-2),
             root_mean_square(by_heading(log_std)),
-            {name: value[::turns] for name, value in prediction.diagnostics.items()},
+            diagnostics,
         )
 
 
@@ -186,7 +196,7 @@ class DeviceHeading(SeesDevice, Equivariant):
     def __call__(
         self, windows: Float[Array, "b n 12"], train: bool = False, **constants: Any
     ) -> Prediction:
-        windows = windows.astype(jnp.float32)
+        windows = checked_windows(windows, self.channels)
         x_axis, y_axis = windows[..., 6:9], windows[..., 9:12]
         up = vertical_of_normal(x_axis, y_axis)
         faces_up = (up.mean(axis=1) > jnp.float32(self.least_up))[:, None]
@@ -352,7 +362,8 @@ def turn_log_std(
 
 def turn_prediction(prediction: Prediction, heading: Float[Array, "b 2"]) -> Prediction:
     """The prediction turned about z: the displacement, the axes of its uncertainty, and the
-    velocities among its diagnostics, of which the diagonal of the covariance is kept."""
+    velocities among its diagnostics, of which the diagonal of the covariance is kept. A
+    distribution over bins stays along the axes of the uncertainty."""
     diagnostics = dict(prediction.diagnostics)
     for name, turned in (("velocity", turn), ("velocity_log_std", turn_log_std)):
         if name in diagnostics:
@@ -365,12 +376,16 @@ def turn_prediction(prediction: Prediction, heading: Float[Array, "b 2"]) -> Pre
 
 
 def reflect_prediction(prediction: Prediction, sign: Float[Array, "b"]) -> Prediction:
-    """The prediction with y reflected where the sign is negative. A diagonal covariance does not
-    change."""
+    """The prediction with y reflected where the sign is negative, with the velocities and the
+    distribution over bins among its diagnostics. A diagonal covariance does not change."""
     signs = jnp.stack([jnp.ones_like(sign), sign, jnp.ones_like(sign)], axis=-1)
     diagnostics = dict(prediction.diagnostics)
     if "velocity" in diagnostics:
         diagnostics["velocity"] = diagnostics["velocity"] * signs[:, None]
+    if "bin_logits" in diagnostics:
+        logits = diagnostics["bin_logits"]
+        mirrored = (signs < 0)[..., None]
+        diagnostics["bin_logits"] = jnp.where(mirrored, mirror(logits), logits)
     displacement = prediction.displacement * signs
     return prediction._replace(displacement=displacement, diagnostics=diagnostics)
 

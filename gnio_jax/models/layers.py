@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,10 +28,25 @@ FLOAT32: dict[str, Any] = {"dtype": jnp.float32, "param_dtype": jnp.float32}
 he_normal_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
 
+CONTENTS = {
+    6: "this network sees samples alone, as window_rotation 'per_sample' gives them",
+    12: "this network sees the axes of the body too, as window_rotation 'body_axes' gives them",
+}
+"""What the channels of a window are, by their number."""
+
+
+def check_windows(windows: Array, channels: int = 6) -> None:
+    """Raise `ValueError` for another shape than (b, n, c), which would otherwise fail deep inside a
+    convolution."""
+    if windows.ndim != 3 or windows.shape[2] != channels:
+        problem = f"must be (b, n, {channels}), found {windows.shape}"
+        remedy = f": {CONTENTS[channels]}" if channels in CONTENTS else ""
+        raise ValueError(f"windows: {problem}{remedy}")
+
+
 def checked_windows(windows: Array, channels: int = 6) -> Float[Array, "b n c"]:
-    """The windows in float32. Raises `AssertionError` for another shape than (b, n, c), which would
-    otherwise fail deep inside a convolution."""
-    chex.assert_shape(windows, (None, None, channels))
+    """The windows in float32. Raises `ValueError` as `check_windows` does."""
+    check_windows(windows, channels)
     return windows.astype(jnp.float32)
 
 

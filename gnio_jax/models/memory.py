@@ -96,7 +96,7 @@ class NetworkWithMemory(nn.Module):
     def __call__(
         self, windows: Float[Array, "b n c"], train: bool = False, **constants: Any
     ) -> Prediction:
-        count, samples, _ = windows.shape
+        count, samples, _ = checked_windows(windows, self.channels).shape
         _, prediction = self.advance(self.begin(count), windows, samples, train, **constants)
         return jax.tree.map(lambda leaf: leaf[:, -1], prediction)
 

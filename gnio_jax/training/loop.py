@@ -42,7 +42,7 @@ DISPATCH_SECONDS = 0.5
 and a quick stop."""
 CHECKPOINT_SECONDS = 600.0
 """Longest time between checkpoints within an epoch, s; every epoch also ends with one."""
-METHODS: dict[str, Callable[[TrainConfig, Path, Reporter, int], float]] = {
+METHODS: dict[str, Callable[[TrainConfig, Path, Reporter, int, bool], float]] = {
     "support_vectors": support_vectors.train
 }
 """Training without steps, by what a network says in its attribute `trained_by`: functions of the
@@ -118,8 +118,8 @@ def train_all(
     method = METHODS.get(models.trained_by(models.from_experiment(configs[0])))
     if method is not None:  # without steps
         losses = [
-            method(config, workdir, reporter, workers)
-            for config, workdir in zip(configs, workdirs, strict=True)
+            method(config, workdir, reporter, workers, resume)
+            for config, workdir, resume in zip(configs, workdirs, resumes, strict=True)
         ]
         return [TrainingResult(*run, None) for run in zip(workdirs, losses, strict=True)]
     for workdir, resume in zip(workdirs, resumes, strict=True):

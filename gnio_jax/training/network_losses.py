@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from gnio_jax.config import LossConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models.airimu import LIKELIHOOD_WEIGHT, huber_loss
-from gnio_jax.models.airio import body_axes, label_rows
+from gnio_jax.models.airio import body_axes, label_rows, velocities, with_end
 from gnio_jax.models.bins import centres_of
 from gnio_jax.models.equivariance import turn, turn_windows
 from gnio_jax.types import Prediction, Windows
@@ -65,13 +65,14 @@ def polar(prediction: Prediction, windows: Windows, config: LossConfig) -> Float
 
 def body_velocity(prediction: Prediction, windows: Windows) -> Float[Array, ""]:
     """AirIO: 100 (Huber + 1e-4 (e²/σ² + ln σ²)), means over samples and axes. Velocities are metres
-    per window."""
+    per window. Velocity and attitude of a target are those at the same time (`label_rows`): for the
+    last one at the window's end, where the filter measures it."""
     diagnostics, samples = prediction.diagnostics, windows.steps.shape[1]
     if "body_velocity" not in diagnostics:
         refuse("body_velocity", "velocities of the body, as the network airio gives")
     rows = label_rows(samples)
-    axes = body_axes(windows.imu[:, rows])
-    truth = jnp.einsum("bnij,bni->bnj", axes, samples * windows.steps[:, rows])
+    axes = with_end(body_axes(windows.imu))[:, rows]
+    truth = jnp.einsum("bnij,bni->bnj", axes, samples * velocities(windows.steps)[:, rows])
     error, log_std = truth - diagnostics["body_velocity"], diagnostics["body_velocity_log_std"]
     likelihood = error**2 * jnp.exp(-2 * log_std) + 2 * log_std
     huber = huber_loss(error, VELOCITY_HUBER)
@@ -80,7 +81,7 @@ def body_velocity(prediction: Prediction, windows: Windows) -> Float[Array, ""]:
 
 def bins(prediction: Prediction, windows: Windows, axes: int) -> Float[Array, ""]:
     """VeloBins: Huber's loss of the mean plus the divergence KL(label ‖ prediction), sums over the
-    axes. There is no likelihood.
+    axes, which are those of the uncertainty (`Prediction.axes`). There is no likelihood.
 
     The label is a Gaussian about the truth, integrated over the bins and tilted exponentially to
     the exact mean. Its σ is the present error, at least a tenth of a bin, without gradient.
@@ -89,8 +90,12 @@ def bins(prediction: Prediction, windows: Windows, axes: int) -> Float[Array, ""
         refuse("bins", "a network with model.head: bins")
     logits = prediction.diagnostics["bin_logits"][:, :axes]
     centres = centres_of(prediction.diagnostics["bin_reach"][0], logits.shape[-1])
-    error = (windows.displacement - prediction.displacement)[:, :axes]
-    label = jax.lax.stop_gradient(_label(windows.displacement[:, :axes], error, centres))
+    truth, mean = (
+        prediction.along_axes(part[:, :axes])
+        for part in (windows.displacement, prediction.displacement)
+    )
+    error = truth - mean
+    label = jax.lax.stop_gradient(_label(truth, error, centres))
     logs = jax.nn.log_softmax(logits, axis=-1)
     entropy = jnp.sum(jnp.where(label > 0, label * jnp.log(jnp.maximum(label, 1e-30)), 0.0), -1)
     divergence = entropy - jnp.sum(label * logs, axis=-1)

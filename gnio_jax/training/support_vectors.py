@@ -21,7 +21,8 @@ from gnio_jax import models
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.models.ridi import features
-from gnio_jax.networks import TrainedNetwork, write_network
+from gnio_jax.networks import TrainedNetwork, read_network, write_network
+from gnio_jax.networks.folder import WEIGHTS
 from gnio_jax.reporting import Reporter
 from gnio_jax.training.recordings import read_splits
 from gnio_jax.training.run_folder import write_splits
@@ -72,10 +73,16 @@ def join_windows(parts: list[LabelledWindows]) -> LabelledWindows:
     return LabelledWindows(np.concatenate(windows), np.concatenate(displacement), placement)
 
 
-def train(config: TrainConfig, workdir: Path, reporter: Reporter, workers: int = 1) -> float:
+def train(
+    config: TrainConfig, workdir: Path, reporter: Reporter, workers: int = 1, resume: bool = False
+) -> float:
     """Fit the recordings of the training split and write the run. Returns the mean squared error on
-    the validation split, m², summed over both axes. Raises `InputError` as `fit` does, and for
+    the validation split, m², summed over both axes. With `resume` a run that has its weights stays
+    as it is, because it is written whole after the fit. Raises `InputError` as `fit` does, and for
     missing data."""
+    if resume and (workdir / WEIGHTS).exists():
+        reporter.line(f"{workdir}: is finished; the support vectors stay as they are")
+        return validation_error(read_network(workdir))
     require_library()
     training, held_out, splits = read_splits(
         config,
@@ -88,6 +95,12 @@ def train(config: TrainConfig, workdir: Path, reporter: Reporter, workers: int =
     workdir.mkdir(parents=True, exist_ok=True)
     write_splits(workdir, splits)
     write_network(workdir, network)
+    return validation_error(network)
+
+
+def validation_error(network: TrainedNetwork) -> float:
+    """The mean squared error on the validation split, m², summed over both axes: the variances of
+    the constant uncertainty."""
     log_std = np.asarray(network.variables["batch_stats"]["uncertainty"]["log_std"])
     return float(np.sum(np.exp(2 * log_std[:2])))
 

@@ -38,7 +38,7 @@ BEFORE_AND_AFTER = Waypoints(WALK.time[[0, -1]] + [0.0, 1.0], np.zeros((2, 2)))
 UNDEFINED = [
     (lambda: metrics.drift(0.01 * LINE, 0.01 * LINE, STEP), "is 0.62 m long, under 1 m"),
     (lambda: metrics.rte(LINE[:1], LINE[:1], STEP), "a single trusted row"),
-    (lambda: metrics.rte_distance(LINE, LINE, 100.0), "no unbroken reference of 100 m"),
+    (lambda: metrics.rte_distance(LINE, LINE, STEP, 100.0), "no unbroken reference of 100 m"),
     (lambda: metrics.stationary_drift(LINE, LINE, STEP), "never stands still for 2 s"),
     (lambda: metrics.yaw_drift(*[WALK.orientation[:50]] * 2, STEP), "less than 10 s"),
     (lambda: metrics.t_rel(WALK, WALK, STEP), "no unbroken reference of 100 m"),

@@ -75,25 +75,50 @@ def test_rte_equals_a_loop_and_is_scaled_for_a_short_walk():
     assert metrics.rte(off, still, STEP) == pytest.approx(4.0)
 
 
+HOLES = [(40, 41), (77, 78), (300, 301), (500, 502), (640, 641)]
+"""Rows without a reference (start, stop), at 10 Hz. The rows before and after the fourth hole are
+0.3 s apart, which may hide a jump of the reference."""
+UNBROKEN = [(0, 500), (502, 900)]
+
+
+def bridged(position):
+    """The positions with a straight line across each hole but the fourth, row by row."""
+    path = position.copy()
+    for start, stop in HOLES:
+        for row in range(start, stop):
+            share = (row - start + 1) / (stop - start + 1)
+            path[row] = (1 - share) * position[start - 1] + share * position[stop]
+    return path
+
+
 @pytest.mark.parametrize("metres", [1.0, 10.0])
 def test_rte_distance_equals_a_loop_and_the_error_of_a_scaled_line(metres):
     truth, estimate = (path.position[:, :2] for path in (walk(), perturbed(walk())))
-    reference = truth.copy()
-    reference[300] = np.nan
-    errors = []
-    for start, stop in [(0, 300), (301, 900)]:
+    reference, path = truth.copy(), bridged(truth)
+    for start, stop in HOLES:
+        reference[start:stop] = np.nan
+    errors, across = [], 0
+    for start, stop in UNBROKEN:
         for i in range(start, stop):
             walked, j = 0.0, i
             while j + 1 < stop and walked < metres - 1e-9:
-                walked += np.linalg.norm(truth[j + 1] - truth[j])
+                walked += np.linalg.norm(path[j + 1] - path[j])
                 j += 1
-            if walked >= metres - 1e-9:
+            if walked >= metres - 1e-9 and np.isfinite(reference[[i, j]]).all():
                 errors.append(estimate[j] - estimate[i] - truth[j] + truth[i])
-    value = metrics.rte_distance(estimate, reference, metres)
+                across += np.isnan(reference[i:j]).any()
+    assert across > 5
+    value = metrics.rte_distance(estimate, reference, STEP, metres)
     assert value == pytest.approx(rms(errors), rel=1e-9)
     line = np.zeros((501, 2))
     line[:, 0] = np.arange(501) * 0.125
-    assert metrics.rte_distance(line * 1.1, line, metres) == pytest.approx(0.1 * metres)
+    assert metrics.rte_distance(line * 1.1, line, STEP, metres) == pytest.approx(0.1 * metres)
+    slow = np.outer(np.arange(20.0), [3.0, 0.0])  # rows 3 s apart, which is no hole
+    assert metrics.rte_distance(slow * 1.1, slow, 3.0, 9.0) == pytest.approx(0.9)
+    line[::2] = np.nan  # every second row is missing
+    assert metrics.rte_distance(line * 1.1, line, STEP, metres) == pytest.approx(0.1 * metres)
+    with pytest.raises(metrics.Undefined, match="unbroken"):
+        metrics.rte_distance(line, np.full_like(line, np.nan), STEP, metres)
 
 
 def test_rpe_equals_a_loop():
@@ -204,7 +229,8 @@ def test_yaw_errors_of_a_tilted_phone(pitch):
 
 
 def test_errors_of_pieces_are_those_of_kittis_benchmark():
-    """Against a plain loop with homogeneous matrices, with a hole in the reference."""
+    """Against a plain loop with homogeneous matrices, with a long hole and single holes in the
+    reference."""
     rng, rows = np.random.default_rng(6), 1500
     time = STEP * np.arange(rows)
     yaw = np.cumsum(0.02 * np.sin(0.05 * time) * STEP)
@@ -217,11 +243,19 @@ def test_errors_of_pieces_are_those_of_kittis_benchmark():
     estimate = moved_by(
         Trajectory(time, position + drift, quaternions(turn * attitude)), TURNED, [5.0, 3.0, 1.0]
     )
+    driven = truth.position.copy()  # straight across the single holes
+    for row in (3, 250, 1200):  # pieces would begin at the last two
+        driven[row] = (position[row - 1] + position[row + 1]) / 2
+        truth.position[row] = np.nan
+    truth.orientation[255] = np.nan
     truth.position[700:720] = np.nan
 
     def poses(path):
         matrices = np.tile(np.eye(4), (rows, 1, 1))
-        matrices[:, :3, :3] = Rotation.from_quat(np.roll(path.orientation, -1, 1)).as_matrix()
+        turned = np.isfinite(path.orientation).all(1)
+        attitude = np.roll(path.orientation[turned], -1, 1)
+        matrices[turned, :3, :3] = Rotation.from_quat(attitude).as_matrix()
+        matrices[~turned] = np.nan
         matrices[:, :3, 3] = path.position
         return matrices
 
@@ -233,8 +267,8 @@ def test_errors_of_pieces_are_those_of_kittis_benchmark():
                 walked, j = 0.0, i
                 while j + 1 < stop and walked <= length:
                     j += 1
-                    walked += np.linalg.norm(truth.position[j] - truth.position[j - 1])
-                if walked > length:
+                    walked += np.linalg.norm(driven[j] - driven[j - 1])
+                if walked > length and np.isfinite([true[i], true[j]]).all():
                     motions = [np.linalg.solve(path[i], path[j]) for path in (ours, true)]
                     error = np.linalg.solve(*motions)
                     cosine = np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)
@@ -282,6 +316,23 @@ def test_nees_does_not_depend_on_the_frame():
     for name in ("nees", "nees_2d", "nees_coverage", "nees_coverage_2d"):
         assert straight[name] == pytest.approx(elsewhere[name])
     assert straight["nees"] == pytest.approx(np.mean(np.sum((error / sigma) ** 2, 1)) / 3)
+
+
+def test_nees_has_no_value_where_the_reference_begins_after_the_start():
+    """The errors since a later row are smaller than those that the covariance counts."""
+    truth, results = walk(), filtered(EYES, 3.0)
+    names = ("nees", "nees_2d", "nees_coverage", "nees_coverage_2d")
+    whole = metrics.measure(perturbed(truth), truth, filtered=results)
+    assert not whole.reasons and all(whole.values[name] > 0 for name in names)
+    for row, seconds in ((1, "0.1"), (450, "45.0")):
+        reference = masked(truth, slice(0, row))
+        measures = metrics.measure(perturbed(truth), reference, filtered=results)
+        for name in names:
+            assert measures.values[name] is None
+            reason = f"the reference begins {seconds} s after the filter's start"
+            assert measures.reasons[name] == reason
+        assert measures.values["nis"] == pytest.approx(1.0) and measures.values["ate"] > 0
+        assert not measures.diverged
 
 
 def test_a_singular_or_indefinite_covariance_has_an_infinite_nees():

@@ -221,6 +221,21 @@ def test_block_by_block_a_corrector_adds_what_it_adds_to_the_whole_recording():
         np.testing.assert_allclose(spread, variance[rows], rtol=1e-4)
 
 
+def test_a_block_begins_at_the_middle_of_the_25_samples_that_its_output_sees():
+    """Sample m is within 12 of the first sample of a block, or it changes a later block only."""
+    model = airimu.AirIMU(width=4)
+    samples = RNG.standard_normal((1, 60, 6)).astype(np.float32)
+    initialise = functools.partial(model.init, jax.random.key(0))
+    apply = quick(model.apply)
+    variables = drawn({"batch_stats": {}, **jax.eval_shape(initialise, samples)})
+    before = np.asarray(apply(variables, samples).imu[0])
+    for m in (29, 30, 31, 39, 40):
+        moved = samples.copy()
+        moved[0, m] += 1.0
+        changed = np.abs(np.asarray(apply(variables, moved).imu[0]) - before).max(axis=1) > 1e-7
+        assert int(np.argmax(changed)) == 9 * -(-(m - 12) // 9)
+
+
 def test_a_corrector_is_refused_where_it_cannot_be():
     with pytest.raises(InputError, match="a corrector needs windows"):
         models.create("gru", corrector="airimu")

@@ -53,7 +53,8 @@ def test_forward_against_numpy():
         x = gelu(batch_norm(linear(x, q["projection"]), q["projection_norm"], s["projection_norm"]))
         for layer in ("gru1", "gru2"):
             x, _ = both_ways(x, q[layer], "gru")
-        rows, steps = [14, 23, 32, 39, 39], [19, 9, 8, 3.5, 0.5]  # steps nearest to each row
+        rows, steps = [14, 23, 32, 40, 40], [18.5, 9, 8.5, 4, 0]  # steps nearest to each row
+        turn = np.concatenate([turn, [turn[-1] @ turn[-2].T @ turn[-1]]])  # of the window's end
         v, variance = decoded(x, q["displacement"]), np.exp(decoded(x, q["log_std"]) - 5)
         moved = np.average([turn[r] @ v[k] for k, r in enumerate(rows)], axis=0, weights=steps)
         spread = [np.diag(turn[r] @ np.diag(variance[k]) @ turn[r].T) for k, r in enumerate(rows)]
@@ -79,13 +80,20 @@ def test_rotation_vectors_are_scipys_and_their_derivative_is_finite_at_the_ident
 
 
 def test_the_loss_is_hubers_and_the_likelihood_of_the_velocity_in_the_body():
-    samples, rows = 30, [14, 23, 29, 29]
-    attitude = Rotation.random(samples, RNG).as_matrix()[None]
+    """On a flight with constant acceleration and rate, whose velocities and attitudes at the labels
+    and at the window's end are known."""
+    samples, rows = 30, np.array([14, 23, 30, 30])
+    dt = 1 / samples  # a window of 1 s, so that m/s are metres per window
+    start, accel, rate = [2.0, -1.0, 0.5], np.array([3.0, 5.0, -4.0]), np.array([1.0, -2.0, 4.0])
+    time = dt * np.arange(samples + 1)[:, None]
+    position = start * time + accel * time**2 / 2
+    tilted = Rotation.from_euler("xyz", [0.4, -0.2, 0.9])
+    turns = tilted * Rotation.from_rotvec(rate * time)
+    attitude, steps = turns[:-1].as_matrix()[None], np.diff(position, axis=0)[None]
     zeros = np.zeros((1, samples, 3))
-    steps = RNG.standard_normal((1, samples, 3))
     velocity, log_std = RNG.standard_normal((2, 1, 4, 3))
     # One error is within Huber's bound.
-    truth = np.stack([attitude[0, r].T @ steps[0, r] * samples for r in rows])
+    truth = turns[rows].inv().apply(start + accel * time[rows])
     velocity[0, 0] = truth[0] + 0.004
     error, bound = truth - velocity[0], 0.005
     huber = np.where(abs(error) < bound, error**2 / 2, bound * (abs(error) - bound / 2))
@@ -105,8 +113,10 @@ def test_true_velocities_add_up_to_the_displacement_and_the_last_is_that_of_the_
     dt = 1 / samples
     time = dt * np.arange(samples + 1)
     position = 0.7 * time + 1.5 * time**2 + 0.04 * np.sin(9 * time)  # 3 m/s² forwards
-    velocity = np.diff(position)[airio.label_rows(samples)] / dt
-    moved = airio.label_shares(samples) @ velocity
-    np.testing.assert_allclose(moved, position[-1], atol=0.04)
-    at_end = 0.7 + 3.0 + 0.36 * np.cos(9)
-    np.testing.assert_allclose(velocity[-1], at_end, atol=4.5 * dt)  # half a step earlier
+    true = 0.7 + 3.0 * time + 0.36 * np.cos(9 * time)
+    steps = jnp.asarray(np.outer(np.diff(position), [1.0, 1.0, 1.0]))[None]
+    velocity = np.asarray(airio.velocities(steps))[0, :, 0] / dt
+    np.testing.assert_allclose(velocity, true, atol=40 * dt**2)
+    rows = airio.label_rows(samples)
+    assert rows[-1] == samples
+    np.testing.assert_allclose(airio.label_shares(samples) @ true[rows], position[-1], atol=0.04)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from gnio_jax import models
@@ -99,6 +100,45 @@ def test_the_loss_is_hubers_and_the_divergence_from_a_label_with_the_true_mean()
     windows = Windows(jnp.zeros((1, 5, 6)), jnp.asarray(truth), jnp.zeros((1, 5, 3)))
     loss = losses(prediction, windows, config, loss_stage(config, 0, 1), 2).total
     np.testing.assert_allclose(loss, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "frame, degrees, reflected",
+    [
+        ("four_headings", 90, False),
+        ("four_headings", 180, False),
+        ("four_headings", 270, False),
+        ("canonical_frame", 37, False),
+        ("so2_frame", 37, False),
+        ("o2_frame", 37, False),
+        ("o2_frame", 37, True),
+    ],
+)
+def test_distribution_and_target_are_along_the_same_axes(frame, degrees, reflected):
+    """A window that is turned or reflected with its truth has the same loss, and the mean of the
+    distribution is the displacement."""
+    model = models.create("trunk", width=3, head="bins", reach=2.0, equivariance=frame)
+    variables = drawn(models.variable_shapes(model, 40))
+    rng = np.random.default_rng(4)
+    windows = rng.normal([0.3, 0.0, 9.8, 0, 0, 0], 2.0, (3, 40, 6))
+    truths = rng.uniform(-1.0, 1.0, (3, 3))
+    turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    mirror = np.diag([1.0, -1.0, 1.0]) if reflected else np.eye(3)
+    motion = turn @ mirror
+    of_rate = np.linalg.det(motion) * motion  # an angular rate is an axial vector
+    moved = np.concatenate([windows[..., :3] @ motion.T, windows[..., 3:] @ of_rate.T], axis=-1)
+    config, apply, totals = LossConfig(name="bins"), quick(model.apply), []
+    for imu, truth in ((windows, truths), (moved, truths @ motion.T)):
+        imu, truth = np.float32(imu), np.float32(truth)
+        prediction = apply(variables, imu)
+        shares = softmax(np.float64(prediction.diagnostics["bin_logits"]))
+        mean = shares @ np.linspace(-2 + 2 / 512, 2 - 2 / 512, 512)
+        displacement = np.asarray(prediction.along_axes(prediction.displacement))
+        np.testing.assert_allclose(mean, displacement, atol=1e-4)
+        assert np.abs(displacement[:, :2]).min() > 1e-3
+        target = Windows(jnp.asarray(imu), jnp.asarray(truth), jnp.zeros((3, 40, 3)))
+        totals.append(losses(prediction, target, config, loss_stage(config, 0, 1)).total)
+    np.testing.assert_allclose(totals[1], totals[0], rtol=1e-3)
 
 
 def test_a_network_with_bins_has_their_uncertainty():

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from gnio_jax import models
-from gnio_jax.config import ModelConfig
+from gnio_jax.config import DataConfig, FilterSettings, ModelConfig
 from gnio_jax.errors import InputError
+from gnio_jax.filtering import initial_state, make_filter, run_odometry
 from gnio_jax.models import registry, resnet
 from gnio_jax.types import GRAVITY
 from tests.support.checks import unchecked
@@ -226,3 +227,36 @@ def test_the_channels_that_a_memory_has_room_for_are_no_option_but_those_of_ones
     assert models.create("own", inputs=5) == Own(inputs=5)
     with pytest.raises(InputError, match="unknown option 'inputs'"):
         models.create("gru", inputs=9)
+
+
+@pytest.mark.parametrize("equivariance", ["none", "four_headings", "o2_frame", "device_heading"])
+@pytest.mark.parametrize("name", ["gnio", "airio", "ai_imu", "gru", "ronin_tcn", "ctin", "ridi"])
+def test_windows_of_another_shape_are_refused_by_name(name, equivariance):
+    """Not by an assertion deep inside, whatever the network and what is around it."""
+    if equivariance != "none" and name not in ("gnio", "gru"):
+        pytest.skip("one network stands for all")
+    if (name, equivariance) == ("gru", "o2_frame"):
+        pytest.skip("a network with memory has no frame")
+    model = models.create(name, **SMALL[name], equivariance=equivariance)
+    variables, channels = models.variable_shapes(model, 100), models.channels(model)
+    kind = "axes of the body" if channels == 12 else "samples alone"
+    for shape in ((2, 100, 18 - channels), (2, 100, 7), (100, channels), (2, 100, channels, 1)):
+        windows = jax.ShapeDtypeStruct(shape, jnp.float32)
+        with unchecked(), pytest.raises(ValueError) as refusal:
+            jax.eval_shape(model.apply, variables, windows)
+        problem = f"windows: must be (b, n, {channels}), found {shape}: this network sees"
+        assert str(refusal.value).startswith(problem) and kind in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["gnio", "airio"])
+def test_the_filter_refuses_a_network_whose_windows_have_other_channels(name):
+    model = models.create(name, **SMALL[name])
+    predict = models.Network.of(model, drawn(models.variable_shapes(model, 100))).predict()
+    rotation = "per_sample" if name == "airio" else "body_axes"
+    windows = DataConfig(rate=100.0, window_rotation=rotation)
+    ekf = make_filter(windows, FilterSettings())
+    state = initial_state(ekf, np.eye(3), np.zeros(3), np.zeros(3))
+    samples = np.tile([[0.0, 0.0, GRAVITY]], (200, 1))
+    with unchecked(), pytest.raises(ValueError, match=r"^windows: must be \(b, n, (6|12)\)") as no:
+        run_odometry(predict, ekf, state, 0 * samples, samples)
+    assert "as window_rotation" in str(no.value)

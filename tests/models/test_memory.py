@@ -19,6 +19,7 @@ from gnio_jax.types import Memory
 from tests.support.comparing import assert_close_in_size
 from tests.support.compiling import quick
 from tests.support.networks import SMALL, drawn
+from tests.support.numpy_layers import softmax
 
 N, INTERVALS, DT = 10, 30, 0.01
 WITH_MEMORY = ["gru", "ronin_lstm", "ronin_tcn", "state_space"]
@@ -177,6 +178,16 @@ def about_z(degrees):
     return Rotation.from_euler("z", degrees, degrees=True).as_matrix()
 
 
+def bins_turned_back(shares, degrees):
+    """Shares of symmetric bins, (..., 3, n), of a window that was turned by quarter turns."""
+    (x, y, z), back = np.moveaxis(shares, -2, 0), np.round(about_z(-degrees)[:2, :2])
+    turned = []
+    for row in back:  # one entry of a row is 1 or −1
+        axis = (x, y)[int(np.flatnonzero(row)[0])]
+        turned.append(axis if row.sum() > 0 else np.flip(axis, -1))
+    return np.stack([*turned, z], axis=-2)
+
+
 @pytest.mark.parametrize(
     "name, options", [*((name, {}) for name in WITH_MEMORY), ("gru", {"head": "bins"})]
 )
@@ -187,7 +198,7 @@ def test_four_memories_are_the_mean_over_four_headings(name, options):
     means, variances, at_zero = [], [], []
     for signals in walks:
         at_zero.append(whole(one, signals).diagnostics)
-        displacements, covariances = [], []
+        displacements, covariances, shares = [], [], []
         for degrees in (0, 90, 180, 270):
             turn = about_z(degrees)
             turned = np.einsum("ij,tkj->tki", turn, signals.reshape(-1, 2, 3)).reshape(-1, 6)
@@ -195,6 +206,11 @@ def test_four_memories_are_the_mean_over_four_headings(name, options):
             displacements.append(prediction.displacement[0] @ turn)
             squares = np.exp(2 * np.float64(prediction.log_std[0]))[..., None] * np.eye(3)
             covariances.append(np.diagonal(turn.T @ squares @ turn, axis1=1, axis2=2))
+            if options:
+                logits = np.float64(prediction.diagnostics["bin_logits"])
+                shares.append(bins_turned_back(softmax(logits), degrees))
+        if options:  # the mean of the distributions, with the mean of the displacements
+            at_zero[-1]["bin_logits"] = np.log(np.mean(shares, axis=0))
         means.append(np.mean(displacements, axis=0))
         variances.append(np.mean(covariances, axis=0))
     model, ready = four.apply.model, four.variables

@@ -13,9 +13,9 @@ from gnio_jax import data
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import ridi
-from gnio_jax.networks.folder import training_recordings
+from gnio_jax.networks.folder import WEIGHTS, training_recordings
 from gnio_jax.reporting import Lines
-from gnio_jax.training import run_folder, support_vectors
+from gnio_jax.training import loop, run_folder, support_vectors
 from gnio_jax.training.support_vectors import LabelledWindows
 from tests.support.circle import circle
 from tests.support.tlio_files import spoil, write_sequence, write_splits
@@ -172,6 +172,30 @@ def test_a_run_names_its_recordings_and_what_is_left_out_of_them(tmp_path, capsy
     text = capsys.readouterr().err
     assert "LEFT OUT of val: d: " in text and "warning: c in train and in val" in text
     assert "train: 3 sequences" in text and " windows" in text
+
+
+def test_a_finished_run_that_is_resumed_stays_as_it_is(tmp_path, capsys, monkeypatch):
+    """Nothing is read or fitted again. A run without its weights is fitted."""
+    pytest.importorskip("sklearn")
+    root, workdir = write_splits(tmp_path / "tlio"), tmp_path / "run"
+    config = dataclasses.replace(CONFIG, dataset="tlio", data_root=str(root), workdir=str(workdir))
+    first = loop.train(config)
+    files = {path: path.read_bytes() for path in workdir.rglob("*") if path.is_file()}
+    capsys.readouterr()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(support_vectors, "fit", lambda *_: pytest.fail("fitted again"))
+        again = loop.train(config, resume=True)
+    assert again.best_loss == pytest.approx(first.best_loss, rel=1e-6) and first.best_loss > 0
+    assert again.workdir == workdir and again.stopped_by is None
+    assert capsys.readouterr().err == (
+        f"{workdir}: is finished; the support vectors stay as they are\n"
+    )
+    assert files == {path: path.read_bytes() for path in workdir.rglob("*") if path.is_file()}
+
+    (workdir / WEIGHTS).unlink()
+    assert loop.train(config, resume=True).best_loss == pytest.approx(first.best_loss, rel=1e-6)
+    assert (workdir / WEIGHTS).exists()
 
 
 def test_a_placement_with_too_few_windows_is_refused():
