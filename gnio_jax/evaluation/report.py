@@ -10,7 +10,7 @@ from gnio_jax.evaluation import statistics
 from gnio_jax.evaluation.metrics import Measures
 from gnio_jax.evaluation.statistics import MetricSummary, Scores
 
-DEFINITIONS = 4
+DEFINITIONS = 5
 """Version of the meaning of the figures of metrics.json, in its `settings`. Raise it with every
 change after which the figures of older files cannot be compared with newer ones: another definition
 of a metric, of divergence or of a mean, or a new field that tables need."""
