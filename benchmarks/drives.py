@@ -101,10 +101,10 @@ def make_fixes(drive: Recording, seed: int) -> Readings:
     time = np.arange(np.ceil(drive.time[0]), drive.time[-1])
     rows = np.searchsorted(drive.time, time)
     time, rows = time[drive.valid[rows]], rows[drive.valid[rows]]
-    kept = np.exp(-1.0 / FIX_SECONDS)
+    memory = np.exp(-1.0 / FIX_SECONDS)
     error = FIX_STD * rng.standard_normal((len(time), 3))
     for i in range(1, len(time)):
-        error[i] = kept * error[i - 1] + np.sqrt(1 - kept**2) * error[i]
+        error[i] = memory * error[i - 1] + np.sqrt(1 - memory**2) * error[i]
     places = geodetic(drive.position[rows] + error, ORIGIN)
     return Readings(time, places, np.full(places.shape, FIX_STD))
 
@@ -165,13 +165,13 @@ def print_states(drives: Sequence[Recording], config: TrainConfig, axes: Sequenc
     print(f"t_rel, %: with the axes {tuple(axes)}, with those of find_mounting, and as a track")
     for drive in drives:
         rate = 1.0 / float(np.median(np.diff(drive.time)))
-        found = find_mounting(drive.gyro, drive.accel, rate, drive.name)
+        mounting = find_mounting(drive.gyro, drive.accel, rate, drive.name)
         for name, states in STATES.items():
             errors = [
                 error_from_reference(
                     drive, with_states(config, states, yaw=yaw, pitch=pitch, roll=roll)
                 )
-                for yaw, pitch, roll in (axes, found[:3])
+                for yaw, pitch, roll in (axes, mounting[:3])
             ]
             errors.append(tracked_error(drive, with_states(config, states)))
             print(f"{drive.name}: {name}: {', '.join(f'{e:.2f}' for e in errors)}", flush=True)
