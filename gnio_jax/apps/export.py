@@ -12,7 +12,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import re
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
@@ -92,29 +94,70 @@ def check_map(formats: Iterable[str]) -> None:
 
 def export_map(path: Path, trajectory: Trajectory, origin: Place, name: str) -> None:
     """Write the path on the map, one point a second, as the suffix says. `origin` is the place of
-    the trajectory's origin, whose axes are east, north and up, and `name` that of the
-    recording."""
+    the trajectory's origin, whose axes are east, north and up, and `name` that of the recording.
+
+    A line of GeoJSON that crosses the antimeridian is a MultiLineString, and its `coordTimes` has a
+    list for each part. A track of GPX is a list of points, and is not cut."""
     rows = np.flatnonzero(trajectory.known & np.isfinite(trajectory.time))
     seconds = np.floor(trajectory.time[rows] - trajectory.time[rows[0]] + 1e-6)
     rows = rows[np.unique(np.append(np.unique(seconds, return_index=True)[1], len(rows) - 1))]
-    places = geodetic(trajectory.position[rows], origin)
-    stamps = [None] * len(rows)
-    if EPOCHS[0] < trajectory.time[rows[0]] < EPOCHS[1]:
-        moments = (datetime.fromtimestamp(s, UTC) for s in trajectory.time[rows].tolist())
-        stamps = [moment.isoformat(timespec="milliseconds")[:23] + "Z" for moment in moments]
+    time, places = trajectory.time[rows], geodetic(trajectory.position[rows], origin)
+    has_dates = EPOCHS[0] < time[0] < EPOCHS[1]
     with replacing(path) as temporary:
         if path.suffix == ".gpx":
-            _write_gpx(temporary, name, places, stamps)
+            _write_gpx(temporary, name, places, _dates(time) if has_dates else [None] * len(time))
             return
-        line = [[round(east, 7), round(north, 7), round(up, 2)] for north, east, up in places]
-        properties: dict[str, Any] = {"coordTimes": stamps} if stamps[0] else {}
+        # Rounded first, so that no longitude is rounded onto the other side of its part.
+        points = np.column_stack([places[:, [1, 0, 2]].round(7), time])
+        parts = _cut_at_antimeridian(points)
+        lines = [[_round_position(*point) for point in part[:, :3].tolist()] for part in parts]
+        dates = [_dates(part[:, 3]) for part in parts] if has_dates else []
         feature = {
             "type": "Feature",
-            "properties": properties,
-            "geometry": {"type": "LineString", "coordinates": line},
+            "properties": {"coordTimes": dates if len(parts) > 1 else dates[0]} if dates else {},
+            "geometry": {"type": "MultiLineString", "coordinates": lines}
+            if len(parts) > 1
+            else {"type": "LineString", "coordinates": lines[0]},
         }
         text = json.dumps({"type": "FeatureCollection", "features": [feature]}, indent=1)
         write_part(temporary, text + "\n")
+
+
+def _round_position(east: float, north: float, up: float) -> list[float]:
+    """A position of GeoJSON: degrees to a centimetre, and m."""
+    return [round(east, 7), round(north, 7), round(up, 2)]
+
+
+def _dates(time: Float[np.ndarray, "n"]) -> list[str]:
+    """Stamps, s since 1970, as ISO 8601 writes them."""
+    moments = (datetime.fromtimestamp(seconds, UTC) for seconds in time.tolist())
+    return [moment.isoformat(timespec="milliseconds")[:23] + "Z" for moment in moments]
+
+
+def _cut_at_antimeridian(points: Float[np.ndarray, "n w"]) -> list[Float[np.ndarray, "m w"]]:
+    """The parts of a line on either side of the antimeridian (RFC 7946, 3.1.9).
+
+    The first column has the longitudes, degrees. Where the line crosses the antimeridian, a point
+    on it is the last one of a part and the first one of the next, with longitudes of 180 and -180.
+    Where it only touches it, nothing is cut.
+    """
+    continuous, shift = points.copy(), np.zeros(points.shape[1])
+    continuous[1:, 0] -= 360.0 * np.cumsum(np.round(np.diff(points[:, 0]) / 360.0))
+    parts, part = [], [continuous[0]]
+    for before, point in itertools.pairwise(continuous):
+        longitude = point[0] - shift[0]
+        if abs(longitude) > 180.0:
+            meridian = shift[0] + math.copysign(180.0, longitude)
+            share = (meridian - before[0]) / (point[0] - before[0])
+            crossing = before + share * (point - before)
+            crossing[0] = meridian
+            parts.append(np.array([*part, crossing] if share > 0 else part) - shift)
+            shift[0] += math.copysign(360.0, longitude)
+            part = [crossing]
+        part.append(point)
+    parts.append(np.array(part) - shift)
+    # A line that begins on the antimeridian may be cut behind its first point.
+    return [part for part in parts if len(part) > 1] or parts
 
 
 def _write_gpx(
@@ -125,6 +168,7 @@ def _write_gpx(
     shown = NO_XML.sub(lambda match: match[0].encode("unicode_escape").decode(), name)
     lines += [f"<trk><name>{escape(shown)}</name><trkseg>"]
     for (latitude, longitude, altitude), stamp in zip(places, stamps, strict=True):
+        longitude = (round(longitude, 7) + 180.0) % 360.0 - 180.0  # GPX has no 180
         time = f"<time>{stamp}</time>" if stamp else ""
         point = f'<trkpt lat="{latitude:.7f}" lon="{longitude:.7f}"><ele>{altitude:.2f}</ele>'
         lines += [f"{point}{time}</trkpt>"]

@@ -55,12 +55,16 @@ GNIO = options.Group(
 def main(argv: Sequence[str] | None = None) -> None:
     """Run a command, by default that of the process, and exit with its status."""
     words = list(sys.argv[1:] if argv is None else argv)
+    console.run(lambda: _run(words))
+
+
+def _run(words: list[str]) -> None:
     if words == ["--completion"]:
         print(options.completion(GNIO, "gnio"))
     elif words in (["--version"], ["version"]):
         print(f"gnio-jax {version('gnio-jax')}")
     else:
-        console.run(lambda: options.run(GNIO, options.Call(_program(), words)))
+        options.run(GNIO, options.Call(_program(), words))
 
 
 def _program() -> str:

@@ -29,7 +29,7 @@ _DISK_ERRORS = {
     *(errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG),
 }
 """Errors for a place that may not be written, for a full disk, and for an impossible name."""
-_READER_LEFT = 141
+_READER_LEFT = 128 + signal.SIGPIPE
 _COMPILE_SECONDS = "0.1"
 """Compile time, s, from which a program is kept; JAX's own default is a second."""
 
@@ -41,9 +41,22 @@ def run(main: Callable[[], object]) -> None:
     stderr and status 2, and so is a variable of JAX that cannot be followed; Ctrl-C gives status
     130. SIGTERM ends the program like an exception, so that no incomplete file remains, and gives
     status 143. So does SIGHUP, of a terminal that is closed, with status 129, unless nohup has
-    switched it off. A warning is one line on stderr. Any other exception is an error of the program
-    and keeps its traceback.
+    switched it off. A warning is one line on stderr. A reader of the output who has left (head,
+    less) ends the program without a word, with the status of SIGPIPE, 141. Any other exception is
+    an error of the program and keeps its traceback.
     """
+    try:
+        _end_in_a_line(main)
+    except BrokenPipeError:
+        drop_unread_output()
+        raise SystemExit(_READER_LEFT) from None
+    except SystemExit:
+        drop_unread_output()
+        raise
+
+
+def _end_in_a_line(main: Callable[[], object]) -> None:
+    """Call `main()` as `run` does, but for a reader who has left."""
     signal.signal(signal.SIGTERM, _terminate)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         signal.signal(signal.SIGHUP, _terminate)
@@ -65,10 +78,6 @@ def run(main: Callable[[], object]) -> None:
         _leave(str(error), 2)
     except KeyboardInterrupt:
         _leave("interrupted", 128 + signal.SIGINT)
-    except BrokenPipeError:
-        # The reader of our output (head, less) has ended, so no message can be shown.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(_READER_LEFT) from None
     except OSError as error:
         if error.errno not in _DISK_ERRORS:
             raise
@@ -81,6 +90,18 @@ def run(main: Callable[[], object]) -> None:
         if (problem := lacking_device()) is None:
             raise
         _leave(problem, 2)
+
+
+def drop_unread_output() -> None:
+    """Let stdout and stderr go nowhere if their reader has left. What they still hold would
+    otherwise end in a message, and in another status, when Python ends."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        except OSError:  # Python itself tells of a full disk
+            continue
 
 
 def lacking_device() -> str | None:
@@ -163,6 +184,11 @@ class _Plain(Console):
             if segment.control is None:
                 segment = segment._replace(text=without_controls(segment.text))
             yield segment
+
+    def on_broken_pipe(self) -> typing.NoReturn:
+        """End as a signal does, so that files are still written. Rich's own status is 1."""
+        drop_unread_output()
+        raise SystemExit(_READER_LEFT)
 
 
 def stdout() -> Console:

@@ -21,6 +21,7 @@ import h5py
 import numpy as np
 
 from gnio_jax.data.parsing.tables import hdf5_field, hdf5_node, parsing_as, shorten
+from gnio_jax.data.resampling import check_count
 from gnio_jax.data.validation import validate
 from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
@@ -48,8 +49,10 @@ def write_hdf5(path: str | os.PathLike[str], sequence: Sequence) -> None:
     The file holds one dataset for each field (contiguous, so that it can be memory-mapped), `name`
     and `format` as attributes, and the sequence's attributes on the group `attributes`. Waypoints
     are the group `waypoints`, and the readings of a sensor the group `readings/SENSOR`. Raises
-    `InputError` for an attribute that is not a text, number or boolean.
+    `InputError` for an attribute that is not a text, number or boolean, and for a sequence of less
+    than two samples, which `read_hdf5` refuses.
     """
+    check_count(sequence)
     with _in_memory() as file:
         _write(file, sequence, path)
         content = _image(file)

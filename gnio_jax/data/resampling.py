@@ -30,6 +30,13 @@ def longest_bridge(rate: float) -> float:
     return max(0.1, 3.0 / rate)
 
 
+def check_count(sequence: Sequence) -> None:
+    """Raise `InputError` for a sequence of less than two samples, which have no rate."""
+    if (count := len(sequence.time)) < 2:
+        problem = f"has {count} sample{'' if count else 's'}, at least two are needed"
+        raise InputError(sequence.name, problem, "leave it out")
+
+
 def is_uniform(time: Float[np.ndarray, " n"], rate: float) -> bool:
     """True if every interval is 1/rate to 0.1 % and the whole to 0.01 %.
 
@@ -78,10 +85,12 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
     velocity by splines, and attitudes by slerp along the shorter arc. `valid` is False between
     samples of which one is invalid, and in gaps of the IMU, where `imu_valid` is also False. A
     reference value next to a NaN is NaN. Waypoints and the readings of other sensors have stamps of
-    their own and do not change. Raises `InputError` for a rate that is not a number above 0.
+    their own and do not change. Raises `InputError` for a rate that is not a number above 0, and
+    for a sequence of less than two samples.
     """
     if not (isinstance(rate, int | float | np.number) and 0 < rate < np.inf):
         raise InputError("rate", f"found {rate!r}", "give a number above 0, Hz")
+    check_count(sequence)
     time, valid = sequence.time, sequence.valid
     if is_uniform(time, rate):
         return sequence

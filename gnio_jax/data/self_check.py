@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset
 from gnio_jax.data.physics import find_implausible
+from gnio_jax.data.resampling import check_count
 from gnio_jax.numerics import (
     convolve,
     integrate_gyro,
@@ -73,7 +74,9 @@ def self_check(sequence: Sequence, pedestrian: bool = True, correlates: bool = T
     that of the positions by less than 0.3, unless the dataset says that they need not
     (`correlates`). Standing still is no failure, and neither is a recording that is too short for
     the gyro's windows. With waypoints only gravity and the speed between them can be checked.
+    Raises `InputError` for a sequence of less than two samples.
     """
+    check_count(sequence)
     step = float(np.median(np.diff(sequence.time)))
     check = SelfCheck(float(sequence.time[-1] - sequence.time[0]), 1.0 / step)
     strength, has_windows = 0.0, True

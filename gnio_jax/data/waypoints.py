@@ -26,6 +26,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Refusal
+from gnio_jax.data.resampling import check_count
 from gnio_jax.numerics import about_z, integrate_gyro, levelling, quaternions, spans
 from gnio_jax.types import Sequence, Waypoints
 
@@ -85,8 +86,10 @@ def with_poses(sequence: Sequence) -> Sequence:
     (`Legs.fits`), times before the first tap and after the last, and samples that were not measured
     are not valid. The attribute `yaw_residual_degrees` is the median angle between y axis and legs.
 
-    Raises `Refusal` if this is above `MOST_RESIDUAL`, or if too little of the walk is left.
+    Raises `Refusal` if this is above `MOST_RESIDUAL`, or if too little of the walk is left, and
+    `InputError` for a walk of less than two samples.
     """
+    check_count(sequence)
     waypoints = sequence.waypoints
     assert waypoints is not None
     time, step = sequence.time, float(np.median(np.diff(sequence.time)))

@@ -190,7 +190,7 @@ class Stream:
             raise ValueError(f"time: must increase, found {time!r} after {self.origin + newest!r}")
         if stamp - newest > LONGEST_GAP:
             problem = f"{time!r} is {stamp - newest:g} s after the sample before, more than"
-            remedy = "stamps must be in seconds; after a long stop make a new tracker"
+            remedy = "stamps must be in seconds; after a long stop call Tracker.restart"
             raise ValueError(f"time: {problem} {LONGEST_GAP:g} s; {remedy}")
         come = [(stamp, sample)]
         if stamp - newest > LONGEST_TRUSTED:

@@ -60,6 +60,10 @@ _LEAST_ERROR = 1e-6
 """Least standard deviation of the mean acceleration, m/s²."""
 
 
+class NoGravity(ValueError):
+    """Samples whose mean acceleration does not show the vertical."""
+
+
 # The arguments of the public functions have no shapes for the run-time checker: a wrong shape is
 # the user's mistake and a ValueError.
 def initial_state(
@@ -123,7 +127,7 @@ def level_state(ekf: Filter, gyro: Any, accel: Any) -> FilterState:
     one independent sample per half second. That of the velocity is proportional to this spread,
     from 0.05 m/s on a table to 1 m/s for a walker. The yaw is zero by definition, so it keeps that
     of `ekf.start`. Raises `ValueError` naming an argument of wrong shape or precision, that is not
-    finite, or that shows no gravity; inside `jax.jit` the attitude is then NaN.
+    finite, or that shows no gravity (`NoGravity`); inside `jax.jit` the attitude is then NaN.
     """
     check_filter(ekf)
     config, std = ekf.config, ekf.start
@@ -138,7 +142,7 @@ def level_state(ekf: Filter, gyro: Any, accel: Any) -> FilterState:
     )
     if not isinstance(up, Tracer) and (size := np.linalg.norm(up)) < LEAST_GRAVITY:
         problem = f"shows no gravity, its mean is {size:.2g} m/s²"
-        raise ValueError(f"accel: {problem}; it must be in m/s² and include gravity")
+        raise NoGravity(f"accel: {problem}; it must be in m/s² and include gravity")
     ekf = dataclasses.replace(ekf, start=std._replace(tilt=tilt_std, velocity=velocity_std))
     zeros = np.zeros(3, accel.dtype)
     return initial_state(ekf, rotation, zeros, zeros, gyro_bias)

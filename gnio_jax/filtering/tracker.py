@@ -50,7 +50,7 @@ from gnio_jax.filtering.network import (
     recalled_displacement,
 )
 from gnio_jax.filtering.propagation import integrate
-from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid
+from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Grid, Stream, create_grid
 from gnio_jax.filtering.scan import Measure, clone_step
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.start import initial_state, level_state
@@ -169,11 +169,11 @@ class Tracker:
         self.hindrance = ""
         """Why the samples before the start were no rest; empty if they were."""
         self._corrector = corrector
-        self._stream = self._open_stream(hole, imu_rate)
+        self._stream = self._open_stream(create_grid(dt, hole, imu_rate))
         if state is not None:
             state = checked_state(state, ekf)
         dtype = jax.dtypes.canonicalize_dtype(np.float64) if state is None else state.offset.dtype
-        self._ekf = converted_filter(ekf, dtype)
+        self._ekf, self._dtype = converted_filter(ekf, dtype), dtype
         start = state
         if start is None:  # The programs are compiled for the shapes of any start.
             zeros = jnp.zeros(3, dtype)
@@ -187,7 +187,13 @@ class Tracker:
 
     def set_rate(self, imu_rate: float, hole: float | None = None) -> None:
         """Change `imu_rate` and `hole` before the first sample. Nothing is compiled again."""
-        self._stream = self._open_stream(hole, imu_rate)
+        self._stream = self._open_stream(create_grid(self._dt, hole, imu_rate))
+
+    def restart(self) -> None:
+        """Forget all samples, and make the start from the next rest, as a tracker without `state`
+        does: after a long stop, or for stamps of another clock. Nothing is compiled again."""
+        self._stream = self._open_stream(self._stream.grid)
+        self._core, self._failure, self.hindrance = None, "", ""
 
     def push(self, time: Any, gyro: Any, accel: Any) -> Pose | None:
         """Take one sample: time s, gyro (3,) rad/s, accel (3,) m/s², raw, in the body frame. A
@@ -249,8 +255,8 @@ class Tracker:
         """
         return self._stream.delay
 
-    def _open_stream(self, hole: float | None, imu_rate: float | None) -> Stream | CorrectedStream:
-        stream = Stream(create_grid(self._dt, hole, imu_rate))
+    def _open_stream(self, grid: Grid) -> Stream | CorrectedStream:
+        stream = Stream(grid)
         return stream if self._corrector is None else CorrectedStream(stream, self._corrector)
 
     def _start_from_rest(self) -> None:
@@ -263,6 +269,7 @@ class Tracker:
                 continue
             number, measured = np.arange(float(self._rest)), rows[:, VALID] > 0
             rows = numerics.interpolate(number, number[measured], rows[measured])
+            rows = rows.astype(self._dtype)
             try:
                 state = level_state(self._ekf, rows[:, GYRO], rows[:, ACCEL])
             except ValueError:  # It shows no gravity, but the next samples may.

@@ -37,7 +37,7 @@ from gnio_jax.filtering.network import Predict
 from gnio_jax.filtering.scan import run_odometry
 from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth
-from gnio_jax.filtering.start import initial_state, level_state
+from gnio_jax.filtering.start import NoGravity, initial_state, level_state
 from gnio_jax.filtering.state import THETA, FilterState, Mean
 from gnio_jax.numerics import (
     filled_up,
@@ -113,6 +113,7 @@ def waypoint_poses(
             `START_SECONDS` and a window that were measured; its waypoints have a
             `Waypoints.problem`, or do not show the yaw; the filter fails, or most waypoints are far
             from the smoothed path.
+        ValueError: An argument of the filter is wrong, or JAX has no float64, which it needs.
     """
     config = dataclasses.replace(ekf.config, history="core")
     ekf = dataclasses.replace(ekf, config=config)
@@ -234,7 +235,8 @@ def _filled_walk(sequence: Sequence, config: FilterConfig) -> _Walk:
 
 
 def _level_start(sequence: Sequence, ekf: Filter) -> FilterState:
-    """The level start from the first second that was measured. Raises `InputError`."""
+    """The level start from the first second that was measured. Raises `InputError` if it shows no
+    gravity."""
     measured, count = sequence.measured_rows, round(START_SECONDS / ekf.config.dt)
     rows = measured[measured < count]
     if 2 * len(rows) < count:  # most of it was not measured
@@ -242,7 +244,7 @@ def _level_start(sequence: Sequence, ekf: Filter) -> FilterState:
     signals = sequence.gyro[rows], sequence.accel[rows]
     try:
         return level_state(ekf, *signals)
-    except ValueError as error:  # e.g. it shows no gravity
+    except NoGravity as error:  # a wrong argument is no fault of the walk
         problem = f"has no level start: {error}"
         raise InputError(sequence.name, problem, "repair or leave out the walk") from None
 

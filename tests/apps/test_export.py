@@ -1,6 +1,8 @@
 """Trajectories in other programs' formats, read back by other means than they were written."""
 
+import itertools
 import json
+from datetime import datetime
 from xml.etree import ElementTree
 
 import numpy as np
@@ -9,6 +11,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from gnio_jax.apps import export as export_module
 from gnio_jax.apps.export import export, export_map
 from gnio_jax.data.geodesy import Place
 from gnio_jax.errors import InputError
@@ -133,5 +136,54 @@ def test_a_map_has_the_name_of_the_recording_and_longitudes_within_180_degrees(t
     points = [float(point.get("lon")) for point in track.iter(f"{space}trkpt")]
     np.testing.assert_allclose(points, longitude, atol=1e-6)
     content = json.loads((tmp_path / "trajectory.geojson").read_text())
-    line = np.array(content["features"][0]["geometry"]["coordinates"])
-    np.testing.assert_allclose(line[:, 0], longitude, atol=1e-6)
+    west, east = map(np.array, content["features"][0]["geometry"]["coordinates"])
+    np.testing.assert_allclose(np.append(west[:-1, 0], east[1:, 0]), longitude, atol=1e-6)
+    assert west[-1, 0] == 180.0 and east[0, 0] == -180.0
+    times = content["features"][0]["properties"]["coordTimes"]
+    assert [len(part) for part in times] == [len(west), len(east)] == [29, 33]
+    # 0.0005° are 55.660 m, which take 27.830 s; the longitudes are rounded to a centimetre.
+    assert times[0][-1] == times[1][0]
+    crossed = datetime.fromisoformat(times[0][-1]).timestamp()
+    assert crossed - START == pytest.approx(27.830, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("longitudes", "parts"),
+    [
+        ([179.0, 179.5], [[179.0, 179.5]]),
+        ([179.0, -179.0], [[179.0, 180.0], [-180.0, -179.0]]),
+        ([-179.0, 179.0], [[-179.0, -180.0], [180.0, 179.0]]),
+        (
+            [179.0, -178.0, -179.0, 179.0, -179.0],
+            [[179, 180], [-180, -178, -179, -180], [180, 179, 180], [-180, -179]],
+        ),
+        ([179.0, 180.0, -179.0], [[179.0, 180.0], [-180.0, -179.0]]),
+        ([179.0, -180.0, -179.0], [[179.0, 180.0], [-180.0, -179.0]]),
+        ([179.0, 180.0, 179.0], [[179.0, 180.0, 179.0]]),  # it touches
+        ([179.0, -180.0, 179.0], [[179.0, 180.0, 179.0]]),
+        ([-179.0, 180.0, 180.0, -179.0], [[-179.0, -180.0, -180.0, -179.0]]),
+        ([180.0, -179.0], [[-180.0, -179.0]]),
+        ([-180.0, 179.0], [[180.0, 179.0]]),
+        ([179.0, -180.0], [[179.0, 180.0]]),
+    ],
+)
+def test_a_line_is_cut_where_it_crosses_the_antimeridian(longitudes, parts):
+    """The other columns of a crossing lie between those of its neighbours."""
+    count = len(longitudes)
+    points = np.column_stack([longitudes, 10.0 * np.arange(count), np.arange(count)])
+    lines = export_module._cut_at_antimeridian(points)
+    assert [line[:, 0].tolist() for line in lines] == parts
+    for line in lines:
+        np.testing.assert_allclose(line[:, 1], 10.0 * line[:, 2])
+    ends = [line[[0, -1], 2] for line in lines]
+    for (_, end), (begin, _) in itertools.pairwise(ends):
+        assert end == begin
+    if parts == [[179.0, 180.0], [-180.0, -179.0]] and count == 2:
+        assert lines[0][-1].tolist() == [180.0, 5.0, 0.5]
+
+
+def test_gpx_has_no_longitude_of_180_degrees(tmp_path):
+    """Its schema ends before it."""
+    pole = Trajectory(START + np.arange(2.0), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    export_map(tmp_path / "a.gpx", pole, Place(10.0, 180.0, 0.0), "north")
+    assert (tmp_path / "a.gpx").read_text().count('lon="-180.0000000"') == 2

@@ -1,6 +1,7 @@
 """The logic of the ROS 2 node, without ROS."""
 
 import importlib.util
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.filtering import Pose
 
-BRIDGE = Path(__file__).parents[2] / "examples" / "ros2" / "gnio_odometry" / "bridge.py"
+PACKAGE = Path(__file__).parents[2] / "examples" / "ros2" / "gnio_odometry"
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
 BIAS = np.array([0.01, -0.02, 0.03])
 VELOCITY = np.array([1.0, 2.0, 3.0])
@@ -18,12 +19,16 @@ SQUARE = np.random.default_rng(0).normal(size=(15, 15))
 COVARIANCE = SQUARE @ SQUARE.T
 
 
-@pytest.fixture(scope="module")
-def bridge():
-    spec = importlib.util.spec_from_file_location("bridge", BRIDGE)
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, PACKAGE / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def bridge():
+    return load("bridge")
 
 
 class Recorder:
@@ -33,7 +38,9 @@ class Recorder:
         self.samples = []
 
     def push(self, time, gyro, accel):
-        if self.samples and time <= self.samples[-1][0]:
+        if max(map(abs, gyro)) > 100:
+            raise ValueError("gyro: no IMU measures more than 100 rad/s")
+        if self.samples and not 0 < time - self.samples[-1][0] <= 60:
             raise ValueError(f"time: must increase, found {time}")
         self.samples.append((time, gyro, accel))
         if len(self.samples) % 2:
@@ -41,6 +48,9 @@ class Recorder:
         moved = VELOCITY, np.array([4.0, 5.0, 6.0])
         remaining_fields = BIAS, np.zeros(3), COVARIANCE, 1.0, 1.0, True
         return Pose(time, TURN.as_matrix(), *moved, *remaining_fields)
+
+    def restart(self):
+        self.samples = []
 
 
 def message(sec, nanosec, gyro=(0.1, 0.2, 0.3), accel=(0.0, 1.0, 9.8)):
@@ -111,3 +121,128 @@ def test_what_is_refused_and_what_diverged_is_not_published(bridge):
     relay = bridge.Bridge(tracker)
     assert [relay.take(message(5, k)) for k in range(4)] == [None] * 4
     assert relay.refused == 2 and "diverged" in relay.reason
+
+
+def at(seconds, **sensors):
+    return message(int(seconds), round(seconds % 1 * 1e9), **sensors)
+
+
+OLD, NEW = 100 + np.arange(20) / 100, np.arange(40) / 100
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        (np.zeros(1), 1.7e9 + NEW, "1.7e+09 s after"),
+        (OLD, 170 + NEW, "69.9 s after"),
+        (OLD, 20 + NEW, "80.1 s before"),
+    ],
+    ids=["no stamp at first", "a pause", "set back"],
+)
+def test_stamps_that_go_on_elsewhere_start_the_tracker_anew(bridge, before, after, words):
+    tracker = Recorder()
+    relay = bridge.Bridge(tracker)
+    for seconds in before:
+        relay.take(at(seconds))
+    published = [relay.take(at(seconds)) for seconds in after]
+    assert relay.restarts == 1 and relay.refused == 10 and words in relay.reason
+    assert not any(published[:11]) and all(published[11::2])
+    # The stamps count from the first message of the new clock.
+    times = [sample[0] for sample in tracker.samples]
+    np.testing.assert_allclose(times, after[10:] - after[10], atol=1e-6)
+    newest = published[39].stamp
+    assert newest[0] + newest[1] / 1e9 == pytest.approx(after[39], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "strays",
+    [
+        20 + NEW[:9],  # too few
+        20 + np.zeros(30),  # one stamp again and again
+        np.where(np.arange(30) % 2, 20, 5000) + NEW[:30],  # of two clocks
+        100.1 + NEW[:9].repeat(2),  # late by less than 0.1 s
+    ],
+)
+def test_some_wrong_stamps_cost_their_messages_alone(bridge, strays):
+    relay = bridge.Bridge(Recorder())
+    for seconds in OLD:
+        relay.take(at(seconds))
+    assert not any(relay.take(at(seconds)) for seconds in strays)
+    assert relay.refused == len(strays) and relay.restarts == 0
+    assert relay.take(at(100.5)) is None and relay.take(at(100.51)) is not None
+
+
+def test_impossible_values_are_no_other_clock(bridge):
+    relay = bridge.Bridge(Recorder())
+    for seconds in OLD:
+        assert relay.take(at(seconds, gyro=(500.0, 0.0, 0.0))) is None
+    assert relay.refused == len(OLD) and relay.restarts == 0 and "rad/s" in relay.reason
+
+
+class RosNode:
+    """What the node uses of `rclpy.node.Node`. The log keeps what ROS would not throttle."""
+
+    def __init__(self, _):
+        self.log, self.published = [], []
+
+    def declare_parameter(self, _, default):
+        return SimpleNamespace(value=default)
+
+    def create_publisher(self, *_):
+        return SimpleNamespace(publish=self.published.append)
+
+    def create_subscription(self, *_):
+        pass
+
+    def get_logger(self):
+        def warning(text, throttle_duration_sec=None):
+            if throttle_duration_sec is None:
+                self.log.append(text)
+
+        return SimpleNamespace(info=self.log.append, warning=warning)
+
+
+class RosMessage:
+    """A message of ROS: every field has fields."""
+
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        self.__dict__[name] = RosMessage()
+        return self.__dict__[name]
+
+
+def test_the_node_logs_once_that_it_starts_anew(bridge, monkeypatch):
+    profile = {"QoSProfile": lambda **_: None, "ReliabilityPolicy": RosMessage()}
+    broadcaster = {"TransformBroadcaster": lambda _: SimpleNamespace(sendTransform=id)}
+    modules = {
+        "rclpy": {},
+        "rclpy.executors": {"ExternalShutdownException": Exception},
+        "rclpy.node": {"Node": RosNode},
+        "rclpy.qos": profile,
+        "geometry_msgs.msg": {"TransformStamped": RosMessage},
+        "nav_msgs.msg": {"Odometry": RosMessage},
+        "sensor_msgs.msg": {"Imu": RosMessage},
+        "tf2_ros": broadcaster,
+        "gnio_odometry.bridge": vars(bridge),
+    }
+    for name, content in modules.items():
+        module = SimpleNamespace(**content)
+        monkeypatch.setitem(sys.modules, name.partition(".")[0], module)
+        monkeypatch.setitem(sys.modules, name, module)
+    node = load("node")
+    network = SimpleNamespace(config=SimpleNamespace(data=None, filter=None))
+    ekf = SimpleNamespace(config=SimpleNamespace(invariant=True))
+    monkeypatch.setattr(node.networks, "load", lambda _: network)
+    monkeypatch.setattr(node.filtering, "make_filter", lambda *_: ekf)
+    monkeypatch.setattr(node, "create_tracker", lambda *_: Recorder())
+    odometry = node.GnioOdometry()
+    for seconds in (*OLD, *(20 + NEW)):
+        content = at(seconds)
+        content.header.frame_id = ""
+        odometry._take(content)
+    ready, anew = odometry.log
+    assert ready == "ready with pedestrian; keep the device still for 1 s"
+    assert "80.1 s before" in anew and anew.endswith("keep the device still for 1 s")
+    assert len(odometry.published) == len(OLD) // 2 + (len(NEW) - 10) // 2
+    assert odometry.published[-1].child_frame_id == "imu_link"

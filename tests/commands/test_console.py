@@ -136,6 +136,39 @@ def test_a_stream_that_is_closed_is_no_fault(closed, status):
     assert (result.returncode, result.stderr) == (status, "")
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize(
+    "words",
+    ["--version", "--completion", "--help", "weights --help", "weights", "data list", "doctor"],
+)
+def test_a_reader_who_has_left_ends_a_command_without_a_word(words, unbuffered):
+    """As `gnio ... | head` does, but certainly before the first line."""
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    command = [sys.executable, "-m", "gnio_jax", *words.split()]
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        result = subprocess.run(
+            command, cwd=ROOT, env=environment, stdout=writing, stderr=subprocess.PIPE, text=True
+        )
+    finally:
+        os.close(writing)
+    assert result.stderr == "" and result.returncode in ((0, 141) if "help" in words else (141,))
+
+
+def test_a_reader_of_errors_who_has_left_makes_no_traceback():
+    """`gnio ... 2>&1 | head`."""
+    command = f"{sys.executable} -m gnio_jax train --wrong 2>&1 | true; exit ${{PIPESTATUS[0]}}"
+    result = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode in (2, 141) and result.stdout + result.stderr == ""
+
+
+def test_a_full_disk_is_no_reader_who_has_left():
+    command = f"{sys.executable} -m gnio_jax weights > /dev/full"
+    result = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 2 and result.stderr == "output: No space left on device\n"
+
+
 def test_the_line_of_progress_shows_its_times_in_80_columns(monkeypatch):
     screen = io.StringIO()
     options = {"file": screen, "force_terminal": True, "width": 80, "stderr": False}

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from gnio_jax import data
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import validate
 from gnio_jax.errors import InputError
+from gnio_jax.types import Waypoints
 from tests.support.checks import unchecked
 from tests.support.circle import changed, circle
 
@@ -122,3 +124,25 @@ def test_a_rate_that_is_none_is_refused():
             pytest.raises(InputError, match=r"^rate: found .*; give a number"),
         ):
             resample(circle(), rate)
+
+
+@pytest.mark.parametrize("count, words", [(0, "0 samples"), (1, "1 sample")])
+def test_a_recording_without_a_rate_is_refused(count, words, tmp_path):
+    """And nothing is written that could not be read."""
+    walk = circle(stamps=np.arange(count) / 100)
+    taps = Waypoints(np.array([0.0, 5.0]), np.zeros((2, 2)))
+    refused = rf"circle: has {words}, at least two are needed; leave it out$"
+    for use in (
+        lambda: resample(walk, 100.0),
+        lambda: resample(walk, 50.0),
+        lambda: data.self_check(walk),
+        lambda: data.with_poses(walk._replace(waypoints=taps)),
+        lambda: data.write_hdf5(tmp_path / "walk.h5", walk),
+    ):
+        with pytest.raises(InputError, match=refused):
+            use()
+    assert not list(tmp_path.iterdir())
+    two = circle(stamps=np.arange(2) / 100)
+    assert len(resample(two, 200.0).time) == 3 and data.self_check(two).rate == 100.0
+    data.write_hdf5(tmp_path / "walk.h5", two)
+    assert len(data.read_hdf5(tmp_path / "walk.h5").time) == 2

@@ -445,6 +445,37 @@ def test_what_is_no_rest_is_said(built, missing, hindrance, start):
     assert tracker.pose().time == pytest.approx((start + 45) * DT, abs=N * DT)
 
 
+def test_a_restarted_tracker_is_a_new_one(built):
+    """On another clock, after samples of another walk, and after a start that was given."""
+    gyro, accel = resting()
+    time = 5.0 + np.arange(len(gyro)) * DT
+    fresh = Tracker(predict, filter_of(), rest_seconds=0.9)
+    expected = feed(fresh, gyro, accel, time)
+    used = Tracker(predict, filter_of(), start(), rest_seconds=0.9)
+    assert feed(used, *recording(), 1.7e9 + np.arange(N * INTERVALS) * DT)
+    used.restart()
+    assert used.pose() is None and used.filter_state() is None
+    poses = feed(used, gyro, accel, time)
+    assert len(poses) == len(expected) > 50
+    for pose, like in zip(poses, expected, strict=True):
+        jax.tree.map(np.testing.assert_array_equal, pose, like)
+    jax.tree.map(np.testing.assert_array_equal, used.filter_state(), fresh.filter_state())
+
+
+def test_a_restarted_tracker_keeps_its_precision():
+    """The state that was given decides it, and not that JAX has float64."""
+    config = dataclasses.replace(CONFIG, allow_float32=True)
+    single = jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float32) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf,
+        start(config),
+    )
+    tracker = Tracker(predict, filter_of(config), single, rest_seconds=0.9)
+    tracker.restart()
+    gyro, accel = resting()
+    poses = feed(tracker, gyro[:60], accel[:60], np.arange(60) * DT)
+    assert poses and poses[-1].position.dtype == np.float32
+
+
 def test_a_rest_without_gravity_is_told_once_and_another_starts(built):
     """Such as in units of gravity, until somebody mends it."""
     gyro, accel = resting()

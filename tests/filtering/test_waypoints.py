@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -216,6 +217,17 @@ def test_an_imu_that_cannot_be_is_refused_in_one_line():
         with pytest.raises(InputError, match=f"^walk: {text}") as caught:
             filtering.waypoint_poses(spoilt, predict, EKF)
         assert "\n" not in str(caught.value) and "; " in str(caught.value)
+
+
+def test_a_filter_without_float64_is_no_fault_of_the_walk():
+    """Its remedy is a setting of JAX, or a filter in float32, and not to leave out the walk."""
+    with jax.enable_x64(False), pytest.raises(ValueError, match=r"^gyro: the filter ru") as caught:
+        filtering.waypoint_poses(tapped(ALL), predict, EKF)
+    assert not isinstance(caught.value, InputError)
+    assert str(caught.value).endswith(
+        "found float32; call jax.config.update('jax_enable_x64', True) first, or ask for "
+        "FilterConfig(allow_float32=True)"
+    )
 
 
 def test_waypoints_too_near_each_other_are_refused():

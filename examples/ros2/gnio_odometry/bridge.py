@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.apps.live.clock import AGREEING, LATEST
+from gnio_jax.filtering.resampler import LONGEST_GAP, LONGEST_TRUSTED
 from gnio_jax.filtering.state import arc_covariance
 
 NANOSECONDS = 1_000_000_000
@@ -34,15 +36,26 @@ class Odometry(NamedTuple):
 class Bridge:
     """Feeds a `gnio_jax.filtering.Tracker`, whose filter has the `invariant` error or not, with
     messages. Stamps are counted from the first one, in whole nanoseconds, so that no digit is lost
-    in float64."""
+    in float64.
+
+    A message whose stamp is far behind the newest one, or further ahead than the tracker takes, is
+    refused. When `AGREEING` of them in a row continue each other, the clock was set, a recording
+    plays again, or the messages have paused: then the tracker starts anew.
+    """
 
     def __init__(self, tracker: Any, invariant: bool = True):
         self._tracker, self._invariant = tracker, invariant
         self._first: int | None = None
+        self._latest: int | None = None
+        """Stamp of the newest message that the tracker took, ns; None: it has taken none."""
+        self._strays = list[int]()
+        """Stamps of the newest messages, which continue each other but not that stamp, ns."""
+        self.restarts = 0
+        """How many times the tracker has started anew."""
         self.refused = 0
         """Messages that the tracker could not take, and clone steps of a filter that diverged."""
         self.reason = ""
-        """Why the newest of them was refused."""
+        """Why the newest of them was refused, or why the tracker has started anew after it."""
 
     def take(self, message: Any) -> Odometry | None:
         """Take one message, and return the odometry of a clone step, if it made one.
@@ -62,12 +75,37 @@ class Bridge:
         except ValueError as error:
             self.refused += 1
             self.reason = str(error)
+            self._note_stray(now)
             return None
+        self._latest = now
+        self._strays.clear()
         if pose is not None and not pose.healthy:
             self.refused += 1
             self.reason = "the filter diverged: start the node again"
             return None
         return None if pose is None else self._odometry(pose, np.array([gyro.x, gyro.y, gyro.z]))
+
+    def _note_stray(self, now: int) -> None:
+        """Start anew if this refused message is the last of a run on another clock."""
+        if self._latest is None:
+            return
+        ahead = (now - self._latest) / NANOSECONDS
+        if -LATEST <= ahead <= LONGEST_GAP:
+            self._strays.clear()
+            return
+        side = "after" if ahead > 0 else "before"
+        words = f"{abs(ahead):.3g} s {side} that of the newest message"
+        self.reason = f"its stamp is {words}"
+        if self._strays and not 0 < now - self._strays[-1] <= LONGEST_TRUSTED * NANOSECONDS:
+            self._strays.clear()
+        self._strays.append(now)
+        if len(self._strays) < AGREEING:
+            return
+        self._tracker.restart()
+        self._first = self._latest = None
+        self._strays.clear()
+        self.restarts += 1
+        self.reason = f"the stamps go on {words}: the filter starts anew, and so does the path"
 
     def _odometry(self, pose: Any, gyro: np.ndarray) -> Odometry:
         assert self._first is not None

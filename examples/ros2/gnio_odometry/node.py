@@ -30,6 +30,7 @@ class GnioOdometry(Node):
         network = self.declare_parameter("network", "pedestrian").value
         rate = self.declare_parameter("imu_rate", 0.0).value
         rest_seconds = self.declare_parameter("rest_seconds", 1.0).value
+        self._advice = f"keep the device still for {rest_seconds:g} s"
         self._odom = self.declare_parameter("odom_frame", "odom").value
         self._imu = self.declare_parameter("imu_frame", "imu_link").value
         publish_tf = self.declare_parameter("publish_tf", True).value
@@ -40,14 +41,14 @@ class GnioOdometry(Node):
         self._publisher = self.create_publisher(Odometry, "odometry", 10)
         self._transforms = TransformBroadcaster(self) if publish_tf else None
         self.create_subscription(Imu, "imu", self._take, SENSOR_DATA)
-        self.get_logger().info(
-            f"ready with {network}; keep the device still for {rest_seconds:g} s"
-        )
+        self.get_logger().info(f"ready with {network}; {self._advice}")
 
     def _take(self, message: Imu) -> None:
-        refusals = self._bridge.refused
+        restarts, refusals = self._bridge.restarts, self._bridge.refused
         estimate = self._bridge.take(message)
-        if self._bridge.refused > refusals:
+        if self._bridge.restarts > restarts:
+            self.get_logger().warning(f"{self._bridge.reason}; {self._advice}")
+        elif self._bridge.refused > refusals:
             self.get_logger().warning(self._bridge.reason, throttle_duration_sec=5.0)
         if estimate is None:
             return

@@ -17,7 +17,15 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
-from gnio_jax.apps.live.samples import LONGEST_LINE, NO_SAMPLE, Arrival, Sample, Units, parse_lines
+from gnio_jax.apps.live.samples import (
+    LONGEST_LINE,
+    NO_SAMPLE,
+    Arrival,
+    Sample,
+    Units,
+    is_missing,
+    parse_lines,
+)
 
 TICK = 0.25
 """Time after which a source says that nothing has come, s."""
@@ -26,7 +34,9 @@ MOST_MESSAGES, MOST_BYTES = 100_000, 32_000_000
 CHUNK = 65536
 """Bytes that are read at once, and largest datagram."""
 TAKEN_OVER = 2.0
-"""Silence after which the datagrams of another machine are read, s."""
+"""Silence after which the datagrams of another sender are read, s."""
+RUNS = 8
+"""Number of successive runs of samples from one port each that show several senders (ours)."""
 
 
 class Inbox:
@@ -91,41 +101,67 @@ class Inbox:
 
 def receive_datagrams(receiver: socket.socket, inbox: Inbox) -> None:
     """Put the datagrams of a UDP socket into the inbox, in a thread: (content, address of the
-    machine that sent it)."""
+    machine that sent it, its port)."""
 
     def receive() -> None:
         while True:
             try:
-                content, (machine, _) = receiver.recvfrom(CHUNK)
+                content, (machine, port) = receiver.recvfrom(CHUNK)
             except OSError:
                 return  # the socket is closed
-            inbox.put((content, machine), len(content))
+            inbox.put((content, machine, port), len(content))
 
     threading.Thread(target=receive, daemon=True).start()
 
 
 class Datagrams:
-    """Reads the datagrams of one machine, until it is silent for `TAKEN_OVER` seconds: it may have
-    got another address. Two IMUs at one port would make one path of both."""
+    """Reads the datagrams of one sender, until it is silent for `TAKEN_OVER` seconds: it may have
+    got another address. Two IMUs at one port would make one path of both.
+
+    A machine may send each sample, or each sensor, from a port of its own, and a program that
+    starts again has another one. Two senders of a machine show by ports that take turns: `RUNS`
+    runs of samples of the gyro from at most half as many ports. Then the first one is followed.
+    """
 
     def __init__(self, stated: Units):
         self._stated = stated
         self._machine: str | None = None
+        self._port: int | None = None
+        """The port that is followed, if several take turns."""
+        self._runs = deque[int](maxlen=RUNS)
+        """Ports of the newest runs of samples with a gyro."""
         self._heard = -math.inf
         """Time at which its newest sample was read, s by this machine."""
 
-    def decode(self, datagram: tuple[bytes, str]) -> Iterator[Sample | str]:
-        """The samples of a datagram, or why a line, or a sample of another machine, is refused."""
-        content, machine = datagram
+    def decode(self, datagram: tuple[bytes, str, int]) -> Iterator[Sample | str]:
+        """The samples of a datagram (content, machine, port), or why a line, or a sample of another
+        sender, is refused."""
+        content, machine, port = datagram
         for sample in parse_lines(content, self._stated):
-            now = time.monotonic()
-            is_silent = now - self._heard > TAKEN_OVER
-            if isinstance(sample, Sample) and (is_silent or machine == self._machine):
-                self._machine, self._heard = machine, now
-            if self._machine in (None, machine):
-                yield sample
-            else:
+            is_sample, now = isinstance(sample, Sample), time.monotonic()
+            if is_sample and now - self._heard > TAKEN_OVER:
+                self._machine, self._port = machine, None
+                self._runs.clear()
+            if self._machine not in (None, machine):
                 yield f"comes from {machine}, and the samples before it from {self._machine}"
+                continue
+            # A port that sends the accelerometer alone is no second sender.
+            turns = isinstance(sample, Sample) and not is_missing(sample.gyro)
+            if turns:
+                self._note_port(port)
+            if turns and self._port not in (None, port):
+                earlier = f"the samples before it from port {self._port}"
+                yield f"comes from port {port} of {machine}, and {earlier}"
+                continue
+            self._heard = now if is_sample else self._heard
+            yield sample
+
+    def _note_port(self, port: int) -> None:
+        """Choose a port if several take turns."""
+        if self._port is None and (not self._runs or self._runs[-1] != port):
+            self._runs.append(port)
+            if len(self._runs) == RUNS and len(set(self._runs)) <= RUNS // 2:
+                self._port = self._runs[0]
 
 
 def read_stream(stream: Any, name: str, stated: Units) -> Iterator[Arrival]:

@@ -75,18 +75,17 @@ def test_datagrams_are_received_before_they_are_read(port):
 
 
 def test_the_datagrams_of_a_second_machine_are_refused(port):
-    """Two IMUs at one port, in turn; the first one may send from several ports, and what is no
-    sample makes nobody the first."""
+    """Two IMUs at one port, in turn; what is no sample makes nobody the first."""
     source = open_source(f"udp:{port}", Stated(silence=0.3))
     with contextlib.ExitStack() as sockets:
         senders = []
-        for machine in ("127.0.0.2", "127.0.0.1", "127.0.0.2", "127.0.0.1"):
+        for machine in ("127.0.0.2", "127.0.0.1"):
             sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             senders.append(sockets.enter_context(sender))
             sender.bind((machine, 0))
         senders[0].sendto(b"time,gyro,accel\n", ("127.0.0.1", port))
         for k in range(1, 21):
-            senders[k % 4].sendto(f"{k},{STILL}\n".encode(), ("127.0.0.1", port))
+            senders[k % 2].sendto(f"{k},{STILL}\n".encode(), ("127.0.0.1", port))
         arrivals = list(source.arrivals)
     source.close()
     assert [sample.time for sample in samples_of(arrivals)] == list(range(1, 21, 2))
@@ -102,10 +101,65 @@ def test_a_machine_that_was_silent_may_have_another_address(monkeypatch):
     reader = inboxes.Datagrams(SI)
     senders = ["first", "first", "second", "first", "second", "first"]
     accepted = [
-        isinstance(next(reader.decode((f"{k},{STILL}\n".encode(), machine))), Sample)
+        isinstance(next(reader.decode((f"{k},{STILL}\n".encode(), machine, 9))), Sample)
         for k, machine in enumerate(senders)
     ]
     assert accepted == [True, True, False, True, True, False]
+
+
+def sent_from(port, lines):
+    """What is read of lines that come from the sockets of this number; None: a new one each."""
+    source = open_source(f"udp:{port}", Stated(silence=0.3))
+    with contextlib.ExitStack() as sockets:
+        senders = {}
+        for number, line in lines:
+            sender = senders.get(number)
+            if sender is None:
+                sender = sockets.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                sender.bind(("127.0.0.1", 0))
+            if number is not None:
+                senders[number] = sender
+            sender.sendto(line.encode(), ("127.0.0.1", port))
+        arrivals = list(source.arrivals)
+    source.close()
+    return arrivals
+
+
+def test_two_senders_of_one_machine_make_no_path_of_both(port):
+    arrivals = sent_from(port, [(k % 2, f"{k},{STILL}") for k in range(200)])
+    times = [sample.time for sample in samples_of(arrivals)]
+    assert times == [*range(7), *range(8, 200, 2)]
+    refusals = texts_of(arrivals, "refusal")
+    assert (
+        len(refusals) == 97 and " of 127.0.0.1, and the samples before it from port" in refusals[0]
+    )
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [(None, f"{k},{STILL}") for k in range(100)],
+        [(k // 50, f"{k},{STILL}") for k in range(200)],
+        [(k % 2, f'{{"time": {k}, "{("gyro", "accel")[k % 2]}": [0, 0, 1]}}') for k in range(100)],
+    ],
+    ids=["a port for each sample", "started again", "a port for each sensor"],
+)
+def test_one_sender_may_have_several_ports(port, lines):
+    arrivals = sent_from(port, lines)
+    assert len(samples_of(arrivals)) == len(lines) and not texts_of(arrivals, "refusal")
+
+
+def test_a_sender_that_took_turns_is_followed_after_a_silence(monkeypatch):
+    stamps = [*(k / 100 for k in range(10)), 1.0, 3.2, 3.3]
+    clock = iter(stamps)
+    monkeypatch.setattr(inboxes.time, "monotonic", lambda: next(clock))
+    reader = inboxes.Datagrams(SI)
+    ports = [1, 2] * 5 + [2, 2, 2]
+    accepted = [
+        isinstance(next(reader.decode((f"{k},{STILL}\n".encode(), "phone", port))), Sample)
+        for k, port in enumerate(ports)
+    ]
+    assert accepted == [True] * 7 + [False, True, False, False, True, True]
 
 
 def lines_of(content):
