@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import filtering
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.state import Shift
 from tests.support import manifold
 from tests.support.compiling import optimised, quick
 from tests.support.random_walk import random_walk
@@ -70,6 +71,33 @@ def test_an_update_is_the_textbooks_with_the_derivatives_by_finite_differences(s
     moved = manifold.plus(poses, (gain @ residual)[:15])
     for value, expected in zip(after.mean, moved, strict=True):
         np.testing.assert_allclose(value, expected, atol=1e-7)
+
+
+def test_a_height_is_no_measurement_of_a_yaw_that_nobody_knows():
+    """It is the same update as that of a quantity of the world, without its second linearisation,
+    though the displacement before it has moved the estimate and the yaw is uncertain by a turn."""
+    config = dataclasses.replace(CONFIG, clones_per_window=4)
+    start, *signals = random_walk(5, n=N, clones=4, intervals=12, dt=DT)
+    ekf = filtering.Filter(config, NOISE, filtering.InitialStd(0.05, 2.0, 3.0, 1.0, 0.01, 0.1))
+    state, _ = filtering.run_filter(ekf, filtering.initial_state(ekf, *start), *signals)
+    moved = state.clone_shift[0] + np.array([0.5, -0.3, 0.1])
+    state = state._replace(shift=Shift(moved, 2.0 * moved))
+    sensor = filtering.Barometer(state.position[2] + 2.0, 0.5, 0.0)
+
+    @quick
+    def updated(state):
+        step = filtering.Step(Imu(jnp.zeros((N, 3)), jnp.zeros((N, 3)), None), 0, 1, config, NOISE)
+        linear = filtering.linearise(state, [2.0], [[0.25]], position=[[0.0, 0.0, 1.0]])
+        of_world = filtering.measure(state, linear, step, np.inf, frame="world")
+        return sensor.update(state, step)[:2], of_world[:2]
+
+    (after, outcome), (expected, of_world) = updated(state)
+    assert bool(outcome.accepted) and abs(after.position[2] - state.position[2]) > 1.0
+    np.testing.assert_allclose(outcome.nis, of_world.nis, rtol=1e-12)
+    np.testing.assert_allclose(outcome.volume, of_world.volume, rtol=1e-12)
+    for value, other, before in zip(after.mean, expected.mean, state.mean, strict=True):
+        np.testing.assert_allclose(value, other, atol=1e-3 + 0.01 * np.abs(other - before).max())
+    np.testing.assert_allclose(covariance(after), covariance(expected), rtol=0.01, atol=1e-3)
 
 
 def test_squared_errors_of_walks_are_as_the_covariance_says():
