@@ -288,7 +288,8 @@ def terminal(shown: bool = True) -> Iterator[Terminal]:
 
 
 def _leave(line: str, status: int) -> typing.NoReturn:
-    print(without_controls(" ".join(line.split())), file=sys.stderr)
+    with contextlib.suppress(OSError):  # the status remains, where stderr cannot be written
+        print(without_controls(" ".join(line.split())), file=sys.stderr)
     raise SystemExit(status) from None
 
 

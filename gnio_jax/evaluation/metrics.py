@@ -43,8 +43,11 @@ APART = 0.25
 """Largest relative error of the time between two rows that are compared (ours)."""
 LONGEST_HOLE = 2 * JUMP_MARGIN
 """Longest time between two trusted rows that a straight line joins where the distance along the
-reference is summed, s (ours). Around a jump of the reference a longer time is not trusted, so that
-no jump counts as a distance."""
+reference is summed, s (ours). Readers that find a jump of the reference trust no row in a longer
+time around it, so that it counts as no distance."""
+LATEST_ALIGNED = 1.0
+"""Time after the start of the filter up to which the reference may begin for the NEES, s (ours):
+the covariance hardly grows before."""
 LEAST_SECONDS = 10.0
 """Time below which `yaw_drift` is undefined, s."""
 
@@ -469,13 +472,14 @@ class MetricInputs(NamedTuple):
         filter's world. NaN without a reference, and where P is zero, as at a start that was given
         as exact.
 
-        Raises `Undefined` if the estimate is aligned at a later row than its first. The covariance
-        of an error since row m is P_kk + P_mm − P_km − P_mk, without the effect of the yaw at m.
-        The filter does not keep the covariance between two rows, and P_kk alone is too large.
+        Raises `Undefined` if the estimate is aligned more than `LATEST_ALIGNED` after its first
+        row. The covariance of an error since row m is P_kk + P_mm − P_km − P_mk, without the effect
+        of the yaw at m. The filter does not keep the covariance between two rows, and P_kk alone is
+        too large.
         """
         aligned_row = int(np.argmax(self.raw.known & self.reference.known))
-        if aligned_row:
-            seconds = self.raw.time[aligned_row] - self.raw.time[0]
+        seconds = self.raw.time[aligned_row] - self.raw.time[0]
+        if seconds > LATEST_ALIGNED:
             raise Undefined(f"the reference begins {seconds:.1f} s after the filter's start")
         yaw = relative_yaw(self.raw.orientation[:1], self.started.orientation[:1])[0]
         error = (self.started.position - self.reference.position) @ rotation_z(yaw).T
@@ -579,9 +583,9 @@ def measure(
 
     `ate*`, `rte*`, `drift` and `yaw_rmse` use the estimate with `alignment`, which is fitted in 3-D
     for the horizontal metrics too. NEES uses alignment at the start, because the filter's
-    covariance is relative to its start; it has no value if the reference begins later. An estimate
-    with a row that is not finite has diverged: every metric that a finite one would have is
-    infinite, and the shares are 0.
+    covariance is relative to its start; it has no value if the reference begins over a second
+    later. An estimate with a row that is not finite has diverged: every metric that a finite one
+    would have is infinite, and the shares are 0.
 
     Args:
         estimate: The estimated poses.

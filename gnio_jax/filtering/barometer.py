@@ -67,8 +67,8 @@ class Barometer(NamedTuple):
             jnp.where(sound, std**2, 1.0)[None, None],
             position=[[0.0, 0.0, 1.0]],
         )
-        # The height is fixed to the world, but no yaw moves it. So the update needs neither the arc of
-        # an uncertain yaw nor a second linearisation, for which frame="world" is.
+        # The height is fixed to the world, but no yaw moves it. So the update needs neither the arc
+        # of an uncertain yaw nor a second linearisation, for which frame="world" is.
         return measure(state, linear, step, ONE_DEGREE)
 
 

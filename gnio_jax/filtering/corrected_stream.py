@@ -63,6 +63,11 @@ class CorrectedStream:
         return self._stream.origin
 
     @property
+    def newest(self) -> float:
+        """The newest stamp, s, as `Stream.newest`."""
+        return self._stream.newest
+
+    @property
     def taken(self) -> int:
         """Number of rows that were taken."""
         return self._taken

@@ -205,6 +205,12 @@ class Stream:
             self._append(arrival, values)
 
     @property
+    def newest(self) -> float:
+        """The newest stamp, s; NaN before the first one. One that jumps counts when the next one
+        agrees with it."""
+        return self.origin + self._newest
+
+    @property
     def delay(self) -> float:
         """Time by which a grid sample is known after its own, at most, s."""
         return self.grid.delay

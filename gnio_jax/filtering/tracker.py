@@ -247,6 +247,12 @@ class Tracker:
         return state._replace(window=core.window, memory=core.memory)
 
     @property
+    def newest(self) -> float:
+        """The newest stamp, s; NaN before the first one. One that jumps by more than 0.2 s counts
+        when the next one agrees with it."""
+        return self._stream.newest
+
+    @property
     def delay(self) -> float:
         """Delay of all poses by the low-pass of a faster IMU and by a corrector, s; 0 without
         both.

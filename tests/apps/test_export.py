@@ -147,6 +147,12 @@ def test_a_map_has_the_name_of_the_recording_and_longitudes_within_180_degrees(t
     assert crossed - START == pytest.approx(27.830, abs=0.01)
 
 
+def test_a_longitude_that_rounds_to_180_degrees_is_written_as_gpx_allows(tmp_path):
+    still = Trajectory(START + np.arange(2.0), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    export_map(tmp_path / "still.gpx", still, Place(0.0, 180.0 - 1e-9, 0.0), "still")
+    assert (tmp_path / "still.gpx").read_text().count('lon="-180.0000000"') == 2
+
+
 @pytest.mark.parametrize(
     ("longitudes", "parts"),
     [

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.filtering import Pose
+from gnio_jax.filtering.resampler import Stream, create_grid
 
 PACKAGE = Path(__file__).parents[2] / "examples" / "ros2" / "gnio_odometry"
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
@@ -48,6 +49,10 @@ class Recorder:
         moved = VELOCITY, np.array([4.0, 5.0, 6.0])
         remaining_fields = BIAS, np.zeros(3), COVARIANCE, 1.0, 1.0, True
         return Pose(time, TURN.as_matrix(), *moved, *remaining_fields)
+
+    @property
+    def newest(self):
+        return self.samples[-1][0] if self.samples else np.nan
 
     def restart(self):
         self.samples = []
@@ -161,6 +166,7 @@ def test_stamps_that_go_on_elsewhere_start_the_tracker_anew(bridge, before, afte
         20 + np.zeros(30),  # one stamp again and again
         np.where(np.arange(30) % 2, 20, 5000) + NEW[:30],  # of two clocks
         100.1 + NEW[:9].repeat(2),  # late by less than 0.1 s
+        100.1 + np.arange(30) / 1000,  # and each after the one before
     ],
 )
 def test_some_wrong_stamps_cost_their_messages_alone(bridge, strays):
@@ -170,6 +176,35 @@ def test_some_wrong_stamps_cost_their_messages_alone(bridge, strays):
     assert not any(relay.take(at(seconds)) for seconds in strays)
     assert relay.refused == len(strays) and relay.restarts == 0
     assert relay.take(at(100.5)) is None and relay.take(at(100.51)) is not None
+
+
+def test_messages_of_two_clocks_in_turn_do_not_start_the_tracker_anew(bridge):
+    relay = bridge.Bridge(Recorder())
+    for k in range(100):
+        relay.take(at(100 + k / 100))
+        relay.take(at(20 + k / 100))
+    assert relay.restarts == 0 and relay.refused == 100
+
+
+@pytest.mark.parametrize("alone", [[], [150.0], [150.0, 155.0]])
+def test_a_message_alone_in_a_pause_does_not_count_as_the_newest(bridge, alone):
+    """The stream of samples does not trust a stamp that jumps until the next one agrees with it."""
+
+    class OfStream(Recorder):
+        stream = Stream(create_grid(0.01, None, 100.0))
+        newest = property(lambda self: self.stream.newest)
+
+        def push(self, time, gyro, accel):
+            self.stream.push(time, (*gyro, *accel))
+
+    tracker = OfStream()
+    relay = bridge.Bridge(tracker)
+    for seconds in [*OLD, *alone]:
+        relay.take(at(seconds))
+    assert tracker.newest == pytest.approx(OLD[-1] - OLD[0]) and relay.refused == 0
+    for seconds in 180 + NEW[:10]:
+        relay.take(at(seconds))
+    assert relay.restarts == 1 and relay.refused == 10
 
 
 def test_impossible_values_are_no_other_clock(bridge):

@@ -169,6 +169,12 @@ def test_a_full_disk_is_no_reader_who_has_left():
     assert result.returncode == 2 and result.stderr == "output: No space left on device\n"
 
 
+def test_the_status_remains_where_errors_cannot_be_written():
+    command = f"{sys.executable} -m gnio_jax train --wrong 2> /dev/full"
+    result = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 2 and result.stdout == ""
+
+
 def test_the_line_of_progress_shows_its_times_in_80_columns(monkeypatch):
     screen = io.StringIO()
     options = {"file": screen, "force_terminal": True, "width": 80, "stderr": False}

@@ -228,6 +228,37 @@ def test_yaw_errors_of_a_tilted_phone(pitch):
         assert values[name] == pytest.approx(0, abs=1e-6)
 
 
+def test_a_piece_counts_if_the_pose_is_known_at_both_of_its_ends():
+    time = STEP * np.arange(300)
+    position = np.stack([10.0 * time, 0 * time, 0 * time], axis=1)
+    truth = Trajectory(time, position, np.tile([1.0, 0.0, 0.0, 0.0], (300, 1)))
+    first, last, length = metrics.pieces(truth, STEP)
+    assert len(first) > 20
+    holed = truth._replace(orientation=truth.orientation.copy())
+    holed.orientation[[first[3], last[7]]] = np.nan
+    missing = np.isin(first, [first[3], last[7]]) | np.isin(last, [first[3], last[7]])
+    pieces = np.stack([first, last, length])[:, ~missing]
+    assert missing[7] and 1 < missing.sum() < len(first)
+    np.testing.assert_array_equal(metrics.pieces(holed, STEP), pieces)
+    stretched = truth._replace(position=1.01 * position)
+    assert metrics.t_rel(stretched, holed, STEP) == pytest.approx(1.0, rel=0.02)
+
+
+def test_holes_of_the_longest_time_are_joined_though_the_step_is_not_exact():
+    for step in (0.05, 0.1, 0.2 / 3):
+        rows = round(metrics.LONGEST_HOLE / step)
+        reference = np.outer(np.arange(10.0 * rows), [1.0, 0.0]) * step
+        holed = reference.copy()
+        holed[1 : 2 * rows][np.arange(2 * rows - 1) % rows != rows - 1] = np.nan
+        # Reading a step of a file may cost its last bits.
+        for exact in (step, step * (1 + 1e-9), step * (1 - 1e-9)):
+            drift = 1.1 * reference
+            error = metrics.rte_distance(drift, holed, exact, 1.0)
+            assert error == pytest.approx(0.1, rel=0.25)
+            (stretch,) = metrics._walked_distances(holed, exact)
+            assert len(stretch[1]) == len(holed)
+
+
 def test_errors_of_pieces_are_those_of_kittis_benchmark():
     """Against a plain loop with homogeneous matrices, with a long hole and single holes in the
     reference."""
@@ -324,7 +355,10 @@ def test_nees_has_no_value_where_the_reference_begins_after_the_start():
     names = ("nees", "nees_2d", "nees_coverage", "nees_coverage_2d")
     whole = metrics.measure(perturbed(truth), truth, filtered=results)
     assert not whole.reasons and all(whole.values[name] > 0 for name in names)
-    for row, seconds in ((1, "0.1"), (450, "45.0")):
+    for row in (1, 10):  # In a second the covariance hardly grows.
+        reference = masked(truth, slice(0, row))
+        assert metrics.measure(perturbed(truth), reference, filtered=results).values["nees"] > 0
+    for row, seconds in ((11, "1.1"), (450, "45.0")):
         reference = masked(truth, slice(0, row))
         measures = metrics.measure(perturbed(truth), reference, filtered=results)
         for name in names:

@@ -454,7 +454,13 @@ def test_a_restarted_tracker_is_a_new_one(built):
     used = Tracker(predict, filter_of(), start(), rest_seconds=0.9)
     assert feed(used, *recording(), 1.7e9 + np.arange(N * INTERVALS) * DT)
     used.restart()
-    assert used.pose() is None and used.filter_state() is None
+    assert used.pose() is None and used.filter_state() is None and np.isnan(used.newest)
+    # A start that is none is forgotten, too.
+    missing = np.where(np.arange(80)[:, None] % 50 > 20, np.nan, accel[:80])
+    feed(used, gyro[:80], missing, time[:80])
+    assert used.hindrance and used.newest == time[79]
+    used.restart()
+    assert used.hindrance == "" and np.isnan(used.newest)
     poses = feed(used, gyro, accel, time)
     assert len(poses) == len(expected) > 50
     for pose, like in zip(poses, expected, strict=True):

@@ -38,16 +38,14 @@ class Bridge:
     messages. Stamps are counted from the first one, in whole nanoseconds, so that no digit is lost
     in float64.
 
-    A message whose stamp is far behind the newest one, or further ahead than the tracker takes, is
-    refused. When `AGREEING` of them in a row continue each other, the clock was set, a recording
-    plays again, or the messages have paused: then the tracker starts anew.
+    A message whose stamp is far behind the tracker's newest one, or further ahead than the tracker
+    takes, is refused. When `AGREEING` of them in a row continue each other, the clock was set, a
+    recording plays again, or the messages have paused: then the tracker starts anew.
     """
 
     def __init__(self, tracker: Any, invariant: bool = True):
         self._tracker, self._invariant = tracker, invariant
         self._first: int | None = None
-        self._latest: int | None = None
-        """Stamp of the newest message that the tracker took, ns; None: it has taken none."""
         self._strays = list[int]()
         """Stamps of the newest messages, which continue each other but not that stamp, ns."""
         self.restarts = 0
@@ -77,7 +75,6 @@ class Bridge:
             self.reason = str(error)
             self._note_stray(now)
             return None
-        self._latest = now
         self._strays.clear()
         if pose is not None and not pose.healthy:
             self.refused += 1
@@ -87,10 +84,9 @@ class Bridge:
 
     def _note_stray(self, now: int) -> None:
         """Start anew if this refused message is the last of a run on another clock."""
-        if self._latest is None:
-            return
-        ahead = (now - self._latest) / NANOSECONDS
-        if -LATEST <= ahead <= LONGEST_GAP:
+        assert self._first is not None
+        ahead = (now - self._first) / NANOSECONDS - self._tracker.newest
+        if not (ahead < -LATEST or ahead > LONGEST_GAP):  # NaN before the first message
             self._strays.clear()
             return
         side = "after" if ahead > 0 else "before"
@@ -102,7 +98,7 @@ class Bridge:
         if len(self._strays) < AGREEING:
             return
         self._tracker.restart()
-        self._first = self._latest = None
+        self._first = None
         self._strays.clear()
         self.restarts += 1
         self.reason = f"the stamps go on {words}: the filter starts anew, and so does the path"

@@ -120,7 +120,8 @@ class Datagrams:
 
     A machine may send each sample, or each sensor, from a port of its own, and a program that
     starts again has another one. Two senders of a machine show by ports that take turns: `RUNS`
-    runs of samples of the gyro from at most half as many ports. Then the first one is followed.
+    runs of samples of the gyro from at most half as many ports. Then the first one is followed, and
+    whatever comes from another port with a gyro is refused.
     """
 
     def __init__(self, stated: Units):
@@ -128,6 +129,8 @@ class Datagrams:
         self._machine: str | None = None
         self._port: int | None = None
         """The port that is followed, if several take turns."""
+        self._refused = set[int]()
+        """Other ports with a gyro, since one is followed."""
         self._runs = deque[int](maxlen=RUNS)
         """Ports of the newest runs of samples with a gyro."""
         self._heard = -math.inf
@@ -142,26 +145,30 @@ class Datagrams:
             if is_sample and now - self._heard > TAKEN_OVER:
                 self._machine, self._port = machine, None
                 self._runs.clear()
+                self._refused.clear()
             if self._machine not in (None, machine):
                 yield f"comes from {machine}, and the samples before it from {self._machine}"
                 continue
             # A port that sends the accelerometer alone is no second sender.
-            turns = isinstance(sample, Sample) and not is_missing(sample.gyro)
-            if turns:
+            has_gyro = isinstance(sample, Sample) and not is_missing(sample.gyro)
+            if has_gyro:
                 self._note_port(port)
-            if turns and self._port not in (None, port):
+            if is_sample and port in self._refused:
                 earlier = f"the samples before it from port {self._port}"
                 yield f"comes from port {port} of {machine}, and {earlier}"
                 continue
-            self._heard = now if is_sample else self._heard
+            if has_gyro or (is_sample and self._port is None):
+                self._heard = now
             yield sample
 
     def _note_port(self, port: int) -> None:
-        """Choose a port if several take turns."""
+        """Choose a port if several take turns, and refuse the others."""
         if self._port is None and (not self._runs or self._runs[-1] != port):
             self._runs.append(port)
             if len(self._runs) == RUNS and len(set(self._runs)) <= RUNS // 2:
                 self._port = self._runs[0]
+        if self._port not in (None, port):
+            self._refused.add(port)
 
 
 def read_stream(stream: Any, name: str, stated: Units) -> Iterator[Arrival]:
