@@ -43,20 +43,16 @@ from gnio_jax.filtering import find_mounting, make_filter  # noqa: E402
 from gnio_jax.types import Readings  # noqa: E402
 from gnio_jax.types import Sequence as Recording  # noqa: E402
 
-NO_STATES: dict[str, float] = {}
-STATES = {
-    "no states": NO_STATES,
+KITTI_STATES = {"mounting_std": 0.005, "mounting_seconds": 20.0, "lever_std": 0.5}
+"""The states that KITTI's drives show, with all of their numbers (`configs/drive.yaml`)."""
+STATES: dict[str, dict[str, float]] = {
+    "no states": {},
     "mounting of 0.01 rad, constant": {"mounting_std": 0.01},
     "lever of 1 m": {"lever_std": 1.0},
     "both": {"mounting_std": 0.01, "lever_std": 1.0},
-    "mounting of 0.005 rad over 20 s, lever of 0.5 m": {
-        "mounting_std": 0.005,
-        "mounting_seconds": 20.0,
-        "lever_std": 0.5,
-    },
+    "mounting of 0.005 rad over 20 s, lever of 0.5 m": KITTI_STATES,
 }
-"""States of the mounting and the lever: rad, s and m. The last ones are what KITTI's drives show
-(`configs/drive.yaml`)."""
+"""States of the mounting and the lever: rad, s and m."""
 START = {"tilt": 0.0034, "velocity": 0.08, "gyro_bias": 1.1e-4, "accel_bias": 0.06}
 """Standard deviations of a start at the reference: rad, m/s, rad/s and m/s²."""
 REST = {"rest_gyro": 0.002, "rest_accel": 0.1, "rest_seconds": 1.0}
@@ -70,9 +66,8 @@ ORIGIN = Place(45.0, -93.0, 250.0)
 def with_states(config: TrainConfig, states: dict[str, float], **others: float) -> TrainConfig:
     """The configuration of a car's filter with these states, and with other numbers of the
     constraint."""
-    names = STATES[list(STATES)[-1]]
     constraint = config.filter.measurements["nonholonomic"] or {}
-    numbers = {name: value for name, value in constraint.items() if name not in names}
+    numbers = {name: value for name, value in constraint.items() if name not in KITTI_STATES}
     changed = {"nonholonomic": {**numbers, **states, **others}}
     measurements = {**config.filter.measurements, **changed}
     settings = dataclasses.replace(config.filter, measurements=measurements)
@@ -180,7 +175,7 @@ def print_states(drives: Sequence[Recording], config: TrainConfig, axes: Sequenc
 def print_gaps(drives: Sequence[Recording], config: TrainConfig, gap: Gap, draws: int) -> None:
     print(f"way through a gap of {gap.seconds:g} s; without a gap: median distance; {draws} draws")
     for drive in drives:
-        for name, settings in (("states", config), ("no states", with_states(config, NO_STATES))):
+        for name, settings in (("states", config), ("no states", with_states(config, {}))):
             rows = [error_through_gap(drive, settings, gap, seed) for seed in range(draws)]
             errors, length = np.array([row[0] for row in rows]), rows[0][1]
             words = f"{errors.mean():.1f} m ({errors.min():.1f} to {errors.max():.1f})"

@@ -365,6 +365,8 @@ def main() -> None:
     for name in arguments.without:
         if UNITS.pop(f"measurements.nonholonomic.{name}", None) is None:
             parser.error(f"--without: {name} is no number of the constraint that is fitted")
+    if arguments.all_drives and (arguments.folds, arguments.only) != (None, None):
+        parser.error("--all-drives: holds no drive out; leave out --folds and --only")
     if "mounting_std" in arguments.without and "mounting_seconds" not in arguments.without:
         parser.error("--without mounting_std: mounting_seconds has no effect then; name it, too")
     drives, fold_of = load_drives(arguments.data_root, arguments.folds)

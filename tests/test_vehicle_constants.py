@@ -247,6 +247,11 @@ def test_the_constants_of_all_drives_are_printed_as_a_file_has_them(sequences, m
     for name, value in free_parameters(settings, UNITS).items():
         assert float(value) == pytest.approx(float(expected[name]), abs=0.01), name
     assert settings.low_pass_seconds == 0.06
+    for words_of_folds in (["--folds", "2"], ["--only", "0"]):
+        monkeypatch.setattr(sys, "argv", [*words, *words_of_folds])
+        with pytest.raises(SystemExit):
+            vehicle_constants.main()
+        assert "--all-drives: holds no drive out" in capsys.readouterr().err
 
 
 def test_a_fold_that_does_not_exist_is_refused(sequences, monkeypatch, capsys):

@@ -110,7 +110,13 @@ def export_map(path: Path, trajectory: Trajectory, origin: Place, name: str) -> 
         # Rounded first, so that no longitude is rounded onto the other side of its part.
         points = np.column_stack([places[:, [1, 0, 2]].round(7), time])
         parts = _cut_at_antimeridian(points)
-        lines = [[_round_position(*point) for point in part[:, :3].tolist()] for part in parts]
+        lines = [
+            [
+                [round(east, 7), round(north, 7), round(up, 2)]
+                for east, north, up, _ in part.tolist()
+            ]
+            for part in parts
+        ]
         dates = [_dates(part[:, 3]) for part in parts] if has_dates else []
         feature = {
             "type": "Feature",
@@ -121,11 +127,6 @@ def export_map(path: Path, trajectory: Trajectory, origin: Place, name: str) -> 
         }
         text = json.dumps({"type": "FeatureCollection", "features": [feature]}, indent=1)
         write_part(temporary, text + "\n")
-
-
-def _round_position(east: float, north: float, up: float) -> list[float]:
-    """A position of GeoJSON: degrees to a centimetre, and m."""
-    return [round(east, 7), round(north, 7), round(up, 2)]
 
 
 def _dates(time: Float[np.ndarray, "n"]) -> list[str]:

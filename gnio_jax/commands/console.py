@@ -48,10 +48,10 @@ def run(main: Callable[[], object]) -> None:
     try:
         _end_in_a_line(main)
     except BrokenPipeError:
-        drop_unread_output()
+        _drop_unread_output()
         raise SystemExit(_READER_LEFT) from None
     except SystemExit:
-        drop_unread_output()
+        _drop_unread_output()
         raise
 
 
@@ -92,7 +92,7 @@ def _end_in_a_line(main: Callable[[], object]) -> None:
         _leave(problem, 2)
 
 
-def drop_unread_output() -> None:
+def _drop_unread_output() -> None:
     """Let stdout and stderr go nowhere if their reader has left. What they still hold would
     otherwise end in a message, and in another status, when Python ends."""
     for stream in (sys.stdout, sys.stderr):
@@ -187,7 +187,7 @@ class _Plain(Console):
 
     def on_broken_pipe(self) -> typing.NoReturn:
         """End as a signal does, so that files are still written. Rich's own status is 1."""
-        drop_unread_output()
+        _drop_unread_output()
         raise SystemExit(_READER_LEFT)
 
 

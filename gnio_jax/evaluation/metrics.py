@@ -362,6 +362,7 @@ def piece_errors(
 def pieces(reference: Trajectory, step: float) -> Int[np.ndarray, "3 m"]:
     """First row, last row and nominal length (m) of the pieces of `piece_errors`."""
     every, parts = max(1, round(1.0 / step)), [np.zeros((3, 0), int)]
+    posed = reference.known
     for first, distance in _walked_distances(reference.position, step):
         begins = np.arange(0, len(distance), every)
         for length in KITTI_LENGTHS:
@@ -369,7 +370,7 @@ def pieces(reference: Trajectory, step: float) -> Int[np.ndarray, "3 m"]:
             within = end < len(distance)
             i, j = first + begins[within], first + end[within]
             rows = np.stack([i, j, np.full(len(i), length)])
-            parts.append(rows[:, reference.known[i] & reference.known[j]])
+            parts.append(rows[:, posed[i] & posed[j]])
     return np.concatenate(parts, axis=1)
 
 

@@ -53,7 +53,7 @@ from gnio_jax.filtering.propagation import integrate
 from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Grid, Stream, create_grid
 from gnio_jax.filtering.scan import Measure, clone_step
 from gnio_jax.filtering.settings import FilterConfig
-from gnio_jax.filtering.start import initial_state, level_state
+from gnio_jax.filtering.start import NoGravity, initial_state, level_state
 from gnio_jax.filtering.state import (
     BIASES,
     FilterState,
@@ -278,7 +278,7 @@ class Tracker:
             rows = rows.astype(self._dtype)
             try:
                 state = level_state(self._ekf, rows[:, GYRO], rows[:, ACCEL])
-            except ValueError:  # It shows no gravity, but the next samples may.
+            except NoGravity:  # The next samples may show it.
                 self.hindrance = "its accelerations show no gravity"
                 self._stream.take(self._rest)
                 raise

@@ -39,7 +39,7 @@ from gnio_jax import geometry
 from gnio_jax.config.schema import NonNegativeCount, Positive
 from gnio_jax.models.bins import BinHead
 from gnio_jax.models.heads import UNCERTAINTIES, GatedHead, LinearHead
-from gnio_jax.models.layers import checked_windows
+from gnio_jax.models.layers import check_windows, checked_windows
 from gnio_jax.models.motion_bank import MotionBank
 from gnio_jax.types import GRAVITY, Memory, Prediction
 
@@ -96,7 +96,8 @@ class NetworkWithMemory(nn.Module):
     def __call__(
         self, windows: Float[Array, "b n c"], train: bool = False, **constants: Any
     ) -> Prediction:
-        count, samples, _ = checked_windows(windows, self.channels).shape
+        check_windows(windows, self.channels)
+        count, samples, _ = windows.shape
         _, prediction = self.advance(self.begin(count), windows, samples, train, **constants)
         return jax.tree.map(lambda leaf: leaf[:, -1], prediction)
 

@@ -46,8 +46,8 @@ METHODS: dict[str, Callable[[TrainConfig, Path, Reporter, int, bool], float]] = 
     "support_vectors": support_vectors.train
 }
 """Training without steps, by what a network says in its attribute `trained_by`: functions of the
-experiment, the work folder, the reporter and the number of processes that read. They write the run
-and return its loss on the validation split."""
+experiment, the work folder, the reporter, the number of processes that read, and whether a finished
+run stays as it is. They write the run and return its loss on the validation split."""
 NO_GRADIENT = 1e-9
 """Norm of a gradient, mean over an epoch, below which Adam, whose ε is 1e-8, makes almost no
 step."""

@@ -452,7 +452,11 @@ def test_a_restarted_tracker_is_a_new_one(built):
     fresh = Tracker(predict, filter_of(), rest_seconds=0.9)
     expected = feed(fresh, gyro, accel, time)
     used = Tracker(predict, filter_of(), start(), rest_seconds=0.9)
-    assert feed(used, *recording(), 1.7e9 + np.arange(N * INTERVALS) * DT)
+    turned, pushed = recording()
+    thrown = feed(
+        used, turned, pushed + np.array([90.0, 0.0, 0.0]), 1.7e9 + np.arange(N * INTERVALS) * DT
+    )
+    assert not thrown[-1].healthy and thrown[-1].failure
     used.restart()
     assert used.pose() is None and used.filter_state() is None and np.isnan(used.newest)
     # A start that is none is forgotten, too.

@@ -150,19 +150,6 @@ def test_one_sender_may_have_several_ports(port, lines):
     assert len(samples_of(arrivals)) == len(lines) and not texts_of(arrivals, "refusal")
 
 
-def test_a_sender_that_took_turns_is_followed_after_a_silence(monkeypatch):
-    stamps = [*(k / 100 for k in range(10)), 1.0, 3.2, 3.3]
-    clock = iter(stamps)
-    monkeypatch.setattr(inboxes.time, "monotonic", lambda: next(clock))
-    reader = inboxes.Datagrams(SI)
-    ports = [1, 2] * 5 + [2, 2, 2]
-    accepted = [
-        isinstance(next(reader.decode((f"{k},{STILL}\n".encode(), "phone", port))), Sample)
-        for k, port in enumerate(ports)
-    ]
-    assert accepted == [True] * 7 + [False, True, False, False, True, True]
-
-
 def decoded(monkeypatch, arrivals):
     """Of the rows (time s, port, line) from one machine: whether each is taken."""
     clock = iter([seconds for seconds, *_ in arrivals])
@@ -174,15 +161,25 @@ def decoded(monkeypatch, arrivals):
     ]
 
 
-def rows_of_sensors(ports, seconds, last):
+def test_a_sender_that_took_turns_is_followed_after_a_silence(monkeypatch):
+    times, ports = [*(k / 100 for k in range(10)), 1.0, 3.2, 3.3], [1, 2] * 5 + [2, 2, 2]
+    rows = [
+        (now, port, f"{k},{STILL}\n")
+        for k, (now, port) in enumerate(zip(times, ports, strict=True))
+    ]
+    accepted = decoded(monkeypatch, rows)
+    assert accepted == [True] * 7 + [False, True, False, False, True, True]
+
+
+def rows_of_sensors(ports, seconds):
     """A row of the gyro and one of the accelerometer a hundred times a second, from two ports."""
-    for k in range(round(100 * seconds), round(100 * last)):
+    for k in range(100 * seconds):
         for port, name in zip(ports, ("gyro", "accel"), strict=True):
             yield k / 100, port, f'{{"time": {k / 100}, "{name}": [0, 0, 9.8]}}\n'
 
 
 def test_a_second_sender_with_a_row_for_each_sensor_is_refused(monkeypatch):
-    first, second = (list(rows_of_sensors(ports, 0.0, 1.0)) for ports in ((1, 1), (3, 3)))
+    first, second = (list(rows_of_sensors(ports, 1)) for ports in ((1, 1), (3, 3)))
     turns = [row for k in range(0, 200, 2) for rows in (first, second) for row in rows[k : k + 2]]
     accepted = np.array(decoded(monkeypatch, turns))
     of_first = np.array([port == 1 for _, port, _ in turns])
@@ -192,7 +189,7 @@ def test_a_second_sender_with_a_row_for_each_sensor_is_refused(monkeypatch):
 def test_a_second_sender_is_followed_when_the_first_has_ended(monkeypatch):
     """Although its accelerometer has a port of its own, whose rows nobody can tell apart."""
     whole = [(k / 100, 1, f"{k / 100},{STILL}\n") for k in range(100)]
-    sensors = list(rows_of_sensors((3, 4), 0.0, 5.0))
+    sensors = list(rows_of_sensors((3, 4), 5))
     turns = sorted(whole + sensors, key=lambda row: row[0])
     accepted = decoded(monkeypatch, turns)
     times, ports, _ = map(np.array, zip(*turns, strict=True))
@@ -203,7 +200,7 @@ def test_a_second_sender_is_followed_when_the_first_has_ended(monkeypatch):
 def test_many_ports_and_those_before_a_silence_are_no_second_sender(monkeypatch):
     rows = [(k / 100, 1 + k % 6, f"{k / 100},{STILL}\n") for k in range(60)]
     assert all(decoded(monkeypatch, rows))
-    # Four runs of two ports, a silence, and as many again.
+    # Seven runs of two ports, a silence, and as many again.
     times = [*(k / 100 for k in range(7)), *(5 + k / 100 for k in range(7))]
     rows = [(now, 1 + k % 2, f"{now},{STILL}\n") for k, now in enumerate(times)]
     assert all(decoded(monkeypatch, rows))
